@@ -1,0 +1,62 @@
+"""The few functions that robot and tasks are written in: one source for floats, NumPy, CasADi and torch.
+
+A vector is an array whose last axis holds the components (NumPy, torch), a column (CasADi), or a tuple of components.
+A tuple's components may themselves be floats, arrays of any one shape, tensors or symbols, which is the fast layout for
+one robot in pure Python and for a batch on an accelerator alike.
+"""
+
+import math
+import sys
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+Vector = Any
+"""A tuple of components, an ndarray or tensor (..., n), or a CasADi column (n,)."""
+
+
+def _library(a: Any) -> ModuleType:
+    """The module that computes with `a`: already imported, because `a` exists."""
+    return sys.modules.get(type(a).__module__.partition(".")[0], np)
+
+
+def sin(a: Any) -> Any:
+    """Sine, elementwise."""
+    return math.sin(a) if isinstance(a, float) else _library(a).sin(a)
+
+
+def cos(a: Any) -> Any:
+    """Cosine, elementwise."""
+    return math.cos(a) if isinstance(a, float) else _library(a).cos(a)
+
+
+def sqrt(a: Any) -> Any:
+    """Square root, elementwise."""
+    return math.sqrt(a) if isinstance(a, float) else _library(a).sqrt(a)
+
+
+def components(v: Vector) -> tuple[Any, ...]:
+    """Splits a vector into its components."""
+    if isinstance(v, tuple):
+        return v
+    if _is_casadi(v):
+        return tuple(v[i] for i in range(v.shape[0]))
+    return tuple(v[..., i] for i in range(v.shape[-1]))
+
+
+def stack(parts: tuple[Any, ...], like: Vector) -> Vector:
+    """Joins components into a vector of the kind of `like`; constants among them are broadcast."""
+    if isinstance(like, tuple):
+        return parts
+    library = _library(like)
+    if _is_casadi(like):
+        return library.vertcat(*parts)
+    if library.__name__ == "torch":
+        parts = [library.as_tensor(part, dtype=like.dtype, device=like.device) for part in parts]
+        return library.stack(library.broadcast_tensors(*parts), dim=-1)
+    return np.stack(np.broadcast_arrays(*parts), axis=-1)
+
+
+def _is_casadi(v: Any) -> bool:
+    return type(v).__module__.partition(".")[0] == "casadi"

@@ -1,0 +1,245 @@
+"""The robot's parameters, read from its URDF by link and joint name."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+
+URDF_PATH = Path(__file__).parent / "urdf" / "ballbot.urdf"
+
+STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
+
+# joint: type, axis, parent link, child link. The closed form holds for this chain and no other.
+_CHAIN = {
+    "x": ("prismatic", (1.0, 0.0, 0.0), "world", "slide"),
+    "y": ("prismatic", (0.0, 1.0, 0.0), "slide", "ball"),
+    "gamma": ("continuous", (0.0, 1.0, 0.0), "ball", "yoke"),
+    "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "body"),
+}
+_MASSLESS_LINKS = ("slide", "yoke")
+
+
+class UrdfError(ValueError):
+    """A URDF that does not describe a ballbot; the message names the file, the element and the fault."""
+
+
+@dataclass(frozen=True)
+class BallbotParams:
+    """Masses and lengths of the ballbot.
+
+    | field | meaning | unit |
+    |---|---|---|
+    | ball_mass, ball_radius | the ball, which translates without rolling | kg, m |
+    | body_mass, body_radius, body_length | the body, a cylinder | kg, m |
+    | com_height | body's centre of mass above the ball's centre | m |
+    | inertia, axial_inertia | of the body about its centre of mass, across and along its axis | kg·m² |
+    | force_limit | largest force on the ball along each axis | N |
+    | gravity | | m/s² |
+    """
+
+    ball_mass: float
+    ball_radius: float
+    body_mass: float
+    body_radius: float
+    body_length: float
+    com_height: float
+    inertia: float
+    axial_inertia: float
+    force_limit: float
+    gravity: float = STANDARD_GRAVITY
+
+    @cached_property
+    def total_mass(self) -> float:
+        """Ball and body, kg."""
+        return self.ball_mass + self.body_mass
+
+    @cached_property
+    def first_moment(self) -> float:
+        """m·l, the body's mass times its centre's height above the ball's, kg·m."""
+        return self.body_mass * self.com_height
+
+    @cached_property
+    def pivot_inertia(self) -> float:
+        """I + m·l², the body's transverse inertia about the ball's centre, kg·m²."""
+        return self.inertia + self.body_mass * self.com_height**2
+
+    @classmethod
+    def from_urdf(cls, path: str | Path = URDF_PATH, gravity: float = STANDARD_GRAVITY) -> "BallbotParams":
+        """Reads the parameters from a URDF with the paper's chain of links and joints.
+
+        Args:
+            path: the URDF; without one, the robot of the paper.
+            gravity: m/s².
+
+        Raises:
+            UrdfError: a link, joint or inertial is missing, a mass is negative, an inertia not positive, or the
+                chain differs from the one that the closed-form dynamics describe.
+        """
+        urdf = _Urdf(Path(path))
+        for joint, (kind, axis, parent, child) in _CHAIN.items():
+            urdf.check_joint(joint, kind, axis, parent, child)
+        for link in _MASSLESS_LINKS:
+            if urdf.mass(link) != 0:
+                raise urdf.error(f"link '{link}' has mass {urdf.mass(link)} kg; it must have 0")
+        ball_mass = urdf.positive_mass("ball")
+        urdf.principal_inertias("ball")
+        transverse, transverse_y, axial = urdf.principal_inertias("body")
+        if transverse != transverse_y:
+            raise urdf.error(f"link 'body' must be round: ixx = {transverse} differs from iyy = {transverse_y}")
+        return cls(
+            ball_mass=ball_mass,
+            ball_radius=urdf.visual("ball", "sphere", "radius"),
+            body_mass=urdf.positive_mass("body"),
+            body_radius=urdf.visual("body", "cylinder", "radius"),
+            body_length=urdf.visual("body", "cylinder", "length"),
+            com_height=urdf.com_height("body"),
+            inertia=transverse,
+            axial_inertia=axial,
+            force_limit=urdf.force_limit(),
+            gravity=float(gravity),
+        )
+
+    def to_urdf(self) -> str:
+        """The URDF text of this robot: the packaged file with this object's numbers; `from_urdf` reads them back."""
+        urdf = _Urdf(URDF_PATH)
+        urdf.find("link[@name='ball']/inertial/mass").set("value", repr(self.ball_mass))
+        urdf.find("link[@name='body']/inertial/mass").set("value", repr(self.body_mass))
+        body_inertia = urdf.find("link[@name='body']/inertial/inertia")
+        for name, value in (("ixx", self.inertia), ("iyy", self.inertia), ("izz", self.axial_inertia)):
+            body_inertia.set(name, repr(value))
+        ball_inertia = 0.4 * self.ball_mass * self.ball_radius**2  # solid sphere; it has no effect, the ball translates
+        for name in ("ixx", "iyy", "izz"):
+            urdf.find("link[@name='ball']/inertial/inertia").set(name, repr(ball_inertia))
+        for place in ("inertial", "visual"):
+            urdf.find(f"link[@name='body']/{place}/origin").set("xyz", f"0 0 {self.com_height!r}")
+        urdf.find("link[@name='ball']/visual/geometry/sphere").set("radius", repr(self.ball_radius))
+        cylinder = urdf.find("link[@name='body']/visual/geometry/cylinder")
+        cylinder.set("radius", repr(self.body_radius))
+        cylinder.set("length", repr(self.body_length))
+        urdf.find("joint[@name='x']/origin").set("xyz", f"0 0 {self.ball_radius!r}")
+        for joint in ("x", "y"):
+            urdf.find(f"joint[@name='{joint}']/limit").set("effort", repr(self.force_limit))
+        return ElementTree.tostring(urdf.root, encoding="unicode")
+
+
+@cache
+def default_params() -> BallbotParams:
+    """The paper's robot, read once from the packaged URDF."""
+    return BallbotParams.from_urdf()
+
+
+class _Urdf:
+    """A parsed URDF whose look-ups raise a `UrdfError` that names what is missing."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            self.root = ElementTree.parse(path).getroot()
+        except FileNotFoundError:
+            raise UrdfError(f"{path}: no such URDF file") from None
+        except ElementTree.ParseError as error:
+            raise UrdfError(f"{path}: not well-formed XML: {error}") from None
+
+    def error(self, text: str) -> UrdfError:
+        return UrdfError(f"{self.path}: {text}")
+
+    def find(self, query: str) -> ElementTree.Element:
+        element = self.root.find(query)
+        if element is None:
+            raise self.error(f"no {query}")
+        return element
+
+    def _named(self, tag: str, name: str) -> ElementTree.Element:
+        element = self.root.find(f"{tag}[@name='{name}']")
+        if element is None:
+            raise self.error(f"{tag} '{name}' is missing")
+        return element
+
+    def _child(self, tag: str, name: str, query: str) -> ElementTree.Element:
+        element = self._named(tag, name).find(query)
+        if element is None:
+            raise self.error(f"{tag} '{name}' has no <{query.replace('/', '><')}>")
+        return element
+
+    def _number(self, element: ElementTree.Element, attribute: str, where: str) -> float:
+        text = element.get(attribute)
+        if text is None:
+            raise self.error(f"{where} has no attribute '{attribute}'")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise self.error(f"{where}: {attribute} = '{text}' is not a number")
+        return value
+
+    def _vector(self, element: ElementTree.Element | None, default: str, where: str) -> tuple[float, ...]:
+        text = default if element is None else element.get("xyz", default)
+        try:
+            vector = tuple(float(part) for part in text.split())
+        except ValueError:
+            vector = ()
+        if len(vector) != 3:
+            raise self.error(f"{where}: xyz = '{text}' is not three numbers")
+        return vector
+
+    def check_joint(self, name: str, kind: str, axis: tuple[float, ...], parent: str, child: str) -> None:
+        joint = self._named("joint", name)
+        for tag, expected in (("parent", parent), ("child", child)):
+            self._named("link", expected)
+            found = self._child("joint", name, tag).get("link")
+            if found != expected:
+                raise self.error(f"joint '{name}' has {tag} link '{found}'; it must be '{expected}'")
+        kinds = ("continuous", "revolute") if kind == "continuous" else (kind,)
+        if joint.get("type") not in kinds:
+            raise self.error(f"joint '{name}' is of type '{joint.get('type')}'; it must be {kind}")
+        found_axis = self._vector(joint.find("axis"), "1 0 0", f"axis of joint '{name}'")
+        if found_axis != axis:
+            raise self.error(f"joint '{name}' has axis {found_axis}; it must be {axis}")
+
+    def mass(self, link: str) -> float:
+        mass = self._number(self._child("link", link, "inertial/mass"), "value", f"mass of link '{link}'")
+        if mass < 0:
+            raise self.error(f"link '{link}' has negative mass {mass} kg")
+        return mass
+
+    def positive_mass(self, link: str) -> float:
+        mass = self.mass(link)
+        if mass == 0:
+            raise self.error(f"link '{link}' has mass 0; it must be positive")
+        return mass
+
+    def principal_inertias(self, link: str) -> tuple[float, float, float]:
+        inertia = self._child("link", link, "inertial/inertia")
+        where = f"inertia of link '{link}'"
+        for name in ("ixy", "ixz", "iyz"):
+            if float(inertia.get(name, "0")) != 0:
+                raise self.error(f"{where}: {name} must be 0")
+        moments = tuple(self._number(inertia, name, where) for name in ("ixx", "iyy", "izz"))
+        if min(moments) <= 0:
+            raise self.error(f"{where} must be positive, not {moments} kg·m²")
+        return moments
+
+    def com_height(self, link: str) -> float:
+        x, y, z = self._vector(
+            self._child("link", link, "inertial/origin"), "0 0 0", f"centre of mass of link '{link}'"
+        )
+        if (x, y) != (0, 0) or z <= 0:
+            raise self.error(f"link '{link}' must have its centre of mass on the axis above the ball, not at {x, y, z}")
+        return z
+
+    def visual(self, link: str, shape: str, attribute: str) -> float:
+        element = self._child("link", link, f"visual/geometry/{shape}")
+        value = self._number(element, attribute, f"{shape} of link '{link}'")
+        if value <= 0:
+            raise self.error(f"{shape} of link '{link}' must have a positive {attribute}, not {value} m")
+        return value
+
+    def force_limit(self) -> float:
+        efforts = [
+            self._number(self._child("joint", name, "limit"), "effort", f"limit of joint '{name}'") for name in "xy"
+        ]
+        if efforts[0] != efforts[1] or efforts[0] <= 0:
+            raise self.error(f"joints 'x' and 'y' must have one positive effort limit, not {efforts} N")
+        return efforts[0]

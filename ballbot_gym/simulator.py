@@ -1,0 +1,287 @@
+"""Simulators of the ballbot behind one interface; the only file that knows PyBullet.
+
+`BulletSimulator` loads the URDF; `Rk4Simulator` integrates the closed form and needs no PyBullet. `Scene` draws states of
+either, in a physics client of its own, so that looking never changes a trajectory.
+"""
+
+import math
+import os
+import sys
+import tempfile
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Protocol
+
+import numpy as np
+
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+
+State = tuple[float, ...]
+"""(8,) state as a tuple of floats; order and units in `dynamics.STATE`."""
+
+_JOINTS = ("x", "y", "gamma", "theta")
+
+
+class Simulator(Protocol):
+    """One ballbot whose force is held over control steps."""
+
+    def reset(self, x: State) -> None:
+        """Puts the robot into state x."""
+
+    def step(self, u: tuple[float, float]) -> State:
+        """Holds force u, N, for one control step and returns the state after it."""
+
+    def close(self) -> None:
+        """Releases what the simulator holds; may be called again."""
+
+
+class Rk4Simulator:
+    """The closed-form model, integrated by RK4 steps of at most `dynamics.RK4_STEP`."""
+
+    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+        """Args: as for `BulletSimulator`; physics_dt defaults to `dynamics.RK4_STEP`."""
+        self._params = params
+        self._dt = control_dt
+        self._substeps = (
+            dynamics.substeps_for(control_dt) if physics_dt is None else _whole_substeps(control_dt, physics_dt)
+        )
+        self._x: State = (0.0,) * 8
+
+    def reset(self, x: State) -> None:
+        self._x = x
+
+    def step(self, u: tuple[float, float]) -> State:
+        self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps)
+        return self._x
+
+    def close(self) -> None:
+        pass
+
+
+class BulletSimulator:
+    """The URDF in PyBullet, in a physics client that this object owns."""
+
+    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+        """Loads the robot.
+
+        Args:
+            params: the robot.
+            control_dt: s, how long each force is held.
+            physics_dt: s, Bullet's step, a whole fraction of control_dt; default 1 ms. Bullet is of first order: its
+                error halves with this step.
+
+        Raises:
+            ImportError: PyBullet is missing or was built without NumPy.
+            RuntimeError: PyBullet has no client left.
+        """
+        substeps = _whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
+        bullet = import_pybullet()
+        self._client = _connect(bullet, bullet.DIRECT)
+        self._release = weakref.finalize(self, bullet.disconnect, self._client)
+        self._robot, self._joints = _load_robot(bullet, self._client, params)
+        # Substeps run in C++ with the torque held, bitwise equal to as many calls and a third faster.
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client
+        )
+        bullet.setGravity(0, 0, -params.gravity, physicsClientId=self._client)
+        self._bullet = bullet
+
+    def reset(self, x: State) -> None:
+        # Joints are reset in place: reloading the URDF takes a hundred times longer.
+        for i, joint in enumerate(self._joints):
+            self._bullet.resetJointState(self._robot, joint, x[i], x[i + 4], physicsClientId=self._client)
+
+    def step(self, u: tuple[float, float]) -> State:
+        bullet, client, robot = self._bullet, self._client, self._robot
+        bullet.setJointMotorControlArray(
+            robot, self._joints[:2], bullet.TORQUE_CONTROL, forces=u, physicsClientId=client
+        )
+        bullet.stepSimulation(physicsClientId=client)
+        a, b, c, d = bullet.getJointStates(robot, self._joints, physicsClientId=client)
+        return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1])
+
+    def close(self) -> None:
+        self._release()
+
+
+PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": BulletSimulator, "rk4": Rk4Simulator}
+"""Simulators by the name that `gymnasium.make(..., physics=name)` takes."""
+
+
+@dataclass(frozen=True)
+class Marker:
+    """Something a task wants drawn: an upright cylinder of `radius` and `height`, its foot on the floor, both in m.
+
+    A `ring` is drawn as its circumference only.
+    """
+
+    position: tuple[float, float]
+    radius: float
+    height: float
+    color: tuple[float, float, float, float]
+    ring: bool = False
+
+
+class Scene:
+    """Draws the ballbot on a floor with a grid, through PyBullet's software renderer or its window.
+
+    The camera follows the ball. A dark line along the body and the floor's 1 m squares make lean and speed readable.
+    """
+
+    def __init__(self, params: BallbotParams, human: bool = False, width: int = 640, height: int = 480):
+        """Args: human opens a window instead of drawing into arrays; width and height in pixels.
+
+        Raises:
+            ImportError: PyBullet is missing or was built without NumPy.
+            RuntimeError: human without a display.
+        """
+        bullet = import_pybullet()
+        if human and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+            raise RuntimeError('render_mode="human" needs a display, and DISPLAY is not set; use "rgb_array"')
+        self._client = _connect(bullet, bullet.GUI if human else bullet.DIRECT)
+        self._release = weakref.finalize(self, bullet.disconnect, self._client)
+        self._bullet, self._human, self._size = bullet, human, (width, height)
+        if human:
+            bullet.configureDebugVisualizer(bullet.COV_ENABLE_GUI, 0, physicsClientId=self._client)
+        self._robot, self._joints = _load_robot(bullet, self._client, params)
+        self._params = params
+        self._markers: list[int] = []
+        self._add_floor()
+
+    def set_markers(self, markers: list[Marker]) -> None:
+        """Replaces what the task wants drawn."""
+        for body in self._markers:
+            self._bullet.removeBody(body, physicsClientId=self._client)
+        self._markers = [body for marker in markers for body in self._add_marker(marker)]
+
+    def draw(self, x: State) -> np.ndarray | None:
+        """Shows state x; returns (height, width, 3) uint8, or None in a window."""
+        bullet, client = self._bullet, self._client
+        for i, joint in enumerate(self._joints):
+            bullet.resetJointState(self._robot, joint, x[i], 0.0, physicsClientId=client)
+        target = (x[0], x[1], 0.5)
+        if self._human:
+            bullet.resetDebugVisualizerCamera(3.2, 40, -18, target, physicsClientId=client)
+            return None
+        width, height = self._size
+        view = bullet.computeViewMatrixFromYawPitchRoll(target, 3.2, 40, -18, 0, 2)
+        projection = bullet.computeProjectionMatrixFOV(45, width / height, 0.1, 60)
+        image = bullet.getCameraImage(
+            width,
+            height,
+            view,
+            projection,
+            lightDirection=(-4, -6, 12),
+            lightDistance=20,
+            shadow=1,
+            renderer=bullet.ER_TINY_RENDERER,
+            flags=bullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=client,
+        )[2]
+        return np.reshape(image, (height, width, 4))[:, :, :3].astype(np.uint8)
+
+    def close(self) -> None:
+        """Closes the window or releases the client; may be called again."""
+        self._release()
+
+    def _add_floor(self) -> None:
+        import pybullet_data
+
+        bullet = self._bullet
+        floor = bullet.loadURDF(
+            str(Path(pybullet_data.getDataPath()) / "plane100.urdf"),
+            useFixedBase=True,
+            physicsClientId=self._client,
+        )
+        bullet.changeVisualShape(floor, -1, rgbaColor=(1, 1, 1, 1), physicsClientId=self._client)
+
+    def _add_marker(self, marker: Marker) -> list[int]:
+        x, y = marker.position
+        if not marker.ring:
+            return [self._cylinder((x, y, marker.height / 2), marker.radius, marker.height, marker.color)]
+        count = max(24, int(12 * marker.radius))
+        angles = [2 * math.pi * k / count for k in range(count)]
+        return [
+            self._cylinder(
+                (x + marker.radius * math.cos(a), y + marker.radius * math.sin(a), marker.height / 2),
+                0.04,
+                marker.height,
+                marker.color,
+            )
+            for a in angles
+        ]
+
+    def _cylinder(self, position: tuple, radius: float, height: float, color: tuple) -> int:
+        bullet, client = self._bullet, self._client
+        shape = bullet.createVisualShape(
+            bullet.GEOM_CYLINDER, radius=radius, length=height, rgbaColor=color, physicsClientId=client
+        )
+        return bullet.createMultiBody(
+            baseMass=0, baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client
+        )
+
+
+def import_pybullet() -> ModuleType:
+    """PyBullet, or an ImportError that says what to do."""
+    try:
+        import pybullet
+    except ImportError as error:
+        raise ImportError(
+            'PyBullet is not installed. Install it with "pip install pybullet" (wheels exist up to Python 3.11), or use '
+            'physics="rk4", which needs only NumPy.'
+        ) from error
+    if not pybullet.isNumpyEnabled():
+        raise ImportError(
+            "This PyBullet was built without NumPy. Reinstall its wheel with "
+            '"pip install --force-reinstall --only-binary=:all: pybullet", or install NumPy first and build again.'
+        )
+    return pybullet
+
+
+def _connect(bullet: ModuleType, mode: int) -> int:
+    client = bullet.connect(mode)
+    if client < 0:
+        raise RuntimeError("PyBullet has no free physics client; close() environments that are no longer used")
+    return client
+
+
+def _load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[int, tuple[int, ...]]:
+    """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "ballbot.urdf"
+        path.write_text(params.to_urdf())
+        robot = bullet.loadURDF(
+            str(path),
+            useFixedBase=True,
+            # Without this flag Bullet recomputes inertias from collision shapes.
+            flags=bullet.URDF_USE_INERTIA_FROM_FILE,
+            physicsClientId=client,
+        )
+    count = bullet.getNumJoints(robot, physicsClientId=client)
+    index = {bullet.getJointInfo(robot, i, physicsClientId=client)[1].decode(): i for i in range(count)}
+    joints = tuple(index[name] for name in _JOINTS)
+    for joint in range(-1, count):
+        bullet.changeDynamics(
+            robot,
+            joint,
+            linearDamping=0,
+            angularDamping=0,
+            jointDamping=0,
+            maxJointVelocity=1e4,
+            physicsClientId=client,
+        )
+    # Bullet's joints start with a velocity motor that holds them.
+    bullet.setJointMotorControlArray(
+        robot, joints, bullet.VELOCITY_CONTROL, forces=[0] * len(joints), physicsClientId=client
+    )
+    return robot, joints
+
+
+def _whole_substeps(control_dt: float, physics_dt: float) -> int:
+    substeps = round(control_dt / physics_dt) if physics_dt > 0 else 0
+    if substeps < 1 or not math.isclose(substeps * physics_dt, control_dt, rel_tol=1e-9):
+        raise ValueError(f"physics_dt = {physics_dt} s must be a whole fraction of control_dt = {control_dt} s")
+    return substeps

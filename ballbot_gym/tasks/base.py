@@ -1,0 +1,102 @@
+"""What a task is: one finite-horizon optimal-control problem that env, experts, optimizer and leaderboard all read."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ballbot_gym import dynamics, ops
+from ballbot_gym.ops import Vector
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.simulator import Marker
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """A finite-horizon optimal-control problem, from which the episode's reward is −cost.
+
+    x is a state (..., 8), u a force (..., 2) in N, c the episode's constants (..., nc). Cost, margins, goal and observation
+    are written with `ops`, so that NumPy, CasADi and torch evaluate the same lines; they are smooth in x and u.
+
+    A task is one file: it fills in the abstract methods, and `TASKS` names it.
+    """
+
+    duration: float = 8.0
+    """Longest episode, s."""
+    control_dt: float = 0.02
+    """How long each force is held, s."""
+    max_tilt: float = math.radians(80)
+    """Tilt beyond which the robot has fallen, rad."""
+    failure_cost: float = 1000.0
+    """Charged when a margin is violated."""
+
+    id: ClassVar[str]
+    """Gymnasium id."""
+    observation_scale: ClassVar[tuple[float, ...]]
+    """What each observed quantity is divided by, in its unit."""
+    constant_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the episode's constants c, in order."""
+    first_exit: ClassVar[bool] = False
+    """Whether reaching the goal ends the episode."""
+
+    OBSERVATION_LIMIT: ClassVar[float] = 1000.0
+    """Bound of the observation space. No state that 350 N can reach within 8 s comes near it."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, int | float) and not value > 0:
+                raise ValueError(f"{type(self).__name__}: {field.name} must be positive, not {value}")
+        if not math.isclose(self.steps * self.control_dt, self.duration, rel_tol=1e-9):
+            raise ValueError(f"duration {self.duration} s is not a whole number of control steps of {self.control_dt} s")
+        if self.max_tilt >= math.pi / 2:
+            raise ValueError(f"max_tilt must be below 90°, not {math.degrees(self.max_tilt):.1f}°")
+
+    @property
+    def steps(self) -> int:
+        """Control steps in the longest episode."""
+        return round(self.duration / self.control_dt)
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+        """Draws an episode: initial state (8,) and constants (nc,)."""
+
+    @abstractmethod
+    def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
+        """Cost rate, 1/s, ≥ 0: the episode costs its sum over control steps times control_dt."""
+
+    @abstractmethod
+    def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        """Success iff every entry ≤ 0: at the first such state if `first_exit`, else at the end of the episode."""
+
+    @abstractmethod
+    def observe(self, x: Vector, c: Vector) -> Vector:
+        """Observation (..., no), each quantity divided by its `observation_scale`; no running statistics."""
+
+    def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        """Safe iff every entry ≥ 0. Every task has the tilt limit; obstacles add theirs."""
+        return (dynamics.cos_tilt(x) - math.cos(self.max_tilt),)
+
+    def markers(self, c: np.ndarray) -> list[Marker]:
+        """What to draw besides the robot."""
+        return []
+
+    def is_safe(self, x: Vector, c: Vector) -> bool:
+        """Whether one state violates no margin; a state that is not finite does."""
+        return all(margin >= 0 for margin in self.margins(x, c))
+
+    def is_goal(self, x: Vector, c: Vector) -> bool:
+        """Whether one state is in the goal."""
+        return all(excess <= 0 for excess in self.goal(x, c))
+
+
+def squared(*parts: Any) -> Any:
+    """Sum of squares."""
+    return sum(part * part for part in parts)
+
+
+def scaled(parts: tuple[Any, ...], scale: tuple[float, ...], like: Vector) -> Vector:
+    """Stacks parts divided by scale."""
+    return ops.stack(tuple(part / s for part, s in zip(parts, scale, strict=True)), like)

@@ -1,0 +1,89 @@
+"""BallbotStabilize-v0: come to rest at the origin from speed and lean."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import dynamics, ops
+from ballbot_gym.ops import Vector
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.simulator import Marker
+from ballbot_gym.tasks.base import Task, scaled, squared
+
+
+@dataclass(frozen=True)
+class Stabilize(Task):
+    """Come to rest at the origin (the paper's Figs 2 and 3, from random states).
+
+    Observation, float32 (8,):
+
+    | number | quantity | divided by | unit |
+    |---|---|---|---|
+    | 0, 1 | ball position x, y | 5 | m |
+    | 2, 3 | lean γ, θ | 1 | rad |
+    | 4, 5 | ball velocity ẋ, ẏ | 5 | m/s |
+    | 6, 7 | lean rate γ̇, θ̇ | 5 | rad/s |
+
+    Action, float32 (2,) in [−1, 1]: force Fx, Fy on the ball, in units of 350 N.
+
+    Start: |x|, |y| ≤ `start_position`, |ẋ|, |ẏ| ≤ `start_speed`, |γ|, |θ| ≤ `start_lean`, |γ̇|, |θ̇| ≤ `start_lean_rate`,
+    uniform.
+
+    Cost rate: x² + y² + ½(γ² + θ² + ẋ² + ẏ² + γ̇² + θ̇²) + 5e-4 (Fx² + Fy²), the paper's shape of weights.
+
+    Ends: tilt beyond `max_tilt` fails; after `duration` the episode is truncated, a success if the robot then stands
+    within 0.1 m of the origin, slower than 0.1 m/s, leaning less than 2° and turning slower than 0.1 rad/s.
+    """
+
+    position_weight: float = 1.0
+    """Of x² + y², 1/(m² s)."""
+    rest_weight: float = 0.5
+    """Of squared leans, speeds and lean rates, in SI units, 1/s."""
+    effort_weight: float = 5e-4
+    """Of Fx² + Fy², 1/(N² s)."""
+    start_position: float = 2.0
+    """m."""
+    start_speed: float = 5.0
+    """m/s."""
+    start_lean: float = 0.6
+    """rad."""
+    start_lean_rate: float = 1.0
+    """rad/s."""
+
+    id = "BallbotStabilize-v0"
+    observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0)
+
+    def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+        limits = (self.start_position, self.start_lean, self.start_speed, self.start_lean_rate)
+        limit = np.repeat(limits, 2)
+        return rng.uniform(-limit, limit), np.zeros(0)
+
+    def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
+        px, py, *rest = ops.components(x)
+        return (
+            self.position_weight * squared(px, py)
+            + self.rest_weight * squared(*rest)
+            + self.effort_weight * squared(*ops.components(u))
+        )
+
+    def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        return at_rest(x)
+
+    def observe(self, x: Vector, c: Vector) -> Vector:
+        return scaled(ops.components(x), self.observation_scale, like=x)
+
+    def markers(self, c: np.ndarray) -> list[Marker]:
+        return [Marker((0.0, 0.0), 0.3, 0.01, (0.1, 0.6, 0.3, 1.0))]
+
+
+def at_rest(x: Vector) -> tuple[Any, ...]:
+    """≤ 0 iff within 0.1 m of the origin, slower than 0.1 m/s, tilted < 2° and turning slower than 0.1 rad/s."""
+    px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)
+    return (
+        squared(px, py) - 0.1**2,
+        squared(vx, vy) - 0.1**2,
+        math.cos(math.radians(2)) - dynamics.cos_tilt(x),
+        squared(gamma_dot, theta_dot) - 0.1**2,
+    )
