@@ -30,6 +30,7 @@ class BallbotEnv(gymnasium.Env):
     | tilt | rad, between the body's axis and the vertical |
     | success | the task's goal holds at the end of the episode |
     | failure | a margin is violated: the robot fell or touched something |
+    | force | (2,) N, applied in this step (0 after `reset`) |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
     """
@@ -96,8 +97,7 @@ class BallbotEnv(gymnasium.Env):
         """
         self._check_open()
         super().reset(seed=seed)
-        x, c = self.task.sample(self.np_random, self.params)
-        x, c = self._apply_options(x, c, dict(options or {}))
+        x, c = self._draw(dict(options or {}))
         self._constants, self._constants_array = tuple(c.tolist()), c
         self._state = tuple(x.tolist())
         self._simulator.reset(self._state)
@@ -106,7 +106,7 @@ class BallbotEnv(gymnasium.Env):
             self._scene.set_markers(self.task.markers(self._constants_array))
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._info(0.0, False, False, False)
+        return self._observation(), self._info(0.0, (0.0, 0.0), False, False, False)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -140,7 +140,7 @@ class BallbotEnv(gymnasium.Env):
         if self.render_mode == "human":
             self.render()
         return self._observation(), -cost, terminated, last and not terminated, self._info(
-            cost, success, failure, clipped
+            cost, force, success, failure, clipped
         )
 
     def render(self) -> np.ndarray | None:
@@ -170,25 +170,36 @@ class BallbotEnv(gymnasium.Env):
         if self._closed:
             raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
 
-    def _apply_options(
-        self, x: np.ndarray, c: np.ndarray, options: dict[str, Any]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Initial state and constants: drawn, where the options do not give them."""
         state, constants = options.pop("state", None), options.pop("constants", None)
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; known: 'state', 'constants'")
+        task = self.task
+        c = task.sample_constants(self.np_random, self.params)
         if constants is not None:
-            c = self._named_constants(c, constants) if isinstance(constants, dict) else constants
-            c = _finite_vector(c, len(self.task.constant_names), "constants")
+            if isinstance(constants, dict):
+                constants = self._replaced(c, constants)
+            c = _finite_vector(constants, len(task.constant_names), "constants")
+            task.check_constants(c, self.params)
+        x = task.sample_state(self.np_random, c, self.params)
         if state is not None:
             x = _finite_vector(state, 8, "state")
-            names = [name for name, _ in dynamics.STATE]
-            tilt = math.degrees(_tilt(x))
-            if not self.task.is_safe(tuple(x.tolist()), tuple(c.tolist())):
+            if not task.is_safe(tuple(x.tolist()), tuple(c.tolist())):
+                values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
                 raise ValueError(
-                    f"start state {dict(zip(names, x.tolist(), strict=True))} is out of range: it violates a margin of "
-                    f"{self.task.id} (tilt {tilt:.1f}°, limit {math.degrees(self.task.max_tilt):.1f}°)"
+                    f"start state is out of range: it violates a margin of {task.id} ({values}; tilt "
+                    f"{math.degrees(_tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
                 )
         return x, c
+
+    def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[float]:
+        """Drawn constants with some replaced by name."""
+        names = self.task.constant_names
+        unknown = sorted(set(named) - set(names))
+        if unknown:
+            raise ValueError(f"{self.task.id} has no constants {unknown}; it has {list(names)}")
+        return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
         if np.shape(action) != (2,):
@@ -205,13 +216,16 @@ class BallbotEnv(gymnasium.Env):
     def _observation(self) -> np.ndarray:
         return np.array(self.task.observe(self._state, self._constants), np.float32)
 
-    def _info(self, cost: float, success: bool, failure: bool, clipped: bool) -> dict[str, Any]:
+    def _info(
+        self, cost: float, force: tuple[float, float], success: bool, failure: bool, clipped: bool
+    ) -> dict[str, Any]:
         return {
             "state": np.array(self._state),
             "cost": cost,
             "tilt": _tilt(self._state),
             "success": success,
             "failure": failure,
+            "force": np.array(force),
             "clipped": clipped,
             "constants": self._constants_array.copy(),
         }

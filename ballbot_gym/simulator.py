@@ -128,7 +128,7 @@ class Marker:
 class Scene:
     """Draws the ballbot on a floor with a grid, through PyBullet's software renderer or its window.
 
-    The camera follows the ball. A dark line along the body and the floor's 1 m squares make lean and speed readable.
+    The camera follows the ball; the floor's 1 m squares make speed readable.
     """
 
     def __init__(self, params: BallbotParams, human: bool = False, width: int = 640, height: int = 480):

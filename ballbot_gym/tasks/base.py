@@ -14,6 +14,19 @@ from ballbot_gym.simulator import Marker
 
 
 @dataclass(frozen=True)
+class Reference:
+    """A steady motion that linear control regulates towards, one point per control step: x (n, 8) and u (n, 2).
+
+    An open reference is followed in time and its last point kept; a single point is an equilibrium. A closed one repeats
+    for ever, and whoever follows it may join at any point.
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    closed: bool = False
+
+
+@dataclass(frozen=True)
 class Task(ABC):
     """A finite-horizon optimal-control problem, from which the episode's reward is −cost.
 
@@ -59,9 +72,21 @@ class Task(ABC):
         """Control steps in the longest episode."""
         return round(self.duration / self.control_dt)
 
+    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
+        """Draws an episode's constants (nc,)."""
+        return np.zeros(0)
+
     @abstractmethod
+    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
+        """Draws an initial state (8,) for constants c."""
+
     def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
         """Draws an episode: initial state (8,) and constants (nc,)."""
+        c = self.sample_constants(rng, params)
+        return self.sample_state(rng, c, params), c
+
+    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+        """Raises a ValueError that names the constant that makes no sense."""
 
     @abstractmethod
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
@@ -70,6 +95,17 @@ class Task(ABC):
     @abstractmethod
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         """Success iff every entry ≤ 0: at the first such state if `first_exit`, else at the end of the episode."""
+
+    @abstractmethod
+    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+        """The steady motion that linear control steers to from state x."""
+
+    @abstractmethod
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+        """Ground paths from state x from which optimizers start, one per basin worth trying, the likeliest first.
+
+        Each is (n+1, 2), m, one ball position per control step: n = `steps`, or less for first-exit tasks.
+        """
 
     @abstractmethod
     def observe(self, x: Vector, c: Vector) -> Vector:
@@ -90,6 +126,26 @@ class Task(ABC):
     def is_goal(self, x: Vector, c: Vector) -> bool:
         """Whether one state is in the goal."""
         return all(excess <= 0 for excess in self.goal(x, c))
+
+
+def cubic(
+    p0: np.ndarray, v0: np.ndarray, p1: np.ndarray, v1: np.ndarray, steps: int, dt: float
+) -> np.ndarray:
+    """(steps+1, 2) the cubic ground path from position and velocity to position and velocity, in SI units."""
+    s = np.linspace(0.0, 1.0, steps + 1)[:, None]
+    duration = steps * dt
+    return (
+        (1 + 2 * s) * (1 - s) ** 2 * p0
+        + s * (1 - s) ** 2 * duration * v0
+        + s**2 * (3 - 2 * s) * p1
+        + s**2 * (s - 1) * duration * v1
+    )
+
+
+def then_stay(path: np.ndarray, steps: int) -> np.ndarray:
+    """A path prolonged to (steps+1, 2) by its last point, or cut."""
+    rest = np.repeat(path[-1:], max(0, steps + 1 - len(path)), axis=0)
+    return np.concatenate([path, rest])[: steps + 1]
 
 
 def squared(*parts: Any) -> Any:

@@ -10,7 +10,9 @@ from ballbot_gym import dynamics, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.simulator import Marker
-from ballbot_gym.tasks.base import Task, scaled, squared
+from ballbot_gym.tasks.base import Reference, Task, cubic, scaled, squared, then_stay
+
+_GUESS_SECONDS = 2.5  # how long a guessed path takes to come to rest
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,10 @@ class Stabilize(Task):
     id = "BallbotStabilize-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0)
 
-    def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
         limits = (self.start_position, self.start_lean, self.start_speed, self.start_lean_rate)
         limit = np.repeat(limits, 2)
-        return rng.uniform(-limit, limit), np.zeros(0)
+        return rng.uniform(-limit, limit)
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         px, py, *rest = ops.components(x)
@@ -71,6 +73,14 @@ class Stabilize(Task):
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         return at_rest(x)
 
+    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+        return Reference(np.zeros((1, 8)), np.zeros((1, 2)))
+
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+        rest = np.zeros(2)
+        path = cubic(x[:2], x[4:6], rest, rest, round(_GUESS_SECONDS / self.control_dt), self.control_dt)
+        return [then_stay(path, self.steps)]
+
     def observe(self, x: Vector, c: Vector) -> Vector:
         return scaled(ops.components(x), self.observation_scale, like=x)
 
@@ -78,12 +88,12 @@ class Stabilize(Task):
         return [Marker((0.0, 0.0), 0.3, 0.01, (0.1, 0.6, 0.3, 1.0))]
 
 
-def at_rest(x: Vector) -> tuple[Any, ...]:
-    """≤ 0 iff within 0.1 m of the origin, slower than 0.1 m/s, tilted < 2° and turning slower than 0.1 rad/s."""
+def at_rest(x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
+    """≤ 0 iff within 0.1 m of a point, slower than 0.1 m/s, tilted < 2° and turning slower than 0.1 rad/s."""
     px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)
     return (
-        squared(px, py) - 0.1**2,
-        squared(vx, vy) - 0.1**2,
-        math.cos(math.radians(2)) - dynamics.cos_tilt(x),
-        squared(gamma_dot, theta_dot) - 0.1**2,
+        squared(px - x_goal, py - y_goal) / 0.1**2 - 1,
+        squared(vx, vy) / 0.1**2 - 1,
+        (1 - dynamics.cos_tilt(x)) / (1 - math.cos(math.radians(2))) - 1,
+        squared(gamma_dot, theta_dot) / 0.1**2 - 1,
     )

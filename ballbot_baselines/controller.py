@@ -1,0 +1,104 @@
+"""The controller protocol, and running a controller in an environment."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+
+from ballbot_gym.env import BallbotEnv
+from ballbot_gym.trajectory import Trajectory
+
+
+class Controller(Protocol):
+    """Anything that turns states into forces: LQR, a tracked plan, MPC, a learned policy."""
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        """Starts an episode at time t, s, in state x (8,) with constants c (nc,)."""
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Force (2,) N to hold until the next control step. What exceeds the limit is clipped by the robot."""
+
+
+@dataclass(frozen=True)
+class FunctionController:
+    """A plain function u = f(t, x) as a Controller."""
+
+    function: Callable[[float, np.ndarray], np.ndarray]
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        pass
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        return np.asarray(self.function(t, x), np.float64)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode under one controller.
+
+    `trajectory` holds the applied forces; `cost` is minus the return; `settle_time` the time from which on the goal held
+    until the end, s, or NaN; `act_seconds` the median wall time of `act`.
+    """
+
+    trajectory: Trajectory
+    constants: np.ndarray
+    cost: float
+    success: bool
+    failure: bool
+    settle_time: float
+    reset_seconds: float
+    act_seconds: float
+
+    @property
+    def peak_tilt(self) -> float:
+        """rad."""
+        return float(self.trajectory.tilt.max())
+
+
+def rollout(
+    env: gymnasium.Env, controller: Controller, seed: int | None = None, options: dict[str, Any] | None = None
+) -> Episode:
+    """Runs one episode.
+
+    Args:
+        env: a BallbotEnv, wrapped or not; its wrappers are bypassed.
+        controller: gets the true state, as every expert does.
+        seed, options: as for `env.reset`.
+
+    Raises:
+        Whatever the controller's `reset` raises, as a PlanError where no plan exists.
+    """
+    ballbot: BallbotEnv = env.unwrapped
+    task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
+    _, info = ballbot.reset(seed=seed, options=options)
+    x, c = info["state"], info["constants"]
+    start = time.perf_counter()
+    controller.reset(0.0, x, c)
+    reset_seconds = time.perf_counter() - start
+    states, forces, act_seconds, settled = [x], [], [], [task.is_goal(tuple(x), tuple(c))]
+    cost, done = 0.0, False
+    while not done:
+        start = time.perf_counter()
+        u = controller.act(len(forces) * dt, x)
+        act_seconds.append(time.perf_counter() - start)
+        _, reward, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
+        x, done = info["state"], terminated or truncated
+        cost -= reward
+        states.append(x)
+        forces.append(info["force"])
+        settled.append(task.is_goal(tuple(x), tuple(c)))
+    last_unsettled = max((k for k, inside in enumerate(settled) if not inside), default=-1)
+    return Episode(
+        trajectory=Trajectory(dt * np.arange(len(states)), np.array(states), np.array(forces)),
+        constants=c,
+        cost=cost,
+        success=info["success"],
+        failure=info["failure"],
+        settle_time=(last_unsettled + 1) * dt if settled[-1] else math.nan,
+        reset_seconds=reset_seconds,
+        act_seconds=float(np.median(act_seconds)),
+    )

@@ -1,0 +1,104 @@
+"""Linear models of the robot and quadratic models of a task's cost, by automatic differentiation."""
+
+from functools import cache
+
+import casadi
+import numpy as np
+
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+
+def linearize(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Linearizes the dynamics about one point.
+
+    Args:
+        params: the robot.
+        x: (8,) state; order and units in `dynamics.STATE`.
+        u: (2,) ball force, N.
+
+    Returns:
+        A: (8, 8) and B: (8, 2), with d(xdot) = A dx + B du. At the origin they are the paper's (5) and (6).
+    """
+    a, b = _derivative_jacobians(params)(x, u)
+    return np.array(a), np.array(b)
+
+
+def discretize(
+    params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Linearizes the control step (force held for dt s, RK4) about points of a trajectory.
+
+    Args:
+        params: the robot.
+        x: (n, 8) states.
+        u: (n, 2) forces, N.
+        dt: s.
+
+    Returns:
+        A: (n, 8, 8) and B: (n, 8, 2), with dx⁺ = A dx + B du.
+    """
+    n = len(x)
+    a, b = _step_jacobians(params, dt)(np.asarray(x).T, np.asarray(u).T)
+    return _blocks(a, n), _blocks(b, n)
+
+
+def quadratic_cost(task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Half the Hessian of the task's cost rate at points of a trajectory, made positive semidefinite.
+
+    For a quadratic cost xᵀQx + uᵀRu these are Q and R, 1/s.
+
+    Returns:
+        Q: (n, 8, 8) and R: (n, 2, 2). Mixed terms of x and u are left out; no task has any.
+    """
+    n = len(x)
+    q, r = _cost_hessians(task)(np.asarray(x).T, np.asarray(u).T, np.tile(np.asarray(c)[:, None], (1, n)))
+    return _semidefinite(0.5 * _blocks(q, n)), 0.5 * _blocks(r, n)
+
+
+def goal_weight(task: Task, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(8, 8) half the Hessian of the sum of the task's goal functions at x: about 1 per squared tolerance."""
+    return _semidefinite(0.5 * np.array(_goal_hessian(task)(x, c))[None])[0]
+
+
+@cache
+def _derivative_jacobians(params: BallbotParams) -> casadi.Function:
+    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
+    xdot = dynamics.derivative(params, x, u)
+    return casadi.Function("jacobians", [x, u], [casadi.jacobian(xdot, x), casadi.jacobian(xdot, u)])
+
+
+@cache
+def _step_jacobians(params: BallbotParams, dt: float) -> casadi.Function:
+    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
+    after = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
+    outputs = [casadi.densify(casadi.jacobian(after, x)), casadi.densify(casadi.jacobian(after, u))]
+    return casadi.Function("jacobians", [x, u], outputs, {"cse": True})
+
+
+@cache
+def _cost_hessians(task: Task) -> casadi.Function:
+    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
+    c = casadi.SX.sym("c", len(task.constant_names))
+    cost = task.cost(x, u, c)
+    outputs = [casadi.densify(casadi.hessian(cost, x)[0]), casadi.densify(casadi.hessian(cost, u)[0])]
+    return casadi.Function("hessians", [x, u, c], outputs)
+
+
+@cache
+def _goal_hessian(task: Task) -> casadi.Function:
+    x, c = casadi.SX.sym("x", 8), casadi.SX.sym("c", len(task.constant_names))
+    return casadi.Function("hessian", [x, c], [casadi.densify(casadi.hessian(sum(task.goal(x, c)), x)[0])])
+
+
+def _blocks(horizontal: casadi.DM, n: int) -> np.ndarray:
+    """(r, n·k) matrices side by side as (n, r, k)."""
+    array = np.array(horizontal)
+    return array.reshape(array.shape[0], n, -1).transpose(1, 0, 2)
+
+
+def _semidefinite(matrices: np.ndarray) -> np.ndarray:
+    """The nearest positive semidefinite matrices: negative curvature cannot weigh an error."""
+    values, vectors = np.linalg.eigh(matrices)
+    return (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)

@@ -1,0 +1,129 @@
+"""Linear-quadratic regulators: about an equilibrium, along a trajectory, and around a closed motion.
+
+All use the env's own discretization: force held for control_dt, cost summed over control steps. So about an equilibrium
+the env's cost from small states is xᵀPx exactly, but for the tail beyond the episode. `continuous_lqr` is the
+continuous-time limit, as in the paper.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from ballbot_baselines.linearize import discretize, goal_weight, linearize, quadratic_cost
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Reference, Task
+
+_MAX_ROUNDS = 50  # around a closed motion until the Riccati equation is periodic
+_GOAL_PRICE = 10.0  # cost charged per squared goal tolerance where a reference ends away from an equilibrium
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Feedback u = u_ref − K (x − x_ref), with cost-to-go (x − x_ref)ᵀ P (x − x_ref): K (n, 2, 8), P (n, 8, 8)."""
+
+    k: np.ndarray
+    p: np.ndarray
+
+
+def continuous_lqr(
+    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """K (2, 8) and P (8, 8) of continuous-time LQR about an equilibrium: ∫cost dt = xᵀPx under u = −Kx."""
+    a, b = linearize(params, x, u)
+    q, r = (weight[0] for weight in quadratic_cost(task, x[None], u[None], c))
+    p = scipy.linalg.solve_continuous_are(a, b, q, r)
+    return np.linalg.solve(r, b.T @ p), p
+
+
+def discrete_lqr(
+    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """K (2, 8) and P (8, 8) of LQR about an equilibrium for the env's steps: Σ cost·control_dt = xᵀPx."""
+    dt = task.control_dt
+    a, b = (matrix[0] for matrix in discretize(params, x[None], u[None], dt))
+    q, r = (weight[0] * dt for weight in quadratic_cost(task, x[None], u[None], c))
+    p = scipy.linalg.solve_discrete_are(a, b, q, r)
+    return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
+
+
+def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
+    """Whether state x (8,) stays where it is under force u (2,), to 1e-6."""
+    return bool(np.abs(dynamics.derivative(params, np.asarray(x), np.asarray(u))).max() < 1e-6)
+
+
+def final_weight(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(8, 8) cost-to-go at a trajectory's end: LQR's at an equilibrium, else the goal's tolerances, priced."""
+    if is_equilibrium(params, x, np.zeros(2)):
+        return discrete_lqr(task, params, x, np.zeros(2), c)[1]
+    return _GOAL_PRICE * goal_weight(task, x, c)
+
+
+def riccati(
+    a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final: np.ndarray
+) -> Gains:
+    """Time-varying LQR, backwards from the final cost-to-go.
+
+    Args:
+        a, b: (n, 8, 8), (n, 8, 2) linear step models.
+        q, r: (n, 8, 8), (n, 2, 2) cost of each step.
+        p_final: (8, 8).
+    """
+    k, p = np.zeros((len(a), 2, 8)), np.zeros((len(a), 8, 8))
+    after = p_final
+    for i in reversed(range(len(a))):
+        weighted = b[i].T @ after
+        k[i] = np.linalg.solve(r[i] + weighted @ b[i], weighted @ a[i])
+        after = q[i] + a[i].T @ after @ (a[i] - b[i] @ k[i])
+        after = 0.5 * (after + after.T)  # rounding would make it lopsided over hundreds of steps
+        p[i] = after
+    return Gains(k, p)
+
+
+def tracking_gains(
+    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, p_final: np.ndarray
+) -> Gains:
+    """Time-varying LQR along states x (n, 8) and forces u (n, 2) at control steps, weighted by the task's own cost."""
+    a, b = discretize(params, x, u, task.control_dt)
+    q, r = quadratic_cost(task, x, u, c)
+    return riccati(a, b, q * task.control_dt, r * task.control_dt, p_final)
+
+
+def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
+    """LQR around a closed motion: Riccati backwards round after round until it is periodic."""
+    gains = Gains(np.zeros((0, 2, 8)), np.eye(8)[None])
+    for _ in range(_MAX_ROUNDS):
+        before, gains = gains, tracking_gains(task, params, reference.x, reference.u, c, gains.p[0])
+        if np.allclose(before.p[0], gains.p[0], rtol=1e-6):
+            return gains
+    raise RuntimeError(f"LQR around the closed motion of {task.id} found no periodic gain in {_MAX_ROUNDS} rounds")
+
+
+class LqrController:
+    """Linear control towards the task's steady reference motion, from the task's own cost.
+
+    About an equilibrium the gain is constant. Along an open reference it is the time-varying LQR that arrives at its end,
+    and around a closed one the periodic LQR at the nearest of its points.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams):
+        self._task, self._params = task, params
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        task, params = self._task, self._params
+        self._start = t
+        self._reference = reference = task.reference(x, c, params)
+        if reference.closed:
+            self._gains = closed_gains(task, params, reference, c)
+        else:
+            p_final = final_weight(task, params, reference.x[-1], c)
+            self._gains = tracking_gains(task, params, reference.x, reference.u, c, p_final)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        reference = self._reference
+        if reference.closed:
+            i = int(np.argmin(np.sum((reference.x[:, :2] - x[:2]) ** 2, axis=1)))
+        else:
+            i = min(round((t - self._start) / self._task.control_dt), len(reference.x) - 1)
+        return reference.u[i] - self._gains.k[i] @ (x - reference.x[i])

@@ -1,0 +1,248 @@
+"""The optimum of any episode of any task, on the env's own discretization.
+
+    minimize   Σ_k cost(x_k, u_k, c)·control_dt        over forces u_k, |u_k| ≤ limit, held for control_dt
+    subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n.
+
+So an episode under physics="rk4" that applies the optimal forces returns minus this cost. The problem is solved by multiple
+shooting from each of the task's guessed paths, and the best solution is kept: a local optimum certified feasible, and as
+global as the guesses.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import casadi
+import numpy as np
+
+from ballbot_baselines import guess
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
+
+FEASIBLE = 1e-6
+"""Largest constraint violation of an optimum, in SI units."""
+
+_FREE_TIME_INTERVALS = 60
+_CONSIDERED = 8  # guesses tried at most by default; tasks name the likeliest first
+
+
+class PlanError(RuntimeError):
+    """No plan was found; the message gives each try's solver, status and constraint violation."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The best episode found: its cost, trajectory (forces held), and what the solver said of it.
+
+    `guess` is the index of the task's guessed path that led there; `seconds` the wall time of all tries.
+    """
+
+    cost: float
+    trajectory: Trajectory
+    status: str
+    violation: float
+    iterations: int
+    solver: str
+    guess: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Backoff:
+    """How far a plan keeps from its limits, so that what tracks it stays within them.
+
+    `margin` is in the unit of the task's margins (obstacles: m), `goal` the fraction of the goal's tolerance that is not
+    used, `force` the fraction of the force limit kept for feedback.
+    """
+
+    # The defaults make up for the solvers' tolerance, so that optimal forces and states truly are within the limits.
+    margin: float = 1e-7
+    goal: float = 1e-6
+    force: float = 1e-7
+
+
+def find_optimum(
+    task: Task,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff = Backoff(),
+    guesses: int = _CONSIDERED,
+    paths: list[np.ndarray] | None = None,
+) -> Optimum:
+    """The cheapest episode from state x0 with constants c.
+
+    Args:
+        task: the problem.
+        params: the robot.
+        x0: (8,) initial state.
+        c: (nc,) constants of the episode.
+        backoff: distance kept from limits; none for the true optimum.
+        guesses: how many of the task's guessed paths to try at most.
+        paths: ground paths to start from instead of the task's.
+
+    Raises:
+        PlanError: no try converged to a feasible episode.
+    """
+    x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
+    paths = task.guess_paths(x0, c, params)[:guesses] if paths is None else paths
+    solve = _solve_first_exit if task.first_exit else _solve_fixed_time
+    best: tuple[int, OcpSolution] | None = None
+    tried: list[OcpSolution] = []
+    for index, path in enumerate(paths):
+        solutions = solve(task, params, x0, c, backoff, path)
+        tried += solutions
+        for solution in solutions:
+            if is_feasible(solution) and (best is None or solution.cost < best[1].cost):
+                best = index, solution
+    if best is None:
+        tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for s in tried)
+        raise PlanError(f"{task.id}: no feasible episode from x = {x0.tolist()}, c = {c.tolist()} ({tries})")
+    index, solution = best
+    return Optimum(
+        cost=solution.cost,
+        trajectory=Trajectory(
+            task.control_dt * np.arange(len(solution.states)), solution.states, params.force_limit * solution.inputs
+        ),
+        status=solution.status,
+        violation=solution.violation,
+        iterations=solution.iterations,
+        solver=solution.solver,
+        guess=index,
+        seconds=sum(s.seconds for s in tried),
+    )
+
+
+def is_feasible(solution: OcpSolution) -> bool:
+    """Converged, and within `FEASIBLE` of every constraint."""
+    return solution.success and solution.violation < FEASIBLE
+
+
+def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
+    """A task on its env's discretization. Inputs are actions, force / limit; p = [c, margin backoff, goal backoff]."""
+    nc = len(task.constant_names)
+    dt, limit = task.control_dt, params.force_limit
+
+    def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
+        return casadi.vertcat(*task.margins(x, p[:nc])) - p[nc]
+
+    def final(x: casadi.SX, p: casadi.SX) -> casadi.SX:
+        if not task.first_exit:
+            return margins(x, p)
+        return casadi.vertcat(margins(x, p), _goal_room(task, x, p, nc))
+
+    return Ocp(
+        name=f"{task.id}",
+        states=8,
+        inputs=2,
+        params=nc + 2,
+        next=lambda x, a, p: dynamics.step(params, x, limit * a, dt, dynamics.substeps_for(dt)),
+        cost=lambda x, a, p: task.cost(x, limit * a, p[:nc]) * dt,
+        inequalities=lambda x, a, p: margins(x, p),
+        final_inequalities=final,
+    )
+
+
+def free_time_ocp(task: Task, params: BallbotParams) -> Ocp:
+    """A first-exit task over intervals of one free length h, the ninth state; it finds about when to arrive."""
+    nc = len(task.constant_names)
+    fixed, limit = shooting_ocp(task, params), params.force_limit
+    return replace(
+        fixed,
+        name=f"{task.id}-free-time",
+        states=9,
+        next=lambda s, a, p: casadi.vertcat(dynamics.step(params, s[:8], limit * a, s[8], 2), s[8]),
+        cost=lambda s, a, p: task.cost(s[:8], limit * a, p[:nc]) * s[8],
+        inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
+        final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], p),
+    )
+
+
+def _goal_room(task: Task, x: casadi.SX, p: casadi.SX, nc: int) -> casadi.SX:
+    # Goal functions are normalized, q/tolerance² − 1: keeping a fraction b of the tolerance asks (1−b)² − 1 − g ≥ 0.
+    return (1 - p[nc + 1]) ** 2 - 1 - casadi.vertcat(*task.goal(x, p[:nc]))
+
+
+@lru_cache(maxsize=64)
+def _solver(task: Task, params: BallbotParams, steps: int, solver: str) -> OcpSolver:
+    return OcpSolver(shooting_ocp(task, params), steps, solver)
+
+
+@lru_cache(maxsize=8)
+def _free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolver:
+    return OcpSolver(free_time_ocp(task, params), _FREE_TIME_INTERVALS, solver)
+
+
+def _bounds(ocp: Ocp, n: int, x0: np.ndarray, backoff: Backoff) -> Bounds:
+    bounds = Bounds.free(ocp, n)
+    bounds.state_lower[0, :8] = bounds.state_upper[0, :8] = x0
+    bounds.input_lower[:], bounds.input_upper[:] = backoff.force - 1, 1 - backoff.force
+    return bounds
+
+
+def _solve_from(
+    task: Task, params: BallbotParams, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff
+) -> list[OcpSolution]:
+    """fatrop from guessed states (n+1, 8) and actions (n, 2), and where it fails ipopt from the same guess."""
+    solutions = []
+    for name in ("fatrop", "ipopt"):
+        solver = _solver(task, params, len(a), name)
+        bounds = _bounds(solver.ocp, len(a), x[0], backoff)
+        solutions.append(solver.solve(x, a, bounds, [*c, backoff.margin, backoff.goal]))
+        if is_feasible(solutions[-1]):
+            break
+    return solutions
+
+
+def _solve_fixed_time(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, path: np.ndarray
+) -> list[OcpSolution]:
+    x, u = guess.along_path(params, path, task.control_dt, start=x0)
+    return _solve_from(task, params, x, u / params.force_limit, c, backoff)
+
+
+def _solve_first_exit(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, path: np.ndarray
+) -> list[OcpSolution]:
+    """Finds the best time with free interval length, then the best whole number of control steps about it."""
+    n, dt = _FREE_TIME_INTERVALS, task.control_dt
+    duration = (len(path) - 1) * dt
+    h = duration / n
+    x, u = guess.along_path(params, guess.resampled(path, n), h, start=x0)
+    for name in ("fatrop", "ipopt"):
+        solver = _free_time_solver(task, params, name)
+        bounds = _bounds(solver.ocp, n, x0, backoff)
+        bounds.state_lower[:, 8], bounds.state_upper[:, 8] = dt / 4, task.duration / n
+        relaxed = solver.solve(
+            np.column_stack([x, np.full(n + 1, h)]), u / params.force_limit, bounds, [*c, backoff.margin, backoff.goal]
+        )
+        if is_feasible(relaxed):
+            break
+    else:
+        return [relaxed]
+    arrival = relaxed.states[0, 8] * n / dt  # in control steps, not whole
+    steps = min(max(1, math.ceil(arrival)), task.steps)
+    solutions = {steps: _at_steps(task, params, c, backoff, relaxed, steps)}
+    for direction in (-1, 1):
+        nearby = steps + direction
+        while 1 <= nearby <= task.steps:
+            solutions[nearby] = _at_steps(task, params, c, backoff, relaxed, nearby)
+            if not _better(solutions[nearby][-1], solutions[nearby - direction][-1]):
+                break
+            nearby += direction
+    return [solution for group in solutions.values() for solution in group]
+
+
+def _better(a: OcpSolution, b: OcpSolution) -> bool:
+    return is_feasible(a) and (not is_feasible(b) or a.cost < b.cost)
+
+
+def _at_steps(
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, relaxed: OcpSolution, steps: int
+) -> list[OcpSolution]:
+    x = guess.resampled(relaxed.states[:, :8], steps)
+    a = guess.resampled(np.vstack([relaxed.inputs, relaxed.inputs[-1:]]), steps)[:-1]
+    return _solve_from(task, params, x, a, c, backoff)

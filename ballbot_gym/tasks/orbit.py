@@ -1,0 +1,171 @@
+"""BallbotOrbit-v0: ride a circle at a commanded speed."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import ops
+from ballbot_gym.ops import Vector
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.simulator import Marker
+from ballbot_gym.tasks.base import Reference, Task, scaled, squared
+
+_GUESS_SECONDS = 1.5  # how long a guessed path takes to reach its speed
+
+
+@dataclass(frozen=True)
+class Orbit(Task):
+    """Ride a circle about the origin at a commanded speed, leaning 10° to 45° inwards (the paper's Fig. 5a).
+
+    Observation, float32 (13,):
+
+    | number | quantity | divided by | unit |
+    |---|---|---|---|
+    | 0, 1 | ball position x, y | 3 | m |
+    | 2, 3 | lean γ, θ | 1 | rad |
+    | 4, 5 | ball velocity ẋ, ẏ | 5 | m/s |
+    | 6, 7 | lean rate γ̇, θ̇ | 5 | rad/s |
+    | 8 | radius error (x² + y² − r²) / 2r | 1 | m |
+    | 9, 10 | velocity error, ball velocity less (v/r)(−y, x) | 5 | m/s |
+    | 11 | radius r | 3 | m |
+    | 12 | speed v | 5 | m/s |
+
+    Action, float32 (2,) in [−1, 1]: force Fx, Fy on the ball, in units of 350 N.
+
+    Constants, set by `reset(options={"constants": {"radius": 1.0, "speed": 4.0}})`:
+
+    | name | meaning | unit | range |
+    |---|---|---|---|
+    | radius | r of the circle | m | drawn from [`min_radius`, `max_radius`] = [1, 3]; set to any > 0.8 |
+    | speed | v along it, counter-clockwise if positive | m/s | drawn so that the steady tilt is uniform in [10°, 45°] |
+
+    Start: at rest, upright, at a uniformly random bearing on the circle.
+
+    Cost rate: 10 e_r² + 2 |e_v|² + 0.02 (γ̇² + θ̇²) + 5e-5 (Fx² + Fy²), with e_r and e_v the errors observed.
+
+    Ends: tilt beyond `max_tilt` fails; after `duration` the episode is truncated, a success if the ball is then within
+    0.2 m of the circle and 0.6 m/s of its velocity.
+    """
+
+    radius_weight: float = 10.0
+    """Of e_r², 1/(m² s)."""
+    velocity_weight: float = 2.0
+    """Of |e_v|², s/m²."""
+    lean_rate_weight: float = 0.02
+    """Of γ̇² + θ̇², s."""
+    effort_weight: float = 5e-5
+    """Of Fx² + Fy², 1/(N² s)."""
+    min_radius: float = 1.0
+    """m."""
+    max_radius: float = 3.0
+    """m."""
+    min_steady_tilt: float = math.radians(10)
+    """rad."""
+    max_steady_tilt: float = math.radians(45)
+    """rad."""
+
+    id = "BallbotOrbit-v0"
+    observation_scale = (3.0, 3.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 1.0, 5.0, 5.0, 3.0, 5.0)
+    constant_names = ("radius", "speed")
+
+    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
+        radius = rng.uniform(self.min_radius, self.max_radius)
+        speed = orbit_speed(params, radius, rng.uniform(self.min_steady_tilt, self.max_steady_tilt))
+        return np.array([radius, speed * rng.choice([-1.0, 1.0])])
+
+    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+        smallest = params.pivot_inertia / params.first_moment
+        if c[0] <= smallest:
+            raise ValueError(f"{self.id}: radius must exceed {smallest:.3f} m, not {c[0]:g}")
+        if c[1] == 0:
+            raise ValueError(f"{self.id}: speed must not be 0")
+
+    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
+        bearing = rng.uniform(0, 2 * math.pi)
+        return np.array([c[0] * math.cos(bearing), c[0] * math.sin(bearing), 0, 0, 0, 0, 0, 0])
+
+    def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
+        radius_error, vx_error, vy_error = self._errors(x, c)
+        *_, gamma_dot, theta_dot = ops.components(x)
+        return (
+            self.radius_weight * squared(radius_error)
+            + self.velocity_weight * squared(vx_error, vy_error)
+            + self.lean_rate_weight * squared(gamma_dot, theta_dot)
+            + self.effort_weight * squared(*ops.components(u))
+        )
+
+    def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        radius_error, vx_error, vy_error = self._errors(x, c)
+        return (squared(radius_error) / 0.2**2 - 1, squared(vx_error, vy_error) / 0.6**2 - 1)
+
+    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+        """One round of the steady orbit, counted from the bearing of x."""
+        rate = c[1] / c[0]
+        steps = max(8, round(2 * math.pi / abs(rate) / self.control_dt))
+        start = math.atan2(x[1], x[0])
+        bearings = start + math.copysign(2 * math.pi, rate) * np.arange(steps) / steps
+        states, forces = steady_orbit(params, c[0], c[1], bearings)
+        return Reference(states, forces, closed=True)
+
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+        """Along the circle, gathering speed."""
+        t = self.control_dt * np.arange(self.steps + 1)
+        progress = np.where(t < _GUESS_SECONDS, t**2 / (2 * _GUESS_SECONDS), t - _GUESS_SECONDS / 2)  # s
+        bearing = math.atan2(x[1], x[0]) + c[1] / c[0] * progress
+        return [c[0] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)]
+
+    def observe(self, x: Vector, c: Vector) -> Vector:
+        parts = (*ops.components(x), *self._errors(x, c), *ops.components(c))
+        return scaled(parts, self.observation_scale, like=x)
+
+    def markers(self, c: np.ndarray) -> list[Marker]:
+        return [Marker((0.0, 0.0), float(c[0]), 0.03, (0.85, 0.1, 0.15, 1.0), ring=True)]
+
+    def _errors(self, x: Vector, c: Vector) -> tuple[Any, Any, Any]:
+        """Radius error, m, and velocity error, m/s: polynomials, so smooth at the origin too."""
+        px, py, _, _, vx, vy, _, _ = ops.components(x)
+        radius, speed = ops.components(c)
+        rate = speed / radius
+        return (squared(px, py) - radius * radius) / (2 * radius), vx + rate * py, vy - rate * px
+
+
+def orbit_speed(params: BallbotParams, radius: float, tilt: float) -> float:
+    """Speed, m/s, at which a steady orbit of this radius, m, leans inwards by this tilt, rad.
+
+    With J = I + ml², h = ml and Ω = v/r: tan(tilt)·(hg + JΩ² cos(tilt)) = hΩ² r. The body's axial inertia, under 0.2 % of
+    J here, is left out.
+    """
+    h, inertia = params.first_moment, params.pivot_inertia
+    rate2 = h * params.gravity * math.tan(tilt) / (h * radius - inertia * math.sin(tilt))
+    return radius * math.sqrt(rate2)
+
+
+def orbit_tilt(params: BallbotParams, radius: float, speed: float) -> float:
+    """Steady inward tilt, rad: the inverse of `orbit_speed`, by bisection (it grows with speed)."""
+    low, high = 0.0, math.atan(1e3)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        h, inertia = params.first_moment, params.pivot_inertia
+        too_fast = inertia * math.sin(middle) >= h * radius
+        low, high = (low, middle) if too_fast or orbit_speed(params, radius, middle) > abs(speed) else (middle, high)
+    return 0.5 * (low + high)
+
+
+def steady_orbit(
+    params: BallbotParams, radius: float, speed: float, bearings: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 8) and forces (n, 2) of the steady orbit at ball bearings (n,), rad."""
+    tilt, rate = orbit_tilt(params, radius, speed), speed / radius
+    outward = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    along = np.stack([-np.sin(bearings), np.cos(bearings)], axis=1)
+    axis, axis_dot = -math.sin(tilt) * outward, -math.sin(tilt) * rate * along  # of n_x, n_y
+    theta = np.arcsin(axis[:, 1])
+    gamma = np.arctan2(axis[:, 0], math.cos(tilt))
+    theta_dot = axis_dot[:, 1] / np.cos(theta)
+    gamma_dot = axis_dot[:, 0] * math.cos(tilt) / (math.cos(tilt) ** 2 + axis[:, 0] ** 2)
+    states = np.column_stack([radius * outward, gamma, theta, speed * along, gamma_dot, theta_dot])
+    com_radius = radius - params.com_height * math.sin(tilt)
+    pull = rate**2 * (params.ball_mass * radius + params.body_mass * com_radius)
+    return states, -pull * outward

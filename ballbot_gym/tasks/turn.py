@@ -1,0 +1,125 @@
+"""BallbotTurn-v0: a 90° turn through a gate at speed."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import dynamics, ops
+from ballbot_gym.ops import Vector
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.simulator import Marker
+from ballbot_gym.tasks.base import Reference, Task, cubic, scaled, squared
+
+_START, _GATE = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # m, the paper's turn
+_LINEAR_SECONDS = 2.0  # when LQR means to pass the gate; of 1.0, 1.5, … 4.0 s the one that passes most often
+
+
+@dataclass(frozen=True)
+class Turn(Task):
+    """Turn by 90°: from (0, −1) moving (0, v) through the gate at (1, 0) moving (v, 0), as in the paper's Fig. 4.
+
+    Observation, float32 (9,):
+
+    | number | quantity | divided by | unit |
+    |---|---|---|---|
+    | 0, 1 | ball position relative to the gate | 5 | m |
+    | 2, 3 | lean γ, θ | 1 | rad |
+    | 4, 5 | ball velocity less the gate's (v, 0) | 5 | m/s |
+    | 6, 7 | lean rate γ̇, θ̇ | 5 | rad/s |
+    | 8 | speed v | 5 | m/s |
+
+    Action, float32 (2,) in [−1, 1]: force Fx, Fy on the ball, in units of 350 N.
+
+    Constants, drawn uniformly, set by `reset(options={"constants": {"speed": 3.0}})`:
+
+    | name | meaning | unit | range |
+    |---|---|---|---|
+    | speed | v at the start and at the gate | m/s | drawn from [`min_speed`, `max_speed`] = [2, 10]; set to any in (0, 12] |
+
+    Cost rate: 5 + ½(γ² + θ² + γ̇² + θ̇²) + 2e-4 (Fx² + Fy²): time, lean and effort, as in the paper's problem 1.
+
+    Ends: within 0.2 m of the gate, 0.5 m/s of its velocity, tilt < 10° and lean rate < 1 rad/s at once: success, and no
+    further cost. Tilt beyond `max_tilt` fails. After `duration` the episode is truncated.
+    """
+
+    time_weight: float = 5.0
+    """Cost of a second, 1/s."""
+    lean_weight: float = 0.5
+    """Of squared leans and lean rates, in SI units, 1/s."""
+    effort_weight: float = 2e-4
+    """Of Fx² + Fy², 1/(N² s)."""
+    min_speed: float = 2.0
+    """m/s."""
+    max_speed: float = 10.0
+    """m/s."""
+
+    id = "BallbotTurn-v0"
+    observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 5.0)
+    constant_names = ("speed",)
+    first_exit = True
+
+    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
+        return rng.uniform(self.min_speed, self.max_speed, 1)
+
+    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+        if not 0 < c[0] <= 12:
+            raise ValueError(f"{self.id}: speed must be in (0, 12] m/s, not {c[0]:g}")
+
+    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
+        return np.array([*_START, 0.0, 0.0, 0.0, c[0], 0.0, 0.0])
+
+    def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
+        _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)
+        return (
+            self.time_weight
+            + self.lean_weight * squared(gamma, theta, gamma_dot, theta_dot)
+            + self.effort_weight * squared(*ops.components(u))
+        )
+
+    def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)
+        (speed,) = ops.components(c)
+        return (
+            squared(px - _GATE[0], py - _GATE[1]) / 0.2**2 - 1,
+            squared(vx - speed, vy) / 0.5**2 - 1,
+            (1 - dynamics.cos_tilt(x)) / (1 - math.cos(math.radians(10))) - 1,
+            squared(gamma_dot, theta_dot) - 1,
+        )
+
+    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+        """The straight motion at (v, 0) that passes the gate after `_LINEAR_SECONDS`."""
+        steps = round(_LINEAR_SECONDS / self.control_dt)
+        to_go = self.control_dt * np.arange(-steps, 1)
+        states = np.zeros((steps + 1, 8))
+        states[:, 0] = _GATE[0] + c[0] * to_go
+        states[:, 1] = _GATE[1]
+        states[:, 4] = c[0]
+        return Reference(states, np.zeros((steps + 1, 2)))
+
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+        """Cubics to the gate, which at speed bulge into the direct turn, and into the loop of 270° on its left."""
+        gate_velocity = np.array([c[0], 0.0])
+        paths = []
+        for seconds in (1.5, 3.0, 5.0):
+            steps = round(min(seconds, self.duration) / self.control_dt)
+            paths.append(cubic(x[:2], x[4:6], _GATE, gate_velocity, steps, self.control_dt))
+        # past the gate's line, around to the left, and through the gate from behind
+        reach = max(1.0, 0.08 * c[0] ** 2)  # m: about the radius of a turn at full force
+        over = np.array([-reach, reach])
+        steps = round(2.0 / self.control_dt)
+        half = cubic(x[:2], x[4:6], over, np.array([-c[0], -c[0]]) / 2, steps, self.control_dt)
+        back = cubic(over, np.array([-c[0], -c[0]]) / 2, _GATE, gate_velocity, steps, self.control_dt)
+        paths.append(np.concatenate([half, back[1:]]))
+        return paths
+
+    def observe(self, x: Vector, c: Vector) -> Vector:
+        px, py, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)
+        (speed,) = ops.components(c)
+        parts = (px - _GATE[0], py - _GATE[1], gamma, theta, vx - speed, vy, gamma_dot, theta_dot, speed)
+        return scaled(parts, self.observation_scale, like=x)
+
+    def markers(self, c: np.ndarray) -> list[Marker]:
+        color = (0.85, 0.1, 0.15, 1.0)
+        return [Marker((_GATE[0], _GATE[1] + side), 0.04, 0.9, color) for side in (-0.35, 0.35)]

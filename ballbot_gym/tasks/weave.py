@@ -1,0 +1,184 @@
+"""BallbotWeave-v0: through a slalom of round obstacles, and to rest behind it."""
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import ops
+from ballbot_gym.ops import Vector
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.simulator import Marker
+from ballbot_gym.tasks.base import Reference, Task, scaled, squared, then_stay
+from ballbot_gym.tasks.stabilize import at_rest
+
+MAX_OBSTACLES = 5
+
+_GUESS_SECONDS = 3.5  # how long a guessed path takes to the goal
+
+
+@dataclass(frozen=True)
+class Weave(Task):
+    """Weave through 2 to 5 round obstacles and come to rest behind them (the paper's Fig. 5b).
+
+    Observation, float32 (23,):
+
+    | number | quantity | divided by | unit |
+    |---|---|---|---|
+    | 0, 1 | ball position relative to the goal | 5 | m |
+    | 2, 3 | lean γ, θ | 1 | rad |
+    | 4, 5 | ball velocity ẋ, ẏ | 5 | m/s |
+    | 6, 7 | lean rate γ̇, θ̇ | 5 | rad/s |
+    | 8 + 3i, 9 + 3i | centre of obstacle i relative to the ball, i = 0 … 4 | 5 | m |
+    | 10 + 3i | its radius | 1 | m |
+
+    Action, float32 (2,) in [−1, 1]: force Fx, Fy on the ball, in units of 350 N.
+
+    Constants, set by `reset(options={"constants": {"goal_x": 8.0, ...}})`:
+
+    | name | meaning | unit | range |
+    |---|---|---|---|
+    | goal_x, goal_y | where to rest | m | goal_x drawn from [6, 9], goal_y 0 |
+    | obstacle{i}_x, _y | centre of obstacle i | m | at least 1.2 m before and behind it are free along x |
+    | obstacle{i}_radius | | m | [0.25, 0.45]; set to any > 0 |
+
+    Obstacles are numbered along the way, and alternate about the straight line; unused numbers repeat the last one.
+
+    Start: at rest, upright, at (0, y) with |y| ≤ 0.3 m.
+
+    Cost rate: as Stabilize's, about the goal.
+
+    Ends: touching an obstacle with the ball, or tilt beyond `max_tilt`, fails; after `duration` the episode is truncated,
+    a success if the robot then rests at the goal by Stabilize's tolerances.
+    """
+
+    position_weight: float = 1.0
+    """Of the squared distance to the goal, 1/(m² s)."""
+    rest_weight: float = 0.5
+    """Of squared leans, speeds and lean rates, in SI units, 1/s."""
+    effort_weight: float = 5e-4
+    """Of Fx² + Fy², 1/(N² s)."""
+    ball_radius: float = 0.1
+    """The robot's, m."""
+
+    id = "BallbotWeave-v0"
+    observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0) + (5.0, 5.0, 1.0) * MAX_OBSTACLES
+    constant_names = ("goal_x", "goal_y") + tuple(
+        f"obstacle{i}_{what}" for i in range(MAX_OBSTACLES) for what in ("x", "y", "radius")
+    )
+
+    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
+        count = int(rng.integers(2, MAX_OBSTACLES + 1))
+        distance = rng.uniform(6.0, 9.0)
+        # free stretches of at least 1.2 m before, between and behind, the rest of the way shared out at random
+        stretches = 1.2 + (distance - 1.2 * (count + 1)) * rng.dirichlet(np.full(count + 1, 2.0))
+        x = np.cumsum(stretches)[:-1]
+        side = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(count)
+        y = side * rng.uniform(0.1, 0.35, count)
+        radius = rng.uniform(0.25, 0.45, count)
+        obstacles = np.column_stack([x, y, radius])
+        padded = np.concatenate([obstacles, np.repeat(obstacles[-1:], MAX_OBSTACLES - count, axis=0)])
+        return np.concatenate([[distance, 0.0], padded.ravel()])
+
+    def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
+        goal, obstacles = split_constants(c)
+        for i, (x, y, radius) in enumerate(obstacles):
+            if radius <= 0:
+                raise ValueError(f"{self.id}: obstacle{i}_radius must be positive, not {radius:g} m")
+            if np.hypot(x - goal[0], y - goal[1]) <= radius + self.ball_radius:
+                raise ValueError(f"{self.id}: the goal lies in obstacle {i}")
+
+    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
+        return np.array([0.0, rng.uniform(-0.3, 0.3), 0, 0, 0, 0, 0, 0])
+
+    def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
+        px, py, *rest = ops.components(x)
+        x_goal, y_goal, *_ = ops.components(c)
+        return (
+            self.position_weight * squared(px - x_goal, py - y_goal)
+            + self.rest_weight * squared(*rest)
+            + self.effort_weight * squared(*ops.components(u))
+        )
+
+    def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        px, py, *_ = ops.components(x)
+        _, _, *obstacles = ops.components(c)
+        clearances = []
+        for i in range(MAX_OBSTACLES):
+            ox, oy, radius = obstacles[3 * i : 3 * i + 3]
+            reach = radius + self.ball_radius
+            # about the distance to contact, m, and smooth everywhere
+            clearances.append((squared(px - ox, py - oy) - reach * reach) / (2 * reach))
+        return (*super().margins(x, c), *clearances)
+
+    def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        x_goal, y_goal, *_ = ops.components(c)
+        return at_rest(x, x_goal, y_goal)
+
+    def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
+        """At rest at the goal: linear control knows nothing of obstacles."""
+        rest = np.zeros((1, 8))
+        rest[0, :2] = c[:2]
+        return Reference(rest, np.zeros((1, 2)))
+
+    def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
+        """A path for every choice of sides, the least curved first."""
+        goal, obstacles = split_constants(c)
+        paths = [self.side_path(x, goal, obstacles, sides) for sides in itertools.product((-1, 1), repeat=len(obstacles))]
+        paths.sort(key=lambda path: np.sum(np.diff(path, 2, axis=0) ** 2))
+        return paths
+
+    def side_path(
+        self, x: np.ndarray, goal: np.ndarray, obstacles: np.ndarray, sides: tuple[int, ...]
+    ) -> np.ndarray:
+        """From rest to rest, passing obstacle i on the left where sides[i] = 1, on the right where it is −1."""
+        clearance = obstacles[:, 2] + self.ball_radius + 0.1
+        knots_x = np.concatenate([[x[0]], obstacles[:, 0], [goal[0]]])
+        knots_y = np.concatenate([[x[1]], obstacles[:, 1] + np.array(sides) * clearance, [goal[1]]])
+        s = np.minimum(self.control_dt * np.arange(self.steps + 1) / _GUESS_SECONDS, 1.0)
+        along = x[0] + (goal[0] - x[0]) * s**3 * (10 - 15 * s + 6 * s**2)  # minimum jerk
+        return then_stay(np.column_stack([along, _smooth(knots_x, knots_y, along)]), self.steps)
+
+    def observe(self, x: Vector, c: Vector) -> Vector:
+        px, py, *rest = ops.components(x)
+        x_goal, y_goal, *obstacles = ops.components(c)
+        parts = [px - x_goal, py - y_goal, *rest]
+        for i in range(MAX_OBSTACLES):
+            ox, oy, radius = obstacles[3 * i : 3 * i + 3]
+            parts += [ox - px, oy - py, radius]
+        return scaled(tuple(parts), self.observation_scale, like=x)
+
+    def markers(self, c: np.ndarray) -> list[Marker]:
+        goal, obstacles = split_constants(c)
+        posts = [Marker((x, y), radius, 0.25, (0.75, 0.1, 0.15, 1.0)) for x, y, radius in obstacles.tolist()]
+        return [*posts, Marker((float(goal[0]), float(goal[1])), 0.3, 0.01, (0.1, 0.6, 0.3, 1.0))]
+
+
+def split_constants(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Goal (2,) and the distinct obstacles (n, 3): x, y, radius, m, in the order of their numbers."""
+    obstacles = np.asarray(c[2:]).reshape(MAX_OBSTACLES, 3)
+    distinct = [i for i in range(MAX_OBSTACLES) if i == 0 or not (obstacles[i] == obstacles[i - 1]).all()]
+    return np.asarray(c[:2]), obstacles[distinct]
+
+
+def sides_passed(path: np.ndarray, c: np.ndarray) -> tuple[int, ...]:
+    """For each obstacle, 1 if the path (n, 2) passes it on the left (greater y) where it is nearest to it, else −1."""
+    _, obstacles = split_constants(c)
+    nearest = [np.argmin(np.hypot(*(path - obstacle[:2]).T)) for obstacle in obstacles]
+    return tuple(1 if path[k, 1] > o[1] else -1 for k, o in zip(nearest, obstacles, strict=True))
+
+
+def _smooth(knots_x: np.ndarray, knots_y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Cubic Hermite interpolation with Catmull–Rom slopes, flat at both ends."""
+    slopes = np.zeros_like(knots_y)
+    slopes[1:-1] = (knots_y[2:] - knots_y[:-2]) / (knots_x[2:] - knots_x[:-2])
+    i = np.clip(np.searchsorted(knots_x, x, side="right") - 1, 0, len(knots_x) - 2)
+    h = knots_x[i + 1] - knots_x[i]
+    s = (x - knots_x[i]) / h
+    return (
+        (1 + 2 * s) * (1 - s) ** 2 * knots_y[i]
+        + s * (1 - s) ** 2 * h * slopes[i]
+        + s**2 * (3 - 2 * s) * knots_y[i + 1]
+        + s**2 * (s - 1) * h * slopes[i + 1]
+    )

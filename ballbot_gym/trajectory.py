@@ -1,0 +1,117 @@
+"""Trajectory: states and forces over time, with interpolation and a file format."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ballbot_gym import files
+
+
+class TrajectoryError(ValueError):
+    """A trajectory whose arrays do not fit together, or a file that holds none."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """States at increasing times, with the forces between them.
+
+    t: (N+1,) s. x: (N+1, 8); order and units in `dynamics.STATE`. u: (N, 2) N where each force is held until the next
+    time, or (N+1, 2) where it runs linearly between times. xdot: (N+1, 8) slopes of x, if known: with them x is
+    interpolated by cubics, else linearly.
+
+    Raises:
+        TrajectoryError: shapes that do not fit, times that do not increase, or values that are not finite.
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    u: np.ndarray
+    xdot: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("t", "x", "u", "xdot"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, np.asarray(value, np.float64))
+        n = len(self.t) - 1
+        if n < 0 or self.t.shape != (n + 1,) or self.x.shape != (n + 1, 8):
+            raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, 8)")
+        if self.u.shape not in ((n, 2), (n + 1, 2)):
+            raise TrajectoryError(f"u {self.u.shape} must be ({n}, 2), held, or ({n + 1}, 2), linear")
+        if self.xdot is not None and self.xdot.shape != self.x.shape:
+            raise TrajectoryError(f"xdot {self.xdot.shape} must have the shape of x, {self.x.shape}")
+        arrays = (self.t, self.x, self.u) if self.xdot is None else (self.t, self.x, self.u, self.xdot)
+        if not all(np.isfinite(array).all() for array in arrays):
+            raise TrajectoryError("a trajectory must be finite")
+        if not (np.diff(self.t) > 0).all():
+            raise TrajectoryError("times must increase")
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return float(self.t[-1] - self.t[0])
+
+    @property
+    def held(self) -> bool:
+        """Whether forces are held between times, rather than linear."""
+        return len(self.u) == len(self.t) - 1
+
+    @property
+    def tilt(self) -> np.ndarray:
+        """(N+1,) angle between the body's axis and the vertical, rad."""
+        return np.arccos(np.clip(np.cos(self.x[:, 2]) * np.cos(self.x[:, 3]), -1.0, 1.0))
+
+    def state(self, t: float) -> np.ndarray:
+        """x(t), (8,); before the start and after the end, the nearest end."""
+        i, fraction = self._locate(t)
+        if i == len(self.t) - 1:
+            return self.x[-1].copy()
+        a, b = self.x[i], self.x[i + 1]
+        if self.xdot is None:
+            return a + fraction * (b - a)
+        h = self.t[i + 1] - self.t[i]
+        slope_a, slope_b = h * self.xdot[i], h * self.xdot[i + 1]
+        s = fraction
+        return (
+            (1 + 2 * s) * (1 - s) ** 2 * a
+            + s * (1 - s) ** 2 * slope_a
+            + s**2 * (3 - 2 * s) * b
+            + s**2 * (s - 1) * slope_b
+        )
+
+    def force(self, t: float) -> np.ndarray:
+        """u(t), (2,) N; before the start and after the end, the nearest end."""
+        i, fraction = self._locate(t)
+        if self.held:
+            return self.u[min(i, len(self.u) - 1)].copy()
+        if i == len(self.t) - 1:
+            return self.u[-1].copy()
+        return self.u[i] + fraction * (self.u[i + 1] - self.u[i])
+
+    def _locate(self, t: float) -> tuple[int, float]:
+        """Interval and fraction of it at which t lies; (N, 0) at the end."""
+        if t >= self.t[-1]:
+            return len(self.t) - 1, 0.0
+        i = max(0, int(np.searchsorted(self.t, t, side="right")) - 1)
+        return i, max(0.0, (t - self.t[i]) / (self.t[i + 1] - self.t[i]))
+
+    def save(self, path: str | Path) -> Path:
+        """Writes an .npz file of the arrays; a reader never sees it half written."""
+        arrays = {"t": self.t, "x": self.x, "u": self.u}
+        if self.xdot is not None:
+            arrays["xdot"] = self.xdot
+        return files.write_npz(path, arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Trajectory":
+        """Reads what `save` wrote.
+
+        Raises:
+            TrajectoryError: the file is no trajectory.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                return cls(**{name: arrays[name] for name in ("t", "x", "u", "xdot") if name in arrays})
+        except (OSError, ValueError, TypeError, EOFError) as error:
+            raise TrajectoryError(f"{path}: not a trajectory file: {error}") from error
