@@ -25,9 +25,7 @@ def linearize(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> tuple[np.n
     return np.array(a), np.array(b)
 
 
-def discretize(
-    params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float
-) -> tuple[np.ndarray, np.ndarray]:
+def discretize(params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Linearizes the control step (force held for dt s, RK4) about points of a trajectory.
 
     Args:

@@ -60,9 +60,7 @@ def final_weight(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray
     return _GOAL_PRICE * goal_weight(task, x, c)
 
 
-def riccati(
-    a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final: np.ndarray
-) -> Gains:
+def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final: np.ndarray) -> Gains:
     """Time-varying LQR, backwards from the final cost-to-go.
 
     Args:

@@ -2,7 +2,7 @@
 
     minimize    Σ_{k<N} cost(s_k, w_k, p) + final_cost(s_N, p)
     subject to  s_{k+1} = next(s_k, w_k, p)
-                path_k(s_k, w_k, p) = 0 or ≥ 0,   final_path(s_N, p) = 0 or ≥ 0
+                path_k(s_k, w_k, p) = 0 or ≥ 0,   final_path(s_N, p) = 0 or ≥ 0,   initial_matrix s_0 = 0
                 bounds on s_k and w_k
 
 Every problem of this package has this form: shooting on the env's discretization, and Hermite–Simpson collocation with
@@ -45,6 +45,8 @@ class Ocp:
     """(s, p) -> (me,), each 0."""
     final_inequalities: FinalFunction | None = None
     """(s, p) -> (mi,), each ≥ 0."""
+    initial_matrix: np.ndarray | None = None
+    """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,7 @@ class Bounds:
     def free(cls, ocp: Ocp, intervals: int) -> "Bounds":
         """No bounds, to be filled in."""
         states, inputs = (intervals + 1, ocp.states), (intervals, ocp.inputs)
-        return cls(
-            np.full(states, -np.inf), np.full(states, np.inf), np.full(inputs, -np.inf), np.full(inputs, np.inf)
-        )
+        return cls(np.full(states, -np.inf), np.full(states, np.inf), np.full(inputs, -np.inf), np.full(inputs, np.inf))
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,7 @@ class _Stage:
         functions = (
             casadi.Function("value", [z, p], [out], options),
             casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options),
-            casadi.Function(
-                "hessian", [z, p, multipliers], [casadi.densify(gradient), _nonzeros(hessian)], options
-            ),
+            casadi.Function("hessian", [z, p, multipliers], [casadi.densify(gradient), _nonzeros(hessian)], options),
         )
         self.value, self.jacobian, self.hessian = compiled(name, functions) if compile else functions
         self.size = out.shape[0]
@@ -134,8 +132,15 @@ class OcpSolver:
 
         paths, finals = path.shape[0], final_path.shape[0]
         equal_paths, equal_finals = (casadi.vertcat(*part).shape[0] if part else 0 for part in (equal, final_equal))
+        initials = 0 if ocp.initial_matrix is None else len(ocp.initial_matrix)
         stage_equal = [True] * (ocp.states + equal_paths) + [False] * (paths - equal_paths)
-        equality = stage_equal * intervals + [True] * equal_finals + [False] * (finals - equal_finals)
+        equality = (
+            stage_equal
+            + [True] * initials
+            + stage_equal * (intervals - 1)
+            + [True] * equal_finals
+            + [False] * (finals - equal_finals)
+        )
         self._g_lower = np.zeros(len(equality))
         self._g_upper = np.where(equality, 0.0, np.inf)
 
@@ -154,7 +159,7 @@ class OcpSolver:
                 "N": intervals,
                 "nx": [ocp.states] * (intervals + 1),
                 "nu": [ocp.inputs] * intervals + [0],
-                "ng": [paths] * intervals + [finals],
+                "ng": [paths + initials] + [paths] * (intervals - 1) + [finals],
                 "equality": equality,
                 "fatrop": {"print_level": 0, "tol": tolerance, "max_iter": max_iterations},
             }
@@ -168,9 +173,7 @@ class OcpSolver:
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g = functions["cache"]["nlp_g"]
 
-    def solve(
-        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | tuple = ()
-    ) -> OcpSolution:
+    def solve(self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | tuple = ()) -> OcpSolution:
         """Solves from a guess.
 
         Args:
@@ -217,15 +220,16 @@ class OcpSolver:
         )
 
 
-def _nlp_functions(
-    ocp: Ocp, n: int, dynamics: _Stage, running: _Stage, final: _Stage, paths: int
-) -> dict[str, object]:
+def _nlp_functions(ocp: Ocp, n: int, dynamics: _Stage, running: _Stage, final: _Stage, paths: int) -> dict[str, object]:
     """The NLP and its derivatives, written as maps of the stage functions over the stages.
 
-    Variables are ordered s_0, w_0, s_1, … s_N, constraints next_0, path_0, next_1, … final_path, as fatrop wants them.
+    Variables are ordered s_0, w_0, s_1, … s_N, constraints next_0, path_0, initial, next_1, … final_path, as fatrop wants
+    them.
     """
     ns, width = ocp.states, ocp.states + ocp.inputs
     rows = ns + paths
+    initial = np.zeros((0, ns)) if ocp.initial_matrix is None else ocp.initial_matrix
+    constraints = n * rows + len(initial) + final.size - 1
     variables = n * width + ns
     z, p = casadi.MX.sym("z", variables), casadi.MX.sym("p", ocp.params)
     stages = casadi.reshape(z[: n * width], width, n)
@@ -236,11 +240,16 @@ def _nlp_functions(
     value_c, value_f = running.value.map(n)(stages, p_all), final.value(last, p)
     f = casadi.sum2(value_c[0, :]) + value_f[0]
     gaps = next_states - dynamics.value.map(n)(stages, p_all)
-    g = casadi.vertcat(casadi.vec(casadi.vertcat(gaps, value_c[1:, :])), value_f[1:])
+    stage_g = casadi.vertcat(gaps, value_c[1:, :])
+    initial_g = casadi.mtimes(casadi.DM(initial), stages[:ns, 0])
+    g = casadi.vertcat(stage_g[:, 0], initial_g, casadi.vec(stage_g[:, 1:]), value_f[1:, :])
 
     jac_d, jac_c = dynamics.jacobian.map(n)(stages, p_all)[1], running.jacobian.map(n)(stages, p_all)[1]
     jac_f = final.jacobian(last, p)[1]
     k = np.arange(n)[:, None]
+    first_row = k * rows + len(initial) * (k > 0)
+    final_row = n * rows + len(initial)
+    initial_row, initial_col = np.nonzero(initial)
     (row_d, col_d), (row_c, col_c), (row_f, col_f) = dynamics.jacobian_at, running.jacobian_at, final.jacobian_at
     is_cost, is_final_cost = row_c == 0, row_f == 0
 
@@ -248,45 +257,58 @@ def _nlp_functions(
     gradient = _scatter(
         [(k * width + col_c)[:, is_cost].ravel(), n * width + col_f[is_final_cost]],
         [np.zeros(n * is_cost.sum(), int), np.zeros(is_final_cost.sum(), int)],
-        casadi.vertcat(casadi.vec(jac_c[np.flatnonzero(is_cost).tolist(), :]), jac_f[np.flatnonzero(is_final_cost).tolist()]),
+        casadi.vertcat(_rows(jac_c, is_cost), _rows(jac_f, is_final_cost)),
         (variables, 1),
     )
     # ∂g: −∂next, +1 on the next state, the path rows, the final rows
     jacobian = _scatter(
         [
-            (k * rows + row_d).ravel(),
-            (k * rows + np.arange(ns)).ravel(),
-            (k * rows + ns - 1 + row_c)[:, ~is_cost].ravel(),
-            n * rows - 1 + row_f[~is_final_cost],
+            (first_row + row_d).ravel(),
+            (first_row + np.arange(ns)).ravel(),
+            (first_row + ns - 1 + row_c)[:, ~is_cost].ravel(),
+            rows + initial_row,
+            final_row - 1 + row_f[~is_final_cost],
         ],
         [
             (k * width + col_d).ravel(),
             ((k + 1) * width + np.arange(ns)).ravel(),
             (k * width + col_c)[:, ~is_cost].ravel(),
+            initial_col,
             n * width + col_f[~is_final_cost],
         ],
         casadi.vertcat(
             -casadi.vec(jac_d),
             casadi.MX.ones(n * ns),
-            casadi.vec(jac_c[np.flatnonzero(~is_cost).tolist(), :]),
-            jac_f[np.flatnonzero(~is_final_cost).tolist()],
+            _rows(jac_c, ~is_cost),
+            casadi.MX(casadi.DM(initial[initial_row, initial_col])),
+            _rows(jac_f, ~is_final_cost),
         ),
-        (n * rows + final.size - 1, variables),
+        (constraints, variables),
     )
 
-    lam_f, lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", n * rows + final.size - 1)
-    lam_stages = casadi.reshape(lam_g[: n * rows], rows, n)
+    lam_f, lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", constraints)
+    lam_initial = lam_g[rows : rows + len(initial)]
+    lam_stages = casadi.reshape(casadi.vertcat(lam_g[:rows], lam_g[rows + len(initial) : final_row]), rows, n)
     lam_next = lam_stages[:ns, :]
     grad_d, hess_d = dynamics.hessian.map(n)(stages, p_all, -lam_next)
     grad_c, hess_c = running.hessian.map(n)(
         stages, p_all, casadi.vertcat(casadi.repmat(lam_f, 1, n), lam_stages[ns:, :])
     )
-    grad_f, hess_f = final.hessian(last, p, casadi.vertcat(lam_f, lam_g[n * rows :]))
-    shifted = casadi.vertcat(casadi.horzcat(casadi.MX.zeros(ns, 1), lam_next[:, :-1]), casadi.MX.zeros(ocp.inputs, n))
+    grad_f, hess_f = final.hessian(last, p, casadi.vertcat(lam_f, lam_g[final_row:]))
+    of_initial = casadi.mtimes(casadi.DM(initial.T), lam_initial)
+    shifted = casadi.vertcat(casadi.horzcat(of_initial, lam_next[:, :-1]), casadi.MX.zeros(ocp.inputs, n))
     grad_lagrangian = casadi.vertcat(casadi.vec(grad_d + grad_c + shifted), grad_f + lam_next[:, -1])
     hessian = _scatter(
-        [(k * width + dynamics.hessian_at[0]).ravel(), (k * width + running.hessian_at[0]).ravel(), n * width + final.hessian_at[0]],
-        [(k * width + dynamics.hessian_at[1]).ravel(), (k * width + running.hessian_at[1]).ravel(), n * width + final.hessian_at[1]],
+        [
+            (k * width + dynamics.hessian_at[0]).ravel(),
+            (k * width + running.hessian_at[0]).ravel(),
+            n * width + final.hessian_at[0],
+        ],
+        [
+            (k * width + dynamics.hessian_at[1]).ravel(),
+            (k * width + running.hessian_at[1]).ravel(),
+            n * width + final.hessian_at[1],
+        ],
         casadi.vertcat(casadi.vec(hess_d), casadi.vec(hess_c), hess_f),
         (variables, variables),
     )
@@ -295,9 +317,7 @@ def _nlp_functions(
     cache = {
         "nlp_f": casadi.Function("nlp_f", [z, p], [f], ["x", "p"], ["f"]),
         "nlp_g": casadi.Function("nlp_g", [z, p], [g], ["x", "p"], ["g"]),
-        "nlp_grad_f": casadi.Function(
-            "nlp_grad_f", [z, p], [casadi.densify(gradient)], ["x", "p"], ["grad_f_x"]
-        ),
+        "nlp_grad_f": casadi.Function("nlp_grad_f", [z, p], [casadi.densify(gradient)], ["x", "p"], ["grad_f_x"]),
         # Of the parameters' multipliers nobody asks (calc_lam_p is off), but the signature has them.
         "nlp_grad": casadi.Function(
             "nlp_grad",
@@ -326,9 +346,7 @@ def _nlp_functions(
     }
 
 
-def _scatter(
-    rows: list[np.ndarray], cols: list[np.ndarray], values: casadi.MX, shape: tuple[int, int]
-) -> casadi.MX:
+def _scatter(rows: list[np.ndarray], cols: list[np.ndarray], values: casadi.MX, shape: tuple[int, int]) -> casadi.MX:
     """A sparse matrix from triplets whose values add up where they meet."""
     row, col = np.concatenate(rows), np.concatenate(cols)
     order = np.lexsort((row, col))
@@ -343,6 +361,11 @@ def _scatter(
         gather = casadi.Sparsity.triplet(len(first), len(place), target.tolist(), list(range(len(place))))
         entries = casadi.mtimes(casadi.MX(casadi.DM(gather, 1.0)), values)
     return casadi.MX(pattern, entries)
+
+
+def _rows(matrix: casadi.MX, keep: np.ndarray) -> casadi.MX:
+    """The rows to keep, column after column, as one column."""
+    return casadi.vec(matrix[np.flatnonzero(keep).tolist(), :]) if keep.any() else casadi.MX(0, 1)
 
 
 def _nonzeros(matrix: casadi.SX) -> casadi.SX:

@@ -26,7 +26,7 @@ FEASIBLE = 1e-6
 """Largest constraint violation of an optimum, in SI units."""
 
 _FREE_TIME_INTERVALS = 60
-_CONSIDERED = 8  # guesses tried at most by default; tasks name the likeliest first
+_CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
 
 
 class PlanError(RuntimeError):

@@ -139,8 +139,12 @@ class BallbotEnv(gymnasium.Env):
             self._steps_left = 0
         if self.render_mode == "human":
             self.render()
-        return self._observation(), -cost, terminated, last and not terminated, self._info(
-            cost, force, success, failure, clipped
+        return (
+            self._observation(),
+            -cost,
+            terminated,
+            last and not terminated,
+            self._info(cost, force, success, failure, clipped),
         )
 
     def render(self) -> np.ndarray | None:

@@ -83,9 +83,7 @@ class BulletSimulator:
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
         self._robot, self._joints = _load_robot(bullet, self._client, params)
         # Substeps run in C++ with the torque held, bitwise equal to as many calls and a third faster.
-        bullet.setPhysicsEngineParameter(
-            fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client
-        )
+        bullet.setPhysicsEngineParameter(fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client)
         bullet.setGravity(0, 0, -params.gravity, physicsClientId=self._client)
         self._bullet = bullet
 

@@ -63,7 +63,9 @@ class Task(ABC):
             if isinstance(value, int | float) and not value > 0:
                 raise ValueError(f"{type(self).__name__}: {field.name} must be positive, not {value}")
         if not math.isclose(self.steps * self.control_dt, self.duration, rel_tol=1e-9):
-            raise ValueError(f"duration {self.duration} s is not a whole number of control steps of {self.control_dt} s")
+            raise ValueError(
+                f"duration {self.duration} s is not a whole number of control steps of {self.control_dt} s"
+            )
         if self.max_tilt >= math.pi / 2:
             raise ValueError(f"max_tilt must be below 90°, not {math.degrees(self.max_tilt):.1f}°")
 
@@ -128,9 +130,7 @@ class Task(ABC):
         return all(excess <= 0 for excess in self.goal(x, c))
 
 
-def cubic(
-    p0: np.ndarray, v0: np.ndarray, p1: np.ndarray, v1: np.ndarray, steps: int, dt: float
-) -> np.ndarray:
+def cubic(p0: np.ndarray, v0: np.ndarray, p1: np.ndarray, v1: np.ndarray, steps: int, dt: float) -> np.ndarray:
     """(steps+1, 2) the cubic ground path from position and velocity to position and velocity, in SI units."""
     s = np.linspace(0.0, 1.0, steps + 1)[:, None]
     duration = steps * dt

@@ -75,8 +75,9 @@ class Weave(Task):
         stretches = 1.2 + (distance - 1.2 * (count + 1)) * rng.dirichlet(np.full(count + 1, 2.0))
         x = np.cumsum(stretches)[:-1]
         side = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(count)
-        y = side * rng.uniform(0.1, 0.35, count)
         radius = rng.uniform(0.25, 0.45, count)
+        # Each bars the straight line, but reaches further across it on its own side: so weaving mostly pays.
+        y = side * rng.uniform(0.5, 0.95, count) * (radius + self.ball_radius)
         obstacles = np.column_stack([x, y, radius])
         padded = np.concatenate([obstacles, np.repeat(obstacles[-1:], MAX_OBSTACLES - count, axis=0)])
         return np.concatenate([[distance, 0.0], padded.ravel()])
@@ -123,15 +124,15 @@ class Weave(Task):
         return Reference(rest, np.zeros((1, 2)))
 
     def guess_paths(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> list[np.ndarray]:
-        """A path for every choice of sides, the least curved first."""
+        """A path for every choice of sides, the shortest first: the best choice is mostly among the first three."""
         goal, obstacles = split_constants(c)
-        paths = [self.side_path(x, goal, obstacles, sides) for sides in itertools.product((-1, 1), repeat=len(obstacles))]
-        paths.sort(key=lambda path: np.sum(np.diff(path, 2, axis=0) ** 2))
+        paths = [
+            self.side_path(x, goal, obstacles, sides) for sides in itertools.product((-1, 1), repeat=len(obstacles))
+        ]
+        paths.sort(key=lambda path: np.hypot(*np.diff(path, axis=0).T).sum())
         return paths
 
-    def side_path(
-        self, x: np.ndarray, goal: np.ndarray, obstacles: np.ndarray, sides: tuple[int, ...]
-    ) -> np.ndarray:
+    def side_path(self, x: np.ndarray, goal: np.ndarray, obstacles: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
         """From rest to rest, passing obstacle i on the left where sides[i] = 1, on the right where it is −1."""
         clearance = obstacles[:, 2] + self.ball_radius + 0.1
         knots_x = np.concatenate([[x[0]], obstacles[:, 0], [goal[0]]])

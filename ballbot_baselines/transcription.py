@@ -1,0 +1,210 @@
+"""Direct collocation: trajectory optimization between states with a free time step, as plain data and its transcription.
+
+    minimize    Σ_{n<N} cost(x_n, u_n, h, q)
+    subject to  Hermite–Simpson:  the cubic through (x_n, f_n) and (x_{n+1}, f_{n+1}) obeys the dynamics at mid-interval,
+                                  with u linear between knots
+                equalities(x_n, u_n, q) = 0,  inequalities(x_n, u_n, q) ≥ 0 at every knot
+                bounds on x_0, x_N, leans, forces, step h and free variables q;   x_N = x_0 if periodic
+
+The transcription only supplies the defect; `ocp.OcpSolver` solves it, with the next knot as input and h and q carried along
+as states that do not change.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import casadi
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.optimum import FEASIBLE, PlanError
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.trajectory import Trajectory
+
+_INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation error is measured
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A trajectory optimization problem as plain data. Vectors are in SI units, in the order of `dynamics.STATE`."""
+
+    name: str
+    cost: Callable[[Any, Any, Any, Any], Any]
+    """(x, u, h, q) -> cost of a knot; the last knot has none."""
+    initial: tuple[np.ndarray, np.ndarray]
+    """Lower and upper bound of x_0, (8,) each; equal where it is given."""
+    final: tuple[np.ndarray, np.ndarray]
+    """The same of x_N."""
+    intervals: int = 40
+    step: tuple[float, float] = (0.005, 0.2)
+    """Bounds of h, s."""
+    lean_limit: float = np.inf
+    """Of |γ| and |θ|, rad."""
+    periodic: bool = False
+    """x_N = x_0."""
+    free: tuple[tuple[float, float], ...] = ()
+    """Bounds of further decision variables q."""
+    equalities: Callable[[Any, Any, Any], tuple] | None = None
+    """(x, u, q) -> each 0, at knots 0 … N−1."""
+    inequalities: Callable[[Any, Any, Any], tuple] | None = None
+    """(x, u, q) -> each ≥ 0, at all knots."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where the solver starts: x (N+1, 8), u (N+1, 2), step h, s, and free variables q."""
+
+    x: np.ndarray
+    u: np.ndarray
+    h: float
+    q: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A solved `Problem`.
+
+    The trajectory has linear forces and cubic states. `violation` is the largest constraint violation, `collocation_error`
+    the largest over the intervals of ∫|ẋ(t) − f(x(t), u(t))| dt for the interpolated plan, in state units: it shrinks as
+    knots are added and says how far the plan can be believed between them.
+    """
+
+    cost: float
+    trajectory: Trajectory
+    q: np.ndarray
+    status: str
+    violation: float
+    collocation_error: float
+    iterations: int
+    solver: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where things stand in the staged state s = [x, u/limit, h, q, x_start]; inputs are the next [x, u/limit]."""
+
+    free: int
+    periodic: bool
+    x: ClassVar[slice] = slice(0, 8)
+    a: ClassVar[slice] = slice(8, 10)
+    h: ClassVar[int] = 10
+
+    @property
+    def q(self) -> slice:
+        return slice(11, 11 + self.free)
+
+    @property
+    def start(self) -> slice:
+        return slice(11 + self.free, 11 + self.free + 8 * self.periodic)
+
+    @property
+    def size(self) -> int:
+        return self.start.stop
+
+
+def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
+    """The staged problem whose equality constraints are the Hermite–Simpson defects."""
+    at, limit = _Layout(len(problem.free), problem.periodic), params.force_limit
+
+    def defect(s: casadi.SX, w: casadi.SX) -> casadi.SX:
+        x0, u0, h, x1, u1 = s[at.x], limit * s[at.a], s[at.h], w[at.x], limit * w[at.a]
+        f0, f1 = dynamics.derivative(params, x0, u0), dynamics.derivative(params, x1, u1)
+        middle = 0.5 * (x0 + x1) + h / 8 * (f0 - f1)
+        f_middle = dynamics.derivative(params, middle, 0.5 * (u0 + u1))
+        return x1 - x0 - h / 6 * (f0 + 4 * f_middle + f1)
+
+    def path(function: Callable | None, s: casadi.SX) -> casadi.SX:
+        return casadi.SX(0, 1) if function is None else casadi.vertcat(*function(s[at.x], limit * s[at.a], s[at.q]))
+
+    initial = None
+    if problem.periodic:  # x_start is x_0
+        initial = np.zeros((8, at.size))
+        initial[:, at.x], initial[:, at.start] = np.eye(8), -np.eye(8)
+    return Ocp(
+        name=f"hermite-simpson-{problem.name}",
+        states=at.size,
+        inputs=10,
+        params=0,
+        next=lambda s, w, p: casadi.vertcat(w, s[at.h :]),
+        cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
+        equalities=lambda s, w, p: casadi.vertcat(defect(s, w), path(problem.equalities, s)),
+        inequalities=lambda s, w, p: path(problem.inequalities, s),
+        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else None,
+        final_inequalities=lambda s, p: path(problem.inequalities, s),
+        initial_matrix=initial,
+    )
+
+
+def solve(
+    problem: Problem,
+    params: BallbotParams,
+    guess: Guess,
+    solver: str = "ipopt",
+    tolerance: float = 1e-8,
+    max_iterations: int = 500,
+) -> Plan:
+    """Solves a problem from a guess.
+
+    Raises:
+        PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
+    """
+    n, at = problem.intervals, _Layout(len(problem.free), problem.periodic)
+    ocp = hermite_simpson(problem, params)
+    bounds = _bounds(problem, ocp, at)
+    knots = np.column_stack([guess.x, guess.u / params.force_limit])
+    start = guess.x[0] if problem.periodic else ()
+    constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
+    result = OcpSolver(ocp, n, solver, tolerance, max_iterations).solve(np.hstack([knots, constant]), knots[1:], bounds)
+    if not (result.success and result.violation < FEASIBLE):
+        raise PlanError(
+            f"{problem.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
+            f"violated by {result.violation:.1e}. Try another guess or more time."
+        )
+    return _plan(params, result, at)
+
+
+def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:
+    bounds = Bounds.free(ocp, problem.intervals)
+    lower, upper = bounds.state_lower, bounds.state_upper
+    lower[:, 2:4], upper[:, 2:4] = -problem.lean_limit, problem.lean_limit
+    lower[:, at.a], upper[:, at.a] = -1, 1
+    for knot, (low, high) in ((0, problem.initial), (-1, problem.final)):
+        lower[knot, at.x] = np.maximum(lower[knot, at.x], low)
+        upper[knot, at.x] = np.minimum(upper[knot, at.x], high)
+    # h and q stay what they are at the first knot, so they are bounded there alone.
+    lower[0, at.h], upper[0, at.h] = problem.step
+    for i, (low, high) in enumerate(problem.free):
+        lower[0, at.q.start + i], upper[0, at.q.start + i] = low, high
+    return bounds
+
+
+def _plan(params: BallbotParams, result: OcpSolution, at: _Layout) -> Plan:
+    x, u = result.states[:, at.x], params.force_limit * result.states[:, at.a]
+    t = result.states[0, at.h] * np.arange(len(x))
+    trajectory = Trajectory(t, x, u, xdot=dynamics.derivative(params, x, u))
+    return Plan(
+        cost=result.cost,
+        trajectory=trajectory,
+        q=result.states[0, at.q],
+        status=result.status,
+        violation=result.violation,
+        collocation_error=collocation_error(params, trajectory),
+        iterations=result.iterations,
+        solver=result.solver,
+        seconds=result.seconds,
+    )
+
+
+def collocation_error(params: BallbotParams, trajectory: Trajectory) -> float:
+    """The largest ∫|ẋ − f(x, u)| dt over an interval and a state component, for x cubic and u linear between knots."""
+    t, u = trajectory.t, trajectory.u
+    step = np.diff(t)
+    inner = (t[:-1, None] + step[:, None] * _INTERIOR).ravel()
+    spline = CubicHermiteSpline(t, trajectory.x, trajectory.xdot)
+    forces = np.column_stack([np.interp(inner, t, u[:, i]) for i in range(2)])
+    residual = np.abs(spline(inner, 1) - dynamics.derivative(params, spline(inner), forces))
+    return float((residual.reshape(len(step), len(_INTERIOR), 8).mean(axis=1) * step[:, None]).max())
