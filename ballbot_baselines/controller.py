@@ -10,6 +10,8 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.trajectory import Trajectory
 
 
@@ -102,3 +104,26 @@ def rollout(
         reset_seconds=reset_seconds,
         act_seconds=float(np.median(act_seconds)),
     )
+
+
+def simulate(
+    controller: Controller,
+    params: BallbotParams,
+    x0: np.ndarray,
+    duration: float,
+    control_dt: float = 0.02,
+    physics: str = "bullet",
+) -> Trajectory:
+    """Runs a controller without a task: from state x0 (8,) for duration s, forces clipped to the robot's limit."""
+    simulator = PHYSICS[physics](params, control_dt)
+    x = np.asarray(x0, np.float64)
+    simulator.reset(tuple(x.tolist()))
+    controller.reset(0.0, x, np.zeros(0))
+    states, forces = [x], []
+    for k in range(round(duration / control_dt)):
+        u = np.clip(controller.act(k * control_dt, x), -params.force_limit, params.force_limit)
+        x = np.array(simulator.step(tuple(u.tolist())))
+        forces.append(u)
+        states.append(x)
+    simulator.close()
+    return Trajectory(control_dt * np.arange(len(states)), np.array(states), np.array(forces))

@@ -26,6 +26,8 @@ FEASIBLE = 1e-6
 """Largest constraint violation of an optimum, in SI units."""
 
 _FREE_TIME_INTERVALS = 60
+_COARSE = 2  # control steps per interval when several guesses are compared
+_BASIN_DOUBT = 0.01  # relaxed costs nearer than this may change places on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
 
 
@@ -90,16 +92,10 @@ def find_optimum(
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     paths = task.guess_paths(x0, c, params)[:guesses] if paths is None else paths
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
-    best: tuple[int, OcpSolution] | None = None
-    tried: list[OcpSolution] = []
-    for index, path in enumerate(paths):
-        solutions = solve(task, params, x0, c, backoff, path)
-        tried += solutions
-        for solution in solutions:
-            if is_feasible(solution) and (best is None or solution.cost < best[1].cost):
-                best = index, solution
+    tried = solve(task, params, x0, c, backoff, paths)
+    best = min((t for t in tried if is_feasible(t[1])), key=lambda t: t[1].cost, default=None)
     if best is None:
-        tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for s in tried)
+        tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for _, s in tried)
         raise PlanError(f"{task.id}: no feasible episode from x = {x0.tolist()}, c = {c.tolist()} ({tries})")
     index, solution = best
     return Optimum(
@@ -112,7 +108,7 @@ def find_optimum(
         iterations=solution.iterations,
         solver=solution.solver,
         guess=index,
-        seconds=sum(s.seconds for s in tried),
+        seconds=sum(s.seconds for _, s in tried),
     )
 
 
@@ -121,10 +117,13 @@ def is_feasible(solution: OcpSolution) -> bool:
     return solution.success and solution.violation < FEASIBLE
 
 
-def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
-    """A task on its env's discretization. Inputs are actions, force / limit; p = [c, margin backoff, goal backoff]."""
+def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
+    """A task on its env's discretization, or with forces held for several control steps.
+
+    Inputs are actions, force / limit; p = [c, margin backoff, goal backoff].
+    """
     nc = len(task.constant_names)
-    dt, limit = task.control_dt, params.force_limit
+    dt, limit = task.control_dt * coarseness, params.force_limit
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         return casadi.vertcat(*task.margins(x, p[:nc])) - p[nc]
@@ -135,7 +134,7 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
         return casadi.vertcat(margins(x, p), _goal_room(task, x, p, nc))
 
     return Ocp(
-        name=f"{task.id}",
+        name=task.id,
         states=8,
         inputs=2,
         params=nc + 2,
@@ -167,8 +166,8 @@ def _goal_room(task: Task, x: casadi.SX, p: casadi.SX, nc: int) -> casadi.SX:
 
 
 @lru_cache(maxsize=64)
-def _solver(task: Task, params: BallbotParams, steps: int, solver: str) -> OcpSolver:
-    return OcpSolver(shooting_ocp(task, params), steps, solver)
+def _solver(task: Task, params: BallbotParams, steps: int, solver: str, coarseness: int = 1) -> OcpSolver:
+    return OcpSolver(shooting_ocp(task, params, coarseness), steps, solver)
 
 
 @lru_cache(maxsize=8)
@@ -198,42 +197,99 @@ def _solve_from(
 
 
 def _solve_fixed_time(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, path: np.ndarray
-) -> list[OcpSolution]:
-    x, u = guess.along_path(params, path, task.control_dt, start=x0)
-    return _solve_from(task, params, x, u / params.force_limit, c, backoff)
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, paths: list[np.ndarray]
+) -> list[tuple[int, OcpSolution]]:
+    """Every solution found, with the index of the path it came from.
+
+    Where there are several paths, each is first solved with forces held for two control steps, which takes half the time
+    and tells the basins apart; those that may be the best are then solved in full.
+    """
+    starts = [guess.along_path(params, path, task.control_dt, start=x0) for path in paths]
+    starts = [(i, x, u / params.force_limit) for i, (x, u) in enumerate(starts)]
+    if len(paths) > 1 and task.steps % _COARSE == 0:
+        starts = _contenders(task, params, x0, c, backoff, starts)
+    return [(i, s) for i, x, a in starts for s in _solve_from(task, params, x, a, c, backoff)]
+
+
+def _contenders(
+    task: Task,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff,
+    starts: list[tuple[int, np.ndarray, np.ndarray]],
+) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Starts at the coarse solutions that are within `_BASIN_DOUBT` of the best; all starts, if there is none."""
+    n = task.steps // _COARSE
+    solver = _solver(task, params, n, "fatrop", _COARSE)
+    solved = []
+    for index, x, a in starts:
+        bounds = _bounds(solver.ocp, n, x0, backoff)
+        solution = solver.solve(x[::_COARSE], a[::_COARSE], bounds, [*c, backoff.margin, backoff.goal])
+        if is_feasible(solution):
+            solved.append((index, solution))
+    fine = []
+    for index, solution in _distinct(solved):
+        x = guess.resampled(solution.states, task.steps)
+        fine.append((index, x, np.repeat(solution.inputs, _COARSE, axis=0)))
+    return fine or starts
+
+
+def _distinct(solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, OcpSolution]]:
+    """Of feasible solutions, those within `_BASIN_DOUBT` of the best, one for each cost, the best first."""
+    kept: list[tuple[int, OcpSolution]] = []
+    for index, solution in sorted(solved, key=lambda pair: pair[1].cost):
+        contends = not kept or solution.cost < kept[0][1].cost * (1 + _BASIN_DOUBT)
+        if contends and not any(math.isclose(solution.cost, k.cost, rel_tol=1e-5) for _, k in kept):
+            kept.append((index, solution))
+    return kept
 
 
 def _solve_first_exit(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, paths: list[np.ndarray]
+) -> list[tuple[int, OcpSolution]]:
+    """As `_solve_fixed_time`: first with a free interval length, which tells the basins apart and about when each arrives,
+    then with whole numbers of control steps about the best of them.
+    """
+    tried = [(i, _solve_free_time(task, params, x0, c, backoff, path)) for i, path in enumerate(paths)]
+    found = [t for t in tried if not is_feasible(t[1])]
+    for index, solution in _distinct([t for t in tried if is_feasible(t[1])]):
+        found += [(index, s) for s in _whole_steps(task, params, c, backoff, solution)]
+    return found
+
+
+def _solve_free_time(
     task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, path: np.ndarray
-) -> list[OcpSolution]:
-    """Finds the best time with free interval length, then the best whole number of control steps about it."""
+) -> OcpSolution:
     n, dt = _FREE_TIME_INTERVALS, task.control_dt
-    duration = (len(path) - 1) * dt
-    h = duration / n
+    h = (len(path) - 1) * dt / n
     x, u = guess.along_path(params, guess.resampled(path, n), h, start=x0)
     for name in ("fatrop", "ipopt"):
         solver = _free_time_solver(task, params, name)
         bounds = _bounds(solver.ocp, n, x0, backoff)
         bounds.state_lower[:, 8], bounds.state_upper[:, 8] = dt / 4, task.duration / n
-        relaxed = solver.solve(
-            np.column_stack([x, np.full(n + 1, h)]), u / params.force_limit, bounds, [*c, backoff.margin, backoff.goal]
-        )
-        if is_feasible(relaxed):
+        states = np.column_stack([x, np.full(n + 1, h)])
+        solution = solver.solve(states, u / params.force_limit, bounds, [*c, backoff.margin, backoff.goal])
+        if is_feasible(solution):
             break
-    else:
-        return [relaxed]
-    arrival = relaxed.states[0, 8] * n / dt  # in control steps, not whole
+    return solution
+
+
+def _whole_steps(
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, relaxed: OcpSolution
+) -> list[OcpSolution]:
+    """Arrival after a whole number of control steps: from the relaxed time, in both directions while it gets cheaper."""
+    arrival = relaxed.states[0, 8] * _FREE_TIME_INTERVALS / task.control_dt
     steps = min(max(1, math.ceil(arrival)), task.steps)
-    solutions = {steps: _at_steps(task, params, c, backoff, relaxed, steps)}
+    groups = {steps: _at_steps(task, params, c, backoff, relaxed, steps)}
     for direction in (-1, 1):
         nearby = steps + direction
         while 1 <= nearby <= task.steps:
-            solutions[nearby] = _at_steps(task, params, c, backoff, relaxed, nearby)
-            if not _better(solutions[nearby][-1], solutions[nearby - direction][-1]):
+            groups[nearby] = _at_steps(task, params, c, backoff, relaxed, nearby)
+            if not _better(groups[nearby][-1], groups[nearby - direction][-1]):
                 break
             nearby += direction
-    return [solution for group in solutions.values() for solution in group]
+    return [solution for group in groups.values() for solution in group]
 
 
 def _better(a: OcpSolution, b: OcpSolution) -> bool:

@@ -1,33 +1,75 @@
 """Time-varying LQR that keeps the robot on a planned trajectory."""
 
 import numpy as np
+import scipy.linalg
 
-from ballbot_baselines.lqr import Gains, discrete_lqr, final_weight, is_equilibrium, tracking_gains
+from ballbot_baselines.linearize import discretize, quadratic_cost
+from ballbot_baselines.lqr import discrete_lqr, final_weight, is_equilibrium, riccati
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 
 class TvlqrController:
-    """Tracks a trajectory with gains from the task's cost.
+    """Tracks a trajectory sampled at control steps: u = u_k − K_k (x − x_k).
 
-    The trajectory is sampled at control steps; past its end the last state is held where it is an equilibrium, else
-    followed by the last gain.
+    Past the trajectory's end its last state is held by the last gain, which is LQR's where that state is an equilibrium.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, trajectory: Trajectory, c: np.ndarray | tuple = ()):
-        """Args: trajectory in time from 0; c (nc,) the constants of the episode it was planned for."""
-        c = np.asarray(c, np.float64)
-        dt = task.control_dt
-        times = trajectory.t[0] + dt * np.arange(max(1, round(trajectory.duration / dt)))
+    def __init__(
+        self,
+        params: BallbotParams,
+        trajectory: Trajectory,
+        dt: float,
+        q: np.ndarray,
+        r: np.ndarray,
+        p_final: np.ndarray,
+        end_gain: np.ndarray | None = None,
+    ):
+        """Computes the gains.
+
+        Args:
+            params: the robot.
+            trajectory: what to track.
+            dt: s, the control step.
+            q, r: (8, 8) and (2, 2) weights of a control step, or (n, …) one for each of the trajectory's n steps.
+            p_final: (8, 8) cost-to-go at the end.
+            end_gain: (2, 8) for what comes after the end; default, the last of the trajectory's.
+        """
+        times = sample_times(trajectory, dt)
         self.x = np.array([trajectory.state(t) for t in times])
-        self.u = np.array([_mean_force(trajectory, t, dt) for t in times])
-        end = trajectory.x[-1]
-        self.gains: Gains = tracking_gains(task, params, self.x, self.u, c, final_weight(task, params, end, c))
+        self.u = np.array([_step_force(trajectory, t, dt) for t in times])
+        a, b = discretize(params, self.x, self.u, dt)
+        n = len(times)
+        self.gains = riccati(a, b, np.broadcast_to(q, (n, 8, 8)), np.broadcast_to(r, (n, 2, 2)), p_final)
+        self._end, self._end_gain = trajectory.x[-1], self.gains.k[-1] if end_gain is None else end_gain
         self._dt, self._start = dt, 0.0
-        self._end, self._end_gain = end, self.gains.k[-1]
-        if is_equilibrium(params, end, np.zeros(2)):
-            self._end_gain = discrete_lqr(task, params, end, np.zeros(2), c)[0]
+
+    @classmethod
+    def for_task(
+        cls, task: Task, params: BallbotParams, trajectory: Trajectory, c: np.ndarray | tuple = ()
+    ) -> "TvlqrController":
+        """With weights from the task's own cost; c (nc,) are the constants the trajectory was planned for."""
+        c, dt, end = np.asarray(c, np.float64), task.control_dt, trajectory.x[-1]
+        times = sample_times(trajectory, dt)
+        x = np.array([trajectory.state(t) for t in times])
+        q, r = quadratic_cost(task, x, np.array([trajectory.force(t) for t in times]), c)
+        rest = is_equilibrium(params, end, np.zeros(2))
+        end_gain = discrete_lqr(task, params, end, np.zeros(2), c)[0] if rest else None
+        return cls(params, trajectory, dt, q * dt, r * dt, final_weight(task, params, end, c), end_gain)
+
+    @classmethod
+    def for_weights(
+        cls, params: BallbotParams, trajectory: Trajectory, dt: float, q: np.ndarray, r: np.ndarray
+    ) -> "TvlqrController":
+        """With constant weights, q (8, 8) and r (2, 2) per second, for plans that end upright, standing or moving.
+
+        Uniform motion upright linearizes like standing, so both end with LQR's cost-to-go.
+        """
+        a, b = (matrix[0] for matrix in discretize(params, np.zeros((1, 8)), np.zeros((1, 2)), dt))
+        p = scipy.linalg.solve_discrete_are(a, b, q * dt, r * dt)
+        gain = np.linalg.solve(r * dt + b.T @ p @ b, b.T @ p @ a)
+        return cls(params, trajectory, dt, q * dt, r * dt, p, gain)
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._start = t
@@ -39,6 +81,11 @@ class TvlqrController:
         return -self._end_gain @ (x - self._end)
 
 
-def _mean_force(trajectory: Trajectory, t: float, dt: float) -> np.ndarray:
+def sample_times(trajectory: Trajectory, dt: float) -> np.ndarray:
+    """The starts, s, of the control steps that make up a trajectory."""
+    return trajectory.t[0] + dt * np.arange(max(1, round(trajectory.duration / dt)))
+
+
+def _step_force(trajectory: Trajectory, t: float, dt: float) -> np.ndarray:
     """The force to hold over a control step for one that may vary within it: its value at mid-step."""
     return trajectory.force(t) if trajectory.held else trajectory.force(t + 0.5 * dt)

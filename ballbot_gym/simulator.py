@@ -22,6 +22,7 @@ from ballbot_gym.params import BallbotParams
 State = tuple[float, ...]
 """(8,) state as a tuple of floats; order and units in `dynamics.STATE`."""
 
+_CAMERA = (4.0, -55.0, -22.0)  # distance, m, yaw and pitch, deg: from behind a robot that moves along x
 _JOINTS = ("x", "y", "gamma", "theta")
 
 
@@ -162,10 +163,10 @@ class Scene:
             bullet.resetJointState(self._robot, joint, x[i], 0.0, physicsClientId=client)
         target = (x[0], x[1], 0.5)
         if self._human:
-            bullet.resetDebugVisualizerCamera(3.2, 40, -18, target, physicsClientId=client)
+            bullet.resetDebugVisualizerCamera(*_CAMERA, target, physicsClientId=client)
             return None
         width, height = self._size
-        view = bullet.computeViewMatrixFromYawPitchRoll(target, 3.2, 40, -18, 0, 2)
+        view = bullet.computeViewMatrixFromYawPitchRoll(target, *_CAMERA, 0, 2)
         projection = bullet.computeProjectionMatrixFOV(45, width / height, 0.1, 60)
         image = bullet.getCameraImage(
             width,
@@ -200,12 +201,12 @@ class Scene:
         x, y = marker.position
         if not marker.ring:
             return [self._cylinder((x, y, marker.height / 2), marker.radius, marker.height, marker.color)]
-        count = max(24, int(12 * marker.radius))
+        count = max(24, int(2 * math.pi * marker.radius / 0.2))
         angles = [2 * math.pi * k / count for k in range(count)]
         return [
             self._cylinder(
                 (x + marker.radius * math.cos(a), y + marker.radius * math.sin(a), marker.height / 2),
-                0.04,
+                0.025,
                 marker.height,
                 marker.color,
             )

@@ -49,7 +49,7 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """s."""
+        """In s."""
         return float(self.t[-1] - self.t[0])
 
     @property
@@ -95,6 +95,12 @@ class Trajectory:
             return len(self.t) - 1, 0.0
         i = max(0, int(np.searchsorted(self.t, t, side="right")) - 1)
         return i, max(0.0, (t - self.t[i]) / (self.t[i + 1] - self.t[i]))
+
+    def resampled(self, dt: float) -> "Trajectory":
+        """The interpolated states and forces every dt s, with linear forces; for drawing and comparing."""
+        times = np.append(np.arange(self.t[0], self.t[-1], dt), self.t[-1])
+        times = times[np.concatenate([[True], np.diff(times) > 1e-9])]
+        return Trajectory(times, np.array([self.state(t) for t in times]), np.array([self.force(t) for t in times]))
 
     def save(self, path: str | Path) -> Path:
         """Writes an .npz file of the arrays; a reader never sees it half written."""

@@ -43,10 +43,10 @@ class Orbit(Task):
 
     Start: at rest, upright, at a uniformly random bearing on the circle.
 
-    Cost rate: 10 e_r² + 2 |e_v|² + 0.02 (γ̇² + θ̇²) + 5e-5 (Fx² + Fy²), with e_r and e_v the errors observed.
+    Cost rate: 10 e_r² + 2 |e_v|² + 0.02 (γ̇² + θ̇²) + 2e-5 (Fx² + Fy²), with e_r and e_v the errors observed.
 
     Ends: tilt beyond `max_tilt` fails; after `duration` the episode is truncated, a success if the ball is then within
-    0.2 m of the circle and 0.6 m/s of its velocity.
+    0.2 m of the circle and a fifth of v of its velocity.
     """
 
     radius_weight: float = 10.0
@@ -55,7 +55,7 @@ class Orbit(Task):
     """Of |e_v|², s/m²."""
     lean_rate_weight: float = 0.02
     """Of γ̇² + θ̇², s."""
-    effort_weight: float = 5e-5
+    effort_weight: float = 2e-5
     """Of Fx² + Fy², 1/(N² s)."""
     min_radius: float = 1.0
     """m."""
@@ -98,7 +98,8 @@ class Orbit(Task):
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         radius_error, vx_error, vy_error = self._errors(x, c)
-        return (squared(radius_error) / 0.2**2 - 1, squared(vx_error, vy_error) / 0.6**2 - 1)
+        _, speed = ops.components(c)
+        return (squared(radius_error) / 0.2**2 - 1, squared(vx_error, vy_error) / (0.2 * speed) ** 2 - 1)
 
     def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
         """One round of the steady orbit, counted from the bearing of x."""

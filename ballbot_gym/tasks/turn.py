@@ -13,7 +13,7 @@ from ballbot_gym.simulator import Marker
 from ballbot_gym.tasks.base import Reference, Task, cubic, scaled, squared
 
 _START, _GATE = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # m, the paper's turn
-_LINEAR_SECONDS = 2.0  # when LQR means to pass the gate; of 1.0, 1.5, … 4.0 s the one that passes most often
+_LINEAR_SECONDS_PER_SPEED = 0.6  # s per m/s: with less LQR falls, with more it dawdles (0.5 to 1.0 tried)
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class Turn(Task):
         )
 
     def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
-        """The straight motion at (v, 0) that passes the gate after `_LINEAR_SECONDS`."""
-        steps = round(_LINEAR_SECONDS / self.control_dt)
+        """The straight motion at (v, 0) that passes the gate after a time proportional to v."""
+        steps = min(max(1, round(_LINEAR_SECONDS_PER_SPEED * c[0] / self.control_dt)), self.steps)
         to_go = self.control_dt * np.arange(-steps, 1)
         states = np.zeros((steps + 1, 8))
         states[:, 0] = _GATE[0] + c[0] * to_go

@@ -1,0 +1,30 @@
+"""Trajectory optimization as a controller: plan at reset, track with TVLQR."""
+
+import numpy as np
+
+from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
+from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+EXECUTED = Backoff(margin=0.02, goal=0.5, force=0.05)
+"""What plans that are to be executed keep: 2 cm from obstacles, half the goal's tolerance, 5 % of the force."""
+
+
+class TrajoptController:
+    """The optimum from the state at reset, less a back-off from its limits, tracked by TVLQR.
+
+    `plan` is the last plan. `reset` raises a PlanError where there is none.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
+        self._task, self._params, self._backoff = task, params, backoff
+        self.plan: Optimum | None = None
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self.plan = find_optimum(self._task, self._params, x, c, self._backoff)
+        self._tracker = TvlqrController.for_task(self._task, self._params, self.plan.trajectory, c)
+        self._tracker.reset(t, x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        return self._tracker.act(t, x)

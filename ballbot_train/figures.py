@@ -1,0 +1,161 @@
+"""Figures of trajectories and of comparisons, in matplotlib."""
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # files only: no display needed
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from ballbot_gym import files
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.evaluate import Result
+
+COLORS = {"lqr": "#c0392b", "trajopt": "#1f6fb2"}
+_OTHER_COLORS = ("#2e8b57", "#8e44ad", "#b9770e", "#34495e")
+LABELS = {"lqr": "LQR", "trajopt": "trajectory optimization + TVLQR"}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A trajectory to draw, with its label, colour and line style."""
+
+    label: str
+    trajectory: Trajectory
+    color: str
+    style: str = "-"
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Something round on the ground path: an obstacle if filled, else a line to follow; metres."""
+
+    x: float
+    y: float
+    radius: float
+    filled: bool = True
+
+
+def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Circle] = ()) -> Figure:
+    """The paper's form: position, velocity and lean over time, forces over time, and the ground path."""
+    figure = plt.figure(figsize=(12, 6.2), layout="constrained")
+    figure.suptitle(title, fontsize=13)
+    axes = figure.subplot_mosaic(
+        [["position", "velocity", "path"], ["lean", "force", "path"]], width_ratios=[1, 1, 1.25]
+    )
+    panels = {
+        "position": ("ball position, m", 0, ("x", "y"), 1.0),
+        "velocity": ("ball velocity, m/s", 4, ("ẋ", "ẏ"), 1.0),
+        "lean": ("lean, deg", 2, ("γ", "θ"), 180 / math.pi),
+    }
+    for curve in curves:
+        t, x = curve.trajectory.t, curve.trajectory.x
+        for key, (_, first, names, factor) in panels.items():
+            for i, name in enumerate(names):
+                axes[key].plot(
+                    t,
+                    factor * x[:, first + i],
+                    _component_style(curve, i),
+                    color=curve.color,
+                    lw=1.5,
+                    alpha=_alpha(i),
+                    label=f"{name}" if curve is curves[0] else None,
+                )
+        _plot_forces(axes["force"], curve)
+        axes["path"].plot(x[:, 0], x[:, 1], curve.style, color=curve.color, lw=2, label=curve.label)
+    for key, (label, *_rest) in panels.items():
+        axes[key].set_ylabel(label)
+    axes["force"].set_ylabel("force, N")
+    for key in ("lean", "force"):
+        axes[key].set_xlabel("time, s")
+    for key in ("position", "velocity", "lean", "force"):
+        axes[key].grid(alpha=0.3)
+        axes[key].axhline(0, color="0.6", lw=0.6)
+    for key, names in (
+        ("position", "x solid, y dotted"),
+        ("velocity", "ẋ solid, ẏ dotted"),
+        ("lean", "γ solid, θ dotted"),
+        ("force", "Fx solid, Fy dotted"),
+    ):
+        axes[key].set_title(names, fontsize=9, color="0.35")
+    _finish_path(axes["path"], curves, circles)
+    return figure
+
+
+def regret_figure(results: Sequence[Result]) -> Figure:
+    """For every task, the share of episodes that each controller finishes within a given regret."""
+    tasks = list(dict.fromkeys(result.task for result in results))
+    figure, axes = plt.subplots(1, len(tasks), figsize=(4.2 * len(tasks), 3.8), layout="constrained", squeeze=False)
+    for axis, task in zip(axes[0], tasks, strict=True):
+        for i, controller in enumerate(dict.fromkeys(r.controller for r in results if r.task == task)):
+            group = [result for result in results if (result.task, result.controller) == (task, controller)]
+            # success, not only standing: an episode that misses its goal has no regret worth the name
+            regrets = np.sort([max(100 * result.regret, 0.01) for result in group if result.success])
+            share = 100 * np.arange(1, len(regrets) + 1) / len(group)
+            axis.step(
+                regrets, share, where="post", lw=2, color=color(controller, i), label=LABELS.get(controller, controller)
+            )
+        axis.set(xscale="log", xlim=(0.01, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %")
+        axis.grid(alpha=0.3)
+    axes[0][0].set_ylabel("episodes that succeed, %")
+    axes[0][0].legend(fontsize=8, loc="upper left")
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Writes a PNG and closes the figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    plt.close(figure)
+    return files.write(path, buffer.getvalue())
+
+
+def color(controller: str, i: int) -> str:
+    """A controller's colour, the same in every figure."""
+    return COLORS.get(controller, _OTHER_COLORS[i % len(_OTHER_COLORS)])
+
+
+def _component_style(curve: Curve, i: int) -> str:
+    return curve.style if i == 0 else ":"
+
+
+def _alpha(i: int) -> float:
+    return 1.0 if i == 0 else 0.8
+
+
+def _plot_forces(axis: plt.Axes, curve: Curve) -> None:
+    trajectory = curve.trajectory
+    for i in range(2):
+        style, common = _component_style(curve, i), {"color": curve.color, "lw": 1.2, "alpha": _alpha(i)}
+        if trajectory.held:
+            axis.step(trajectory.t[:-1], trajectory.u[:, i], style, where="post", **common)
+        else:
+            axis.plot(trajectory.t, trajectory.u[:, i], style, **common)
+
+
+def _finish_path(axis: plt.Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
+    for circle in circles:
+        axis.add_patch(
+            plt.Circle(
+                (circle.x, circle.y),
+                circle.radius,
+                fill=circle.filled,
+                color="0.75" if circle.filled else "0.6",
+                ls="-" if circle.filled else "--",
+                zorder=0,
+            )
+        )
+    start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
+    axis.plot(*start[:2], "o", color="k", ms=5)
+    axis.plot(*end[:2], "s", color="k", ms=5)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set(xlabel="x, m", ylabel="y, m", title="ground path (● start, ■ end)")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=9, loc="best")

@@ -1,0 +1,43 @@
+"""Fixtures that parametrize tests over everything registered, so that a new task arrives tested."""
+
+import numpy as np
+import pytest
+
+import ballbot_gym
+from ballbot_gym.params import default_params
+from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.tasks import TASKS
+
+
+@pytest.fixture(scope="session")
+def params():
+    return default_params()
+
+
+@pytest.fixture(params=TASKS.values(), ids=TASKS.keys())
+def task(request):
+    return request.param()
+
+
+@pytest.fixture(params=PHYSICS)
+def physics(request):
+    return request.param
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def make_env():
+    """Makes environments that are closed after the test."""
+    envs = []
+
+    def make(task="stabilize", **kwargs):
+        envs.append(ballbot_gym.BallbotEnv(task, **kwargs))
+        return envs[-1]
+
+    yield make
+    for env in envs:
+        env.close()

@@ -1,0 +1,167 @@
+import math
+
+import numpy as np
+import pytest
+
+from ballbot_gym import dynamics
+from ballbot_gym.params import URDF_PATH, default_params
+
+START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)  # high lean, all rates at work
+FORCE = (60.0, -40.0)
+GENTLE = (0.0, 0.0, 0.2, -0.1, 1.0, -2.0, 0.5, 0.3)  # falls freely to γ = 1.7 rad in half a second
+
+
+def random_points(count, max_tilt, seed=0):
+    """States (count, 8) up to max_tilt, rad, and forces (count, 2) up to the limit."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1, 1, (4 * count, 8)) * [2, 2, max_tilt, max_tilt, 5, 5, 5, 5]
+    x = x[np.cos(x[:, 2]) * np.cos(x[:, 3]) > math.cos(max_tilt)][:count]
+    assert len(x) == count
+    return x, rng.uniform(-350, 350, (count, 2))
+
+
+def integrate(params, x, u, seconds, h):
+    return np.array(dynamics.step(params, x, u, seconds, round(seconds / h)))
+
+
+def test_linearization_at_origin_is_the_papers(params):
+    pytest.importorskip("casadi")
+    from ballbot_baselines.linearize import linearize
+
+    a, b = linearize(params, np.zeros(8), np.zeros(2))
+    # the paper's (5) and (6), printed to three decimals; its c is the first digits of 0.29517
+    expected_a, expected_b = np.zeros((8, 8)), np.zeros((8, 2))
+    expected_a[:4, 4:] = np.eye(4)
+    expected_a[4, 2] = expected_a[5, 3] = -35.072
+    expected_a[6, 2] = expected_a[7, 3] = 60.403
+    expected_b[4, 0] = expected_b[5, 1] = 0.295
+    expected_b[6, 0] = expected_b[7, 1] = -0.397
+    np.testing.assert_array_equal(np.round(a, 3), expected_a)
+    np.testing.assert_array_equal(np.round(b, 3), expected_b)
+
+
+def test_linearization_is_that_of_the_numpy_model_too(params):
+    # central differences: truncation h² and rounding 1e-16/h are both about 1e-10 of entries up to 60
+    h = 1e-5
+    x = h * np.eye(8)
+    a = (dynamics.derivative(params, x, np.zeros((8, 2))) - dynamics.derivative(params, -x, np.zeros((8, 2)))) / (2 * h)
+    assert a.T[4, 2] == pytest.approx(-35.07244, abs=5e-6)
+    assert a.T[6, 2] == pytest.approx(60.40254, abs=5e-6)
+    slope = dynamics.derivative(params, np.zeros(8), np.array([1.0, 0.0]))
+    np.testing.assert_allclose(slope, [0, 0, 0, 0, 0.295172, 0, -0.397241, 0], atol=5e-7)
+
+
+def test_upright_at_rest_is_an_equilibrium(params):
+    assert dynamics.derivative(params, (0.0,) * 8, (0.0, 0.0)) == (0.0,) * 8
+
+
+def test_whole_numbers_are_as_good_as_floats(params):
+    assert dynamics.derivative(params, (0,) * 8, (1, 0)) == dynamics.derivative(params, (0.0,) * 8, (1.0, 0.0))
+
+
+def test_floats_numpy_casadi_and_torch_give_the_same_derivative(params):
+    casadi, torch = pytest.importorskip("casadi"), pytest.importorskip("torch")
+    x, u = random_points(200, math.radians(75))
+    batch = dynamics.derivative(params, x, u)
+    floats = [dynamics.derivative(params, tuple(a), tuple(b)) for a, b in zip(x.tolist(), u.tolist(), strict=True)]
+    tensors = dynamics.derivative(params, torch.from_numpy(x), torch.from_numpy(u))
+    sx, su = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
+    symbolic = casadi.Function("f", [sx, su], [dynamics.derivative(params, sx, su)])
+    # the libraries' sines differ in the last bit, and the mass matrix's condition at 75° (below 1e3) magnifies it
+    rounding = {"rtol": 1e-12, "atol": 1e-10}
+    np.testing.assert_allclose(floats, batch, **rounding)
+    np.testing.assert_allclose(tensors.numpy(), batch, **rounding)
+    np.testing.assert_allclose(np.array(symbolic(x.T, u.T)).T, batch, **rounding)
+
+
+def test_batches_of_any_shape_and_tuples_of_arrays_give_the_same_step(params):
+    x, u = random_points(6, math.radians(60))
+    flat = dynamics.step(params, x, u, 0.02)
+    shaped = dynamics.step(params, x.reshape(2, 3, 8), u.reshape(2, 3, 2), 0.02)
+    columns = dynamics.step(params, tuple(x.T), tuple(u.T), 0.02)
+    np.testing.assert_array_equal(shaped.reshape(6, 8), flat)
+    np.testing.assert_array_equal(np.stack(columns, axis=1), flat)
+
+
+def test_closed_form_is_drakes(params):
+    """Runs where drake is installed; needs no other extra: `pytest tests/test_dynamics.py -k drake`."""
+    pytest.importorskip("pydrake")
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(URDF_PATH))
+    plant.mutable_gravity_field().set_gravity_vector([0, 0, -params.gravity])
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    x, u = random_points(1000, math.radians(75))
+    ours = np.stack(dynamics.accelerations(params, x, u), axis=1)
+    worst = 0.0
+    for state, force, mine in zip(x, u, ours, strict=True):
+        plant.SetPositionsAndVelocities(context, state)
+        plant.get_actuation_input_port().FixValue(context, force)
+        drakes = plant.get_generalized_acceleration_output_port().Eval(context)
+        worst = max(worst, np.abs(mine - drakes).max() / np.abs(drakes).max())
+    assert worst < 1e-12  # measured: 4e-15
+
+
+def test_energy_rate_is_the_power_of_the_force(params):
+    # dE/dt = F·v; central differences over h leave h²: measured 9e-4 W at 1e-4 s and 9e-6 W here, of up to 2,600 W
+    x, u = random_points(100, math.radians(70))
+    h = 1e-5
+    before, after = dynamics.step(params, x, u, -h, 1), dynamics.step(params, x, u, h, 1)
+    rate = (dynamics.energy(params, after) - dynamics.energy(params, before)) / (2 * h)
+    np.testing.assert_allclose(rate, (u * x[:, 4:6]).sum(axis=1), atol=1e-4)
+
+
+def test_rk4_conserves_energy_to_its_order(params):
+    # fourth order: halving the step divides the drift by 16 in the limit; measured 15.0 and 15.5
+    drift = [
+        abs(dynamics.energy(params, integrate(params, GENTLE, (0.0, 0.0), 0.5, h)) - dynamics.energy(params, GENTLE))
+        for h in (0.02, 0.01, 0.005)
+    ]
+    assert drift[0] / drift[1] > 14
+    assert drift[1] / drift[2] > 14
+    assert drift[1] < 1e-6 * dynamics.energy(params, GENTLE)  # at RK4_STEP; measured 1e-7
+
+
+def test_rk4_step_is_as_accurate_as_documented(params):
+    exact = integrate(params, START, FORCE, 0.3, 1e-4)  # (10 ms/0.1 ms)⁴ = 1e8 times more accurate
+    error = {h: np.abs(integrate(params, START, FORCE, 0.3, h) - exact).max() for h in (0.02, dynamics.RK4_STEP)}
+    assert error[dynamics.RK4_STEP] < 1e-6  # measured: 8.1e-7
+    assert error[0.02] / error[dynamics.RK4_STEP] == pytest.approx(16, rel=0.2)
+
+
+@pytest.mark.parametrize(("dt", "substeps"), [(0.001, 1), (0.01, 1), (0.02, 2), (0.025, 3), (0.03, 3)])
+def test_control_steps_are_cut_into_as_few_rk4_steps_as_are_short_enough(dt, substeps):
+    assert dynamics.substeps_for(dt) == substeps
+
+
+def test_motion_in_one_plane_stays_in_it(params):
+    after = dynamics.step(params, (0.0, 0.3, 0.0, 0.4, 0.0, 1.0, 0.0, -0.5), (0.0, 70.0), 0.3, 30)
+    assert [after[i] for i in (0, 2, 4, 6)] == [0.0] * 4
+
+
+def test_mirrored_start_gives_mirrored_motion(params):
+    mirror, mirror_force = np.array([-1, 1] * 4), np.array([-1, 1])
+    after = dynamics.step(params, np.array(START), np.array(FORCE), 0.1, 10)
+    mirrored = dynamics.step(params, mirror * START, mirror_force * FORCE, 0.1, 10)
+    np.testing.assert_allclose(mirrored, mirror * after, rtol=1e-13)
+
+
+def test_tilt_is_the_angle_of_the_bodys_axis():
+    gamma, theta = 0.5, -0.8
+    axis_z = np.array([np.sin(gamma) * np.cos(theta), np.sin(theta), np.cos(gamma) * np.cos(theta)])[2]
+    assert dynamics.cos_tilt((0.0, 0.0, gamma, theta, 0.0, 0.0, 0.0, 0.0)) == pytest.approx(axis_z)
+
+
+def test_state_and_input_are_named_in_order():
+    assert [name for name, _ in dynamics.STATE] == ["x", "y", "γ", "θ", "ẋ", "ẏ", "γ̇", "θ̇"]
+    assert [unit for _, unit in dynamics.STATE] == ["m", "m", "rad", "rad", "m/s", "m/s", "rad/s", "rad/s"]
+    assert dynamics.INPUT == (("Fx", "N"), ("Fy", "N"))
+
+
+def test_potential_energy_is_of_the_bodys_height():
+    params = default_params()
+    rest = dynamics.energy(params, (0.0,) * 8)
+    assert rest == pytest.approx(15 * 9.81 * 0.6)

@@ -1,0 +1,482 @@
+import hashlib
+import itertools
+import json
+import math
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from ballbot_gym import BallbotEnv
+from ballbot_gym.simulator import PHYSICS, Marker, Scene
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.stabilize import Stabilize
+
+UPRIGHT = np.zeros(8)
+
+
+def leaning(gamma):
+    return np.array([0.0, 0.0, gamma, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def play(env, actions):
+    """Steps through actions until the episode ends; returns (reward, terminated, truncated, info) of each step."""
+    steps = []
+    for action in actions:
+        _, reward, terminated, truncated, info = env.step(action)
+        steps.append((reward, terminated, truncated, info))
+        if terminated or truncated:
+            break
+    return steps
+
+
+def digest(task, physics):
+    """Hash of everything that two seeded episodes return."""
+    env = BallbotEnv(task, physics=physics)
+    sha = hashlib.sha256()
+    rng = np.random.default_rng(5)
+    for seed in (3, None):
+        observation, info = env.reset(seed=seed)
+        done = False
+        while not done:
+            sha.update(observation.tobytes() + info["state"].tobytes() + info["constants"].tobytes())
+            observation, reward, terminated, truncated, info = env.step(rng.uniform(-1, 1, 2))
+            sha.update(np.float64(reward).tobytes())
+            done = terminated or truncated
+    env.close()
+    return sha.hexdigest()
+
+
+# --- Gymnasium's rules ---
+
+
+def test_every_task_is_registered_under_its_id(task, physics):
+    env = gymnasium.make(task.id, physics=physics)
+    assert isinstance(env.unwrapped.task, type(task))
+    assert env.spec.id == task.id
+    env.close()
+
+
+def test_gymnasium_checker_has_no_complaint(task, physics):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(task.id, physics=physics)
+        check_env(env.unwrapped, skip_render_check=True)  # its render check opens a window
+        env.close()
+
+
+def test_stable_baselines3_checker_has_no_complaint(task, physics):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(task.id, physics=physics)
+        checker.check_env(env.unwrapped, warn=True, skip_render_check=True)
+        env.close()
+
+
+# --- the return is minus the cost ---
+
+
+def test_return_is_minus_the_cost_recomputed_from_states_and_forces(task, physics, make_env, rng):
+    env = make_env(task, physics=physics)
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        x, c, cost, total = info["state"], info["constants"], 0.0, 0.0
+        for reward, *_, info in play(env, rng.uniform(-1.2, 1.2, (task.steps, 2))):
+            cost += task.cost(x, info["force"], c) * task.control_dt + task.failure_cost * info["failure"]
+            total -= reward
+            assert reward == -info["cost"]
+            x = info["state"]
+        assert info["failure"]  # random forces topple it, so that the failure cost is among what was summed
+        assert total == pytest.approx(cost, rel=1e-12)  # the order of additions differs
+
+
+def test_reset_costs_nothing_and_reports_the_start(task, physics, make_env):
+    env = make_env(task, physics=physics)
+    observation, info = env.reset(seed=1)
+    assert info["cost"] == 0
+    assert not any(info[name] for name in ("success", "failure", "clipped"))
+    np.testing.assert_array_equal(info["force"], [0, 0])
+    expected = task.observe(info["state"], info["constants"])
+    np.testing.assert_array_equal(observation, np.float32(expected))
+
+
+def test_observation_is_the_tasks_of_the_state_reported(task, physics, make_env):
+    env = make_env(task, physics=physics)
+    env.reset(seed=1)
+    for k in range(10):
+        observation, *_, info = env.step([0.02 * k, -0.1])
+        np.testing.assert_array_equal(observation, np.float32(task.observe(info["state"], info["constants"])))
+        assert info["tilt"] == pytest.approx(math.acos(math.cos(info["state"][2]) * math.cos(info["state"][3])))
+
+
+# --- reproducibility ---
+
+
+def test_same_seed_is_bit_identical_across_resets_and_instances(task, physics):
+    assert digest(task, physics) == digest(task, physics)
+
+
+def test_same_seed_is_bit_identical_across_processes():
+    result = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=True)
+    theirs = json.loads(result.stdout.splitlines()[-1])
+    assert theirs == {f"{task} {physics}": digest(task, physics) for task, physics in itertools.product(TASKS, PHYSICS)}
+
+
+def test_reset_repeats_with_the_seed_in_the_middle_of_an_episode(task, physics, make_env):
+    env = make_env(task, physics=physics)
+    _, first = env.reset(seed=7)
+    after = env.step([0.3, -0.2])[0]
+    env.step([1.0, 1.0])
+    _, again = env.reset(seed=7)
+    np.testing.assert_array_equal(again["state"], first["state"])
+    np.testing.assert_array_equal(again["constants"], first["constants"])
+    np.testing.assert_array_equal(env.step([0.3, -0.2])[0], after)
+
+
+def test_different_seeds_and_following_episodes_differ(task, make_env):
+    env = make_env(task, physics="rk4")
+    starts = [env.reset(seed=seed)[0] for seed in (0, 1, None, None)]
+    assert all((a != b).any() for a, b in itertools.combinations(starts, 2))
+
+
+def test_bullet_and_rk4_draw_the_same_episodes(task, make_env):
+    (_, a), (_, b) = (make_env(task, physics=physics).reset(seed=4) for physics in PHYSICS)
+    np.testing.assert_array_equal(a["state"], b["state"])
+    np.testing.assert_array_equal(a["constants"], b["constants"])
+
+
+# --- options ---
+
+
+def test_given_start_state_takes_effect(task, physics, make_env):
+    state = [0.1, -0.2, 0.3, -0.1, 0.5, 0.6, -0.7, 0.8]
+    env = make_env(task, physics=physics)
+    _, info = env.reset(seed=0, options={"state": state})
+    np.testing.assert_array_equal(info["state"], state)
+    *_, info = env.step([0.0, 0.0])
+    assert info["state"][0] == pytest.approx(0.1 + 0.5 * 0.02, abs=5e-3)  # it moved from there
+
+
+def test_given_constants_take_effect_by_name_and_as_a_vector(task, make_env):
+    env = make_env(task, physics="rk4")
+    _, drawn = env.reset(seed=0)
+    _, other = env.reset(seed=1)
+    _, info = env.reset(seed=0, options={"constants": other["constants"], "state": other["state"]})
+    np.testing.assert_array_equal(info["constants"], other["constants"])
+    for i, name in enumerate(task.constant_names[:2]):
+        _, info = env.reset(seed=0, options={"constants": {name: other["constants"][i]}})
+        expected = drawn["constants"].copy()
+        expected[i] = other["constants"][i]
+        np.testing.assert_array_equal(info["constants"], expected)
+
+
+def test_options_do_not_shift_what_later_episodes_draw(task, make_env):
+    env = make_env(task, physics="rk4")
+    env.reset(seed=0)
+    expected = env.reset()[1]
+    env.reset(seed=0, options={"state": UPRIGHT})
+    got = env.reset()[1]
+    np.testing.assert_array_equal(got["state"], expected["state"])
+    np.testing.assert_array_equal(got["constants"], expected["constants"])
+
+
+def test_own_robot_is_simulated(physics, make_env, params):
+    heavy = replace(params, body_mass=30.0, inertia=2 * params.inertia, axial_inertia=2 * params.axial_inertia)
+    weak = replace(params, force_limit=100.0)
+    speeds = []
+    for robot in (params, heavy, weak):
+        env = make_env(physics=physics, params=robot)
+        env.reset(seed=0, options={"state": UPRIGHT})
+        speeds.append(env.step([1.0, 0.0])[-1]["state"][4])
+    assert speeds[1] < speeds[0]
+    assert speeds[2] == pytest.approx(speeds[0] * 100 / 350, rel=0.05)  # nearly linear for one step
+
+
+# --- ends ---
+
+
+def test_falling_terminates_and_charges_the_failure_cost(task, physics, make_env):
+    env = make_env(task, physics=physics, render_mode=None)
+    env.reset(seed=0, options={"state": leaning(1.0)})
+    steps = play(env, [[0.0, 0.0]] * task.steps)
+    reward, terminated, truncated, info = steps[-1]
+    assert (terminated, truncated, info["failure"], info["success"]) == (True, False, True, False)
+    assert info["tilt"] > task.max_tilt
+    assert reward < -task.failure_cost
+    assert all(step[0] > -task.failure_cost and not step[-1]["failure"] for step in steps[:-1])
+
+
+def test_episode_is_truncated_at_its_duration(task, physics):
+    env = gymnasium.make(task.id, physics=physics, duration=1.0)
+    env.reset(seed=0, options={"state": UPRIGHT})
+    steps = play(env, [[0.0, 0.0]] * 100)
+    env.close()
+    assert len(steps) == round(1.0 / task.control_dt)
+    reward, terminated, truncated, info = steps[-1]
+    assert (terminated, truncated, info["failure"]) == (False, True, False)
+    assert reward > -task.failure_cost
+    assert not any(step[1] or step[2] for step in steps[:-1])
+
+
+def test_stabilize_succeeds_if_it_rests_at_the_end_and_not_before(make_env, physics):
+    env = make_env(physics=physics, duration=0.1)
+    env.reset(options={"state": UPRIGHT})
+    steps = play(env, [[0.0, 0.0]] * 9)
+    assert [step[-1]["success"] for step in steps] == [False] * 4 + [True]
+    env.reset(options={"state": [0.2, 0, 0, 0, 0, 0, 0, 0]})
+    assert not play(env, [[0.0, 0.0]] * 9)[-1][-1]["success"]
+
+
+def test_turn_ends_in_success_at_the_gate_at_no_further_cost(make_env, physics):
+    env = make_env("turn", physics=physics)
+    _, info = env.reset(options={"constants": {"speed": 3.0}, "state": [0.75, 0, 0, 0, 3.0, 0, 0, 0]})
+    steps = play(env, [[0.0, 0.0]] * 9)
+    reward, terminated, truncated, info = steps[-1]
+    assert (terminated, truncated, info["success"], info["failure"]) == (True, False, True, False)
+    # 0.05 m at 3 m/s, upright and without force: a step is 0.06 m, and costs its time alone
+    assert len(steps) == 1
+    assert reward == pytest.approx(-env.task.time_weight * env.task.control_dt)
+
+
+def test_turn_is_no_success_at_the_gate_in_the_wrong_direction(make_env):
+    env = make_env("turn", physics="rk4")
+    env.reset(options={"constants": {"speed": 3.0}, "state": [1.0, 0.0, 0, 0, 0, 3.0, 0, 0]})
+    assert not env.step([0.0, 0.0])[-1]["success"]
+
+
+def test_touching_an_obstacle_with_the_balls_rim_fails(make_env, physics):
+    env = make_env("weave", physics=physics)
+    _, info = env.reset(seed=0)
+    x, y, radius = info["constants"][2:5]
+    gap = 0.05  # m, between ball and obstacle
+    start = np.array([x - radius - 0.1 - gap, y, 0, 0, 1.0, 0, 0, 0])
+    env.reset(options={"constants": info["constants"], "state": start})
+    steps = play(env, [[0.0, 0.0]] * 9)
+    assert len(steps) == 3  # 0.05 m at 1 m/s
+    assert steps[-1][1]
+    assert steps[-1][-1]["failure"]
+
+
+# --- actions ---
+
+
+def test_action_beyond_one_is_clipped_and_info_says_so(task, physics, make_env):
+    env = make_env(task, physics=physics)
+    env.reset(seed=0, options={"state": UPRIGHT})
+    *_, beyond = env.step([3.0, -7.0])
+    env.reset(seed=0, options={"state": UPRIGHT})
+    *_, limit = env.step([1.0, -1.0])
+    assert beyond["clipped"]
+    assert not limit["clipped"]
+    for info in (beyond, limit):
+        np.testing.assert_array_equal(info["force"], [350.0, -350.0])
+    np.testing.assert_array_equal(beyond["state"], limit["state"])
+
+
+@pytest.mark.parametrize("action", [np.array([0.25, -0.5], np.float32), [0.25, -0.5], (0.25, -0.5)])
+def test_action_is_the_force_in_units_of_the_limit(make_env, action):
+    env = make_env(physics="rk4")
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.step(action)[-1]["force"], [87.5, -175.0])
+
+
+BAD_ACTIONS = {
+    "NaN": ([math.nan, 0.0], "finite"),
+    "infinite": ([0.0, math.inf], "finite"),
+    "too long": ([0.0, 0.0, 0.0], r"shape \(2,\), not \(3,\)"),
+    "too deep": ([[0.0, 0.0]], r"shape \(2,\), not \(1, 2\)"),
+    "scalar": (0.5, r"shape \(2,\), not \(\)"),
+    "None": (None, r"shape \(2,\)"),
+}
+
+
+@pytest.mark.parametrize(("action", "problem"), BAD_ACTIONS.values(), ids=BAD_ACTIONS.keys())
+def test_bad_action_is_refused_and_changes_nothing(make_env, physics, action, problem):
+    env = make_env(physics=physics)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=problem):
+        env.step(action)
+    after = env.step([0.1, 0.1])[0]
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.step([0.1, 0.1])[0], after)
+
+
+# --- bad input ---
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "problem"),
+    [
+        ({"physics": "mujoco"}, ValueError, "unknown physics 'mujoco'; known: 'bullet', 'rk4'"),
+        ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'"),
+        ({"task": "juggle"}, ValueError, "unknown task 'juggle'; known: 'stabilize'"),
+        ({"durration": 4.0}, TypeError, "BallbotStabilize-v0 has no argument durration; it has .*duration"),
+        ({"duration": -1.0}, ValueError, "Stabilize: duration must be positive"),
+        ({"task": Stabilize(), "duration": 4.0}, ValueError, r"fields \['duration'\] cannot be given together"),
+        ({"physics_dt": 0.003}, ValueError, "whole fraction"),
+    ],
+)
+def test_bad_argument_is_named(kwargs, error, problem):
+    with pytest.raises(error, match=problem):
+        BallbotEnv(**kwargs)
+
+
+def test_unknown_task_field_through_gymnasium_make_is_a_type_error(task):
+    with pytest.raises(TypeError, match=f"{task.id} has no argument colour"):
+        gymnasium.make(task.id, colour="red")
+
+
+BAD_OPTIONS = {
+    "unknown": ({"stat": UPRIGHT}, r"unknown reset options \['stat'\]; known: 'state', 'constants'"),
+    "short state": ({"state": [0.0] * 7}, "state must be 8 finite numbers"),
+    "deep state": ({"state": [[0.0] * 8]}, "state must be 8 finite numbers"),
+    "NaN state": ({"state": [math.nan] * 8}, "state must be 8 finite numbers"),
+    "words for a state": ({"state": "upright"}, "state must be 8 finite numbers"),
+    "fallen state": ({"state": leaning(1.5)}, r"start state is out of range.*γ = 1.5.*tilt 85.9° of at most 80.0°"),
+    "long constants": ({"constants": [0.0] * 99}, "constants must be"),
+    "unknown constant": ({"constants": {"colour": 1.0}}, r"has no constants \['colour'\]"),
+}
+
+
+@pytest.mark.parametrize(("options", "problem"), BAD_OPTIONS.values(), ids=BAD_OPTIONS.keys())
+def test_bad_option_is_named(task, make_env, options, problem):
+    env = make_env(task, physics="rk4")
+    with pytest.raises(ValueError, match=problem):
+        env.reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize(
+    ("task", "constants", "problem"),
+    [
+        ("turn", {"speed": 0.0}, "speed must be in"),
+        ("turn", {"speed": 13.0}, "speed must be in"),
+        ("orbit", {"radius": 0.5}, "radius must exceed"),
+        ("orbit", {"speed": 0.0}, "speed must not be 0"),
+        ("weave", {"obstacle1_radius": 0.0}, "obstacle1_radius must be positive"),
+        ("weave", {"obstacle0_x": 7.0, "obstacle0_y": 0.0, "goal_x": 7.0}, "the goal lies in obstacle 0"),
+        ("orbit", {"radius": math.nan}, "constants must be 2 finite numbers"),
+    ],
+)
+def test_senseless_constant_is_named(make_env, task, constants, problem):
+    with pytest.raises(ValueError, match=problem):
+        make_env(task, physics="rk4").reset(seed=0, options={"constants": constants})
+
+
+def test_obstacle_on_the_start_is_refused(make_env):
+    env = make_env("weave", physics="rk4")
+    on_start = {"obstacle0_x": 0.0, "obstacle0_y": 0.0, "obstacle0_radius": 0.5}
+    with pytest.raises(ValueError, match=r"obstacle|start"):
+        env.reset(seed=0, options={"constants": on_start})
+
+
+def test_step_before_reset_is_refused(physics, make_env):
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"step\(\) before reset"):
+        make_env(physics=physics).step([0.0, 0.0])
+
+
+def test_step_after_the_end_is_refused(physics, make_env):
+    for start in (UPRIGHT, leaning(1.39)):  # truncated; terminated
+        env = make_env(physics=physics, duration=0.2)
+        env.reset(options={"state": start})
+        play(env, [[0.0, 0.0]] * 10)
+        with pytest.raises(gymnasium.error.ResetNeeded, match="episode has ended"):
+            env.step([0.0, 0.0])
+
+
+def test_closed_environment_refuses_everything_but_close(physics, make_env):
+    env = make_env(physics=physics, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.close()
+    for use in (lambda: env.step([0.0, 0.0]), env.reset, env.render):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="closed"):
+            use()
+    env.close()
+
+
+# --- rendering ---
+
+
+def test_frames_are_images_that_show_the_lean(task, physics, make_env):
+    env = make_env(task, physics=physics, render_mode="rgb_array")
+    frames = []
+    for gamma in (0.0, 0.8):
+        env.reset(seed=0, options={"state": leaning(gamma)})
+        frames.append(env.render())
+    assert [(frame.shape, frame.dtype) for frame in frames] == [((480, 640, 3), np.uint8)] * 2
+    # the body is drawn orange, and nothing else is
+    orange = [(f[..., 0] > 120) & (f[..., 2] < 0.35 * f[..., 0]) & (f[..., 1] > 0.35 * f[..., 0]) for f in frames]
+    widths = [np.ptp(np.nonzero(mask)[1]) for mask in orange]
+    heights = [np.ptp(np.nonzero(mask)[0]) for mask in orange]
+    assert heights[0] > 3 * widths[0]  # upright: 1 m high, 0.2 m wide
+    assert widths[1] > 2 * widths[0]
+
+
+def test_rendering_does_not_change_the_trajectory(task, physics, make_env, rng):
+    actions = rng.uniform(-0.2, 0.2, (5, 2))
+    states = []
+    for mode in (None, "rgb_array"):
+        env = make_env(task, physics=physics, render_mode=mode)
+        env.reset(seed=0)
+        states.append([])
+        for action in actions:
+            states[-1].append(env.step(action)[-1]["state"])
+            if mode:
+                env.render()
+    np.testing.assert_array_equal(states[0], states[1])
+
+
+def test_what_a_task_marks_is_drawn_and_removed_again(params):
+    scene = Scene(params, width=160, height=120)
+    bare = scene.draw(tuple(UPRIGHT))
+    scene.set_markers([Marker((0.5, 0.5), 0.2, 0.5, (0.9, 0.1, 0.1, 1.0))])
+    marked = scene.draw(tuple(UPRIGHT))
+    scene.set_markers([])
+    after = scene.draw(tuple(UPRIGHT))
+    scene.close()
+    assert (marked != bare).any()
+    np.testing.assert_array_equal(after, bare)
+
+
+def test_camera_follows_the_ball(params):
+    scene = Scene(params, width=160, height=120)
+    orange = []
+    for x in (0.0, 20.0):
+        frame = scene.draw((x, -x, *UPRIGHT[2:]))
+        orange.append(np.argwhere((frame[..., 0] > 120) & (frame[..., 2] < 60)).mean(axis=0))
+    scene.close()
+    np.testing.assert_allclose(orange[0], orange[1], atol=2)  # pixels
+
+
+def test_window_without_a_display_is_refused(monkeypatch, make_env):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    env = make_env(render_mode="human")
+    with pytest.raises(RuntimeError, match="needs a display, and DISPLAY is not set"):
+        env.reset(seed=0)
+
+
+def test_render_without_a_mode_warns(make_env):
+    env = make_env(physics="rk4")
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert env.render() is None
+
+
+def test_render_before_reset_is_refused(make_env):
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"render\(\) before reset"):
+        make_env(render_mode="rgb_array").render()
+
+
+def test_frame_rate_is_that_of_the_control_steps(make_env):
+    assert make_env(physics="rk4").metadata["render_fps"] == 50
+    assert make_env(physics="rk4", control_dt=0.04).metadata["render_fps"] == 25
+
+
+if __name__ == "__main__":  # the other process of test_same_seed_is_bit_identical_across_processes
+    print(json.dumps({f"{task} {physics}": digest(task, physics) for task in TASKS for physics in PHYSICS}))

@@ -1,0 +1,146 @@
+import dataclasses
+
+import pytest
+
+from ballbot_gym.params import URDF_PATH, BallbotParams, UrdfError, default_params
+
+
+def test_packaged_robot_has_the_numbers_that_give_the_papers_linearization():
+    assert default_params() == BallbotParams(
+        ball_mass=0.5,
+        ball_radius=0.1,
+        body_mass=15.0,
+        body_radius=0.1,
+        body_length=1.0,
+        com_height=0.6,
+        inertia=1.2875,
+        axial_inertia=0.075,
+        force_limit=350.0,
+        gravity=9.81,
+    )
+
+
+def test_body_is_a_solid_cylinder(params):
+    m, r, length = params.body_mass, params.body_radius, params.body_length
+    assert params.inertia == pytest.approx(m * (3 * r**2 + length**2) / 12, rel=1e-12)
+    assert params.axial_inertia == pytest.approx(m * r**2 / 2, rel=1e-12)
+
+
+def test_derived_quantities_are_those_of_the_two_masses(params):
+    assert params.total_mass == 15.5
+    assert params.first_moment == pytest.approx(9.0)
+    assert params.pivot_inertia == pytest.approx(1.2875 + 15 * 0.6**2)
+
+
+def test_written_urdf_reads_back_bit_by_bit(params, tmp_path):
+    # thirds and sevenths: numbers that a short decimal would lose
+    fields = {field.name: getattr(params, field.name) * 8 / 7 + 1 / 3 for field in dataclasses.fields(params)}
+    changed = BallbotParams(**fields)
+    path = tmp_path / "changed.urdf"
+    path.write_text(changed.to_urdf())
+    assert BallbotParams.from_urdf(path, gravity=changed.gravity) == changed
+
+
+def test_gravity_is_the_callers_and_defaults_to_the_earths():
+    assert BallbotParams.from_urdf().gravity == 9.81
+    assert BallbotParams.from_urdf(gravity=1.62).gravity == 1.62
+
+
+def test_revolute_leans_are_as_good_as_continuous_ones(tmp_path, params):
+    assert read_changed(tmp_path, 'type="continuous"', 'type="revolute"') == params
+
+
+def read_changed(folder, old, new):
+    text = URDF_PATH.read_text()
+    assert old in text
+    path = folder / "changed.urdf"
+    path.write_text(text.replace(old, new))
+    return BallbotParams.from_urdf(path)
+
+
+def block(start, end):
+    """The packaged URDF's text from `start` through the next `end`."""
+    text = URDF_PATH.read_text()
+    first = text.index(start)
+    return text[first : text.index(end, first) + len(end)]
+
+
+BODY_INERTIA = '<inertia ixx="1.2875" iyy="1.2875" izz="0.075" ixy="0" ixz="0" iyz="0"/>'
+ZERO_INERTIAL = block('<link name="slide">', "</link>")
+
+BAD_URDFS = {
+    "missing link": ('<link name="world"/>', "", "link 'world' is missing"),
+    "missing massless link": (block('<link name="yoke">', "</link>"), "", "link 'yoke' is missing"),
+    "missing joint": (block('<joint name="theta"', "</joint>"), "", "joint 'theta' is missing"),
+    "missing inertial": (
+        block('<inertial>\n      <mass value="0.5"/>', "</inertial>"),
+        "",
+        "link 'ball' has no <inert",
+    ),
+    "missing massless inertial": (ZERO_INERTIAL, '<link name="slide"/>', "link 'slide' has no <inertial>"),
+    "missing mass": ('<mass value="15"/>', "", "link 'body' has no <inertial><mass>"),
+    "missing inertia": (BODY_INERTIA, "", "link 'body' has no <inertial><inertia>"),
+    "missing visual": ('<sphere radius="0.1"/>', "", "link 'ball' has no <visual><geometry><sphere>"),
+    "missing limit": ('<limit effort="350" velocity="10000"/>', "", "joint 'x' has no <limit>"),
+    "missing attribute": ('<mass value="15"/>', "<mass/>", "mass of link 'body' has no attribute 'value'"),
+    "negative mass": ('<mass value="15"/>', '<mass value="-15"/>', "link 'body' has negative mass -15.0 kg"),
+    "zero mass": ('<mass value="0.5"/>', '<mass value="0"/>', "link 'ball' has mass 0"),
+    "massless link with mass": ('<mass value="0"/>', '<mass value="1"/>', "link 'slide' has mass 1.0 kg"),
+    "massless link with inertia": (
+        '<mass value="0"/>\n      <inertia ixx="0"',
+        '<mass value="0"/>\n      <inertia ixx="1"',
+        "link 'slide'",
+    ),
+    "zero inertia": ('izz="0.075"', 'izz="0"', "inertia of link 'body' must be positive"),
+    "negative inertia": ('ixx="0.002"', 'ixx="-0.002"', "inertia of link 'ball' must be positive"),
+    "body not round": ('iyy="1.2875"', 'iyy="1.3"', "link 'body' must be round"),
+    "product of inertia": (
+        'ixy="0" ixz="0" iyz="0"/>\n    </inertial>\n    <visual>',
+        'ixy="1"/></inertial><visual>',
+        "ixy",
+    ),
+    "product of inertia not a number": (BODY_INERTIA, BODY_INERTIA.replace('ixy="0"', 'ixy="no"'), "link 'body': ixy"),
+    "mass not a number": ('<mass value="15"/>', '<mass value="heavy"/>', "mass of link 'body': value = 'heavy'"),
+    "mass not finite": ('<mass value="15"/>', '<mass value="nan"/>', "mass of link 'body': value = 'nan'"),
+    "vector not numbers": ('<axis xyz="1 0 0"/>', '<axis xyz="1 0"/>', "axis of joint 'x': xyz = '1 0'"),
+    "wrong axis": ('<axis xyz="-1 0 0"/>', '<axis xyz="1 0 0"/>', "joint 'theta' has axis"),
+    "wrong type": ('name="y" type="prismatic"', 'name="y" type="fixed"', "joint 'y' is of type 'fixed'"),
+    "wrong parent": ('<parent link="ball"/>', '<parent link="slide"/>', "joint 'gamma' has parent link 'slide'"),
+    "wrong child": ('<child link="body"/>', '<child link="yoke"/>', "joint 'theta' has child link 'yoke'"),
+    "displaced joint": ('<child link="body"/>', '<child link="body"/><origin xyz="0 0 0.2"/>', "joint 'theta'"),
+    "centre of mass off axis": (
+        '<origin xyz="0 0 0.6"/>',
+        '<origin xyz="0.1 0 0.6"/>',
+        "link 'body' must have its cent",
+    ),
+    "centre of mass below": ('<origin xyz="0 0 0.6"/>', '<origin xyz="0 0 -0.6"/>', "link 'body' must have its centre"),
+    "tilted inertia": (
+        '<origin xyz="0 0 0.6"/>\n      <mass',
+        '<origin xyz="0 0 0.6" rpy="0.3 0 0"/>\n      <mass',
+        "link 'body'",
+    ),
+    "radius not positive": ('<sphere radius="0.1"/>', '<sphere radius="0"/>', "positive radius, not 0.0 m"),
+    "no force": ('effort="350"', 'effort="0"', "positive effort limit"),
+    "unreadable XML": ("</robot>", "", "not well-formed XML"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "culprit"), BAD_URDFS.values(), ids=BAD_URDFS.keys())
+def test_bad_urdf_gets_an_error_that_names_file_and_culprit(tmp_path, old, new, culprit):
+    with pytest.raises(UrdfError) as error:
+        read_changed(tmp_path, old, new)
+    assert culprit in str(error.value)
+    assert "changed.urdf" in str(error.value)
+
+
+def test_unequal_force_limits_are_refused(tmp_path):
+    text = URDF_PATH.read_text().replace('effort="350"', 'effort="300"', 1)
+    path = tmp_path / "uneven.urdf"
+    path.write_text(text)
+    with pytest.raises(UrdfError, match=r"\[300.0, 350.0\] N"):
+        BallbotParams.from_urdf(path)
+
+
+def test_absent_urdf_is_named(tmp_path):
+    with pytest.raises(UrdfError, match="nowhere.urdf: no such URDF file"):
+        BallbotParams.from_urdf(tmp_path / "nowhere.urdf")

@@ -1,0 +1,162 @@
+import gc
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pybullet
+import pytest
+
+from ballbot_gym import dynamics
+from ballbot_gym.simulator import PHYSICS, BulletSimulator, Rk4Simulator, Scene, import_pybullet
+
+START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
+FORCE = (60.0, -40.0)
+GENTLE = (0.0, 0.0, 0.2, -0.1, 1.0, -2.0, 0.5, 0.3)
+
+
+def held(params, physics, x, u, seconds, physics_dt):
+    """The state after holding u for some seconds."""
+    simulator = PHYSICS[physics](params, seconds, physics_dt)
+    simulator.reset(x)
+    try:
+        return np.array(simulator.step(u))
+    finally:
+        simulator.close()
+
+
+def open_clients():
+    gc.collect()
+    return sum(pybullet.getConnectionInfo(i)["isConnected"] for i in range(1024))
+
+
+def test_bullet_converges_to_the_closed_form_at_first_order(params):
+    exact = held(params, "rk4", START, FORCE, 0.3, 0.0005)  # exact to 1e-11: its error is fourth order
+    errors = [np.abs(held(params, "bullet", START, FORCE, 0.3, dt) - exact).max() for dt in (1e-3, 5e-4, 2.5e-4)]
+    # first order means 2; measured 2.0e-2, 9.8e-3, 4.9e-3
+    assert errors[0] == pytest.approx(2.0e-2, rel=0.05)
+    assert 1.7 < errors[0] / errors[1] < 2.3
+    assert 1.7 < errors[1] / errors[2] < 2.3
+
+
+def test_bullet_conserves_energy_to_first_order(params):
+    energy = dynamics.energy(params, GENTLE)
+    steps = (2e-3, 1e-3, 5e-4)
+    drift = [abs(dynamics.energy(params, held(params, "bullet", GENTLE, (0.0, 0.0), 0.5, dt)) - energy) for dt in steps]
+    assert drift[1] < 0.01 * energy  # measured 0.53 J of 117 J at 1 ms
+    assert 1.7 < drift[0] / drift[1] < 2.3
+    assert 1.7 < drift[1] / drift[2] < 2.3
+
+
+def test_robot_with_other_masses_converges_too(params):
+    # nothing of the packaged robot may be left in what Bullet loads
+    other = replace(params, ball_mass=2.0, body_mass=9.0, com_height=0.45, inertia=0.9, axial_inertia=0.3, gravity=3.7)
+    exact = held(other, "rk4", START, FORCE, 0.3, 0.0005)
+    errors = [np.abs(held(other, "bullet", START, FORCE, 0.3, dt) - exact).max() for dt in (1e-3, 5e-4)]
+    assert 1.7 < errors[0] / errors[1] < 2.3
+
+
+def test_rk4_simulator_is_the_closed_form_step(params):
+    simulator = Rk4Simulator(params, 0.02)
+    simulator.reset(START)
+    assert simulator.step(FORCE) == dynamics.step(params, START, FORCE, 0.02, 2)
+
+
+def test_substeps_in_bullet_are_bitwise_as_many_steps(params):
+    coarse, fine = BulletSimulator(params, 0.02, 0.001), BulletSimulator(params, 0.001, 0.001)
+    for simulator in (coarse, fine):
+        simulator.reset(START)
+    for force in (FORCE, (-350.0, 350.0), (0.0, 10.0)):
+        after = coarse.step(force)
+        for _ in range(20):
+            finely_after = fine.step(force)
+        assert after == finely_after
+    coarse.close()
+    fine.close()
+
+
+def test_reset_leaves_no_trace_of_what_was_before(params, physics):
+    simulator = PHYSICS[physics](params, 0.02)
+    runs = []
+    for _ in range(2):
+        simulator.reset(START)
+        runs.append([simulator.step((10.0 * k, -FORCE[1])) for k in range(25)])
+    simulator.close()
+    assert runs[0] == runs[1]
+
+
+def test_two_simulators_do_not_disturb_each_other(params, physics):
+    alone, beside, other = (PHYSICS[physics](params, 0.02) for _ in range(3))
+    for simulator in (alone, beside):
+        simulator.reset(START)
+    expected = [alone.step(FORCE) for _ in range(10)]
+    got = []
+    for _ in range(10):
+        other.reset(GENTLE)
+        got.append(beside.step(FORCE))
+        other.step((-350.0, 350.0))
+    assert got == expected
+    for simulator in (alone, beside, other):
+        simulator.close()
+
+
+def test_close_releases_the_client_once(params):
+    before = open_clients()
+    simulator = BulletSimulator(params, 0.02)
+    assert open_clients() == before + 1
+    simulator.close()
+    simulator.close()
+    assert open_clients() == before
+
+
+def test_forgotten_simulators_and_scenes_release_their_clients(params):
+    before = open_clients()
+    simulator, scene = BulletSimulator(params, 0.02), Scene(params)
+    assert open_clients() == before + 2
+    del simulator, scene
+    assert open_clients() == before
+
+
+def test_more_simulators_may_be_made_in_turn_than_bullet_has_clients(params):
+    for _ in range(1100):  # PyBullet has 1,024
+        simulator = BulletSimulator(params, 0.02)
+        del simulator
+
+
+def test_running_out_of_clients_says_what_to_do(params, monkeypatch):
+    monkeypatch.setattr(pybullet, "connect", lambda mode: -1)
+    with pytest.raises(RuntimeError, match=r"no free physics client; close\(\)"):
+        BulletSimulator(params, 0.02)
+
+
+@pytest.mark.parametrize("physics_dt", [0.003, 0.03, 0.0, -0.001])
+def test_physics_step_must_be_a_whole_fraction_of_the_control_step(params, physics, physics_dt):
+    with pytest.raises(ValueError, match="whole fraction of control_dt = 0.02 s"):
+        PHYSICS[physics](params, 0.02, physics_dt)
+
+
+def test_missing_pybullet_names_the_remedy(monkeypatch, make_env):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(ImportError, match=r'pip install pybullet.*physics="rk4"'):
+        make_env()
+
+
+def test_rk4_needs_no_pybullet(monkeypatch, make_env):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    env = make_env(physics="rk4")
+    env.reset(seed=0)
+    assert np.isfinite(env.step([0.1, 0.1])[1])
+
+
+def test_pybullet_without_numpy_names_the_remedy(monkeypatch):
+    monkeypatch.setattr(pybullet, "isNumpyEnabled", lambda: 0)
+    with pytest.raises(ImportError, match=r"built without NumPy.*--force-reinstall"):
+        import_pybullet()
+
+
+def test_importing_the_environments_imports_no_heavy_library():
+    heavy = ["casadi", "torch", "stable_baselines3", "pybullet", "scipy", "matplotlib"]
+    program = f"import ballbot_gym, json, sys; print(json.dumps([name for name in {heavy} if name in sys.modules]))"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert json.loads(result.stdout) == []
