@@ -7,8 +7,8 @@ from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
-EXECUTED = Backoff(margin=0.02, goal=0.5, force=0.05)
-"""What plans that are to be executed keep: 2 cm from obstacles, half the goal's tolerance, 5 % of the force."""
+EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02)
+"""What plans that are to be executed keep: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the force."""
 
 
 class TrajoptController:

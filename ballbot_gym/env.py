@@ -180,13 +180,14 @@ class BallbotEnv(gymnasium.Env):
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; known: 'state', 'constants'")
         task = self.task
-        c = task.sample_constants(self.np_random, self.params)
+        draws = self.np_random.random(task.constant_draws + task.state_draws).tolist()
+        c = np.array(task.draw_constants(tuple(draws[: task.constant_draws]), self.params), np.float64)
         if constants is not None:
             if isinstance(constants, dict):
                 constants = self._replaced(c, constants)
             c = _finite_vector(constants, len(task.constant_names), "constants")
             task.check_constants(c, self.params)
-        x = task.sample_state(self.np_random, c, self.params)
+        x = np.array(task.draw_state(tuple(draws[task.constant_draws :]), tuple(c.tolist()), self.params), np.float64)
         if state is not None:
             x = _finite_vector(state, 8, "state")
             if not task.is_safe(tuple(x.tolist()), tuple(c.tolist())):

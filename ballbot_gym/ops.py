@@ -5,6 +5,7 @@ A tuple's components may themselves be floats, arrays of any one shape, tensors 
 one robot in pure Python and for a batch on an accelerator alike.
 """
 
+import functools
 import math
 import sys
 from types import ModuleType
@@ -34,6 +35,17 @@ def cos(a: Any) -> Any:
 def sqrt(a: Any) -> Any:
     """Square root, elementwise."""
     return math.sqrt(a) if isinstance(a, float) else _library(a).sqrt(a)
+
+
+def where(condition: Any, a: Any, b: Any) -> Any:
+    """a where the condition holds, else b, elementwise. Not for CasADi: what tasks ask of optimizers is smooth."""
+    if isinstance(condition, bool):
+        return a if condition else b
+    library = _library(condition)
+    if library.__name__ == "torch":
+        as_tensor = functools.partial(library.as_tensor, device=condition.device)
+        return library.where(condition, as_tensor(a), as_tensor(b))
+    return np.where(condition, a, b)
 
 
 def components(v: Vector) -> tuple[Any, ...]:

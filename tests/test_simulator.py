@@ -132,7 +132,7 @@ def test_running_out_of_clients_says_what_to_do(params, monkeypatch):
 
 @pytest.mark.parametrize("physics_dt", [0.003, 0.03, 0.0, -0.001])
 def test_physics_step_must_be_a_whole_fraction_of_the_control_step(params, physics, physics_dt):
-    with pytest.raises(ValueError, match="whole fraction of control_dt = 0.02 s"):
+    with pytest.raises(ValueError, match=r"whole fraction of control_dt = 0\.02 s"):
         PHYSICS[physics](params, 0.02, physics_dt)
 
 

@@ -51,6 +51,10 @@ class Task(ABC):
     """What each observed quantity is divided by, in its unit."""
     constant_names: ClassVar[tuple[str, ...]] = ()
     """Names of the episode's constants c, in order."""
+    constant_draws: ClassVar[int] = 0
+    """Uniform numbers that `draw_constants` takes."""
+    state_draws: ClassVar[int] = 0
+    """Uniform numbers that `draw_state` takes."""
     first_exit: ClassVar[bool] = False
     """Whether reaching the goal ends the episode."""
 
@@ -74,18 +78,19 @@ class Task(ABC):
         """Control steps in the longest episode."""
         return round(self.duration / self.control_dt)
 
-    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
-        """Draws an episode's constants (nc,)."""
-        return np.zeros(0)
+    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        """The constants (nc) that `constant_draws` uniform numbers z in [0, 1) stand for; z may hold batches."""
+        return ()
 
     @abstractmethod
-    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
-        """Draws an initial state (8,) for constants c."""
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        """The initial state (8) that `state_draws` uniform numbers z stand for, in an episode with constants c."""
 
     def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
         """Draws an episode: initial state (8,) and constants (nc,)."""
-        c = self.sample_constants(rng, params)
-        return self.sample_state(rng, c, params), c
+        c = self.draw_constants(tuple(rng.random(self.constant_draws).tolist()), params)
+        x = self.draw_state(tuple(rng.random(self.state_draws).tolist()), c, params)
+        return np.array(x, np.float64), np.array(c, np.float64)
 
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         """Raises a ValueError that names the constant that makes no sense."""
@@ -146,6 +151,11 @@ def then_stay(path: np.ndarray, steps: int) -> np.ndarray:
     """A path prolonged to (steps+1, 2) by its last point, or cut."""
     rest = np.repeat(path[-1:], max(0, steps + 1 - len(path)), axis=0)
     return np.concatenate([path, rest])[: steps + 1]
+
+
+def between(z: Any, low: Any, high: Any) -> Any:
+    """A uniform number z in [0, 1) as one in [low, high)."""
+    return low + (high - low) * z
 
 
 def squared(*parts: Any) -> Any:

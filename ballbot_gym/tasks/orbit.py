@@ -10,7 +10,7 @@ from ballbot_gym import ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.simulator import Marker
-from ballbot_gym.tasks.base import Reference, Task, scaled, squared
+from ballbot_gym.tasks.base import Reference, Task, between, scaled, squared
 
 _GUESS_SECONDS = 1.5  # how long a guessed path takes to reach its speed
 
@@ -69,11 +69,13 @@ class Orbit(Task):
     id = "BallbotOrbit-v0"
     observation_scale = (3.0, 3.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 1.0, 5.0, 5.0, 3.0, 5.0)
     constant_names = ("radius", "speed")
+    constant_draws = 3
+    state_draws = 1
 
-    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
-        radius = rng.uniform(self.min_radius, self.max_radius)
-        speed = orbit_speed(params, radius, rng.uniform(self.min_steady_tilt, self.max_steady_tilt))
-        return np.array([radius, speed * rng.choice([-1.0, 1.0])])
+    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        radius = between(z[0], self.min_radius, self.max_radius)
+        speed = orbit_speed(params, radius, between(z[1], self.min_steady_tilt, self.max_steady_tilt))
+        return radius, ops.where(z[2] < 0.5, -1.0, 1.0) * speed
 
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         smallest = params.pivot_inertia / params.first_moment
@@ -82,9 +84,10 @@ class Orbit(Task):
         if c[1] == 0:
             raise ValueError(f"{self.id}: speed must not be 0")
 
-    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
-        bearing = rng.uniform(0, 2 * math.pi)
-        return np.array([c[0] * math.cos(bearing), c[0] * math.sin(bearing), 0, 0, 0, 0, 0, 0])
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        radius, _ = c
+        bearing, zero = 2 * math.pi * z[0], 0.0 * radius
+        return (radius * ops.cos(bearing), radius * ops.sin(bearing), zero, zero, zero, zero, zero, zero)
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         radius_error, vx_error, vy_error = self._errors(x, c)
@@ -132,15 +135,15 @@ class Orbit(Task):
         return (squared(px, py) - radius * radius) / (2 * radius), vx + rate * py, vy - rate * px
 
 
-def orbit_speed(params: BallbotParams, radius: float, tilt: float) -> float:
+def orbit_speed(params: BallbotParams, radius: Any, tilt: Any) -> Any:
     """Speed, m/s, at which a steady orbit of this radius, m, leans inwards by this tilt, rad.
 
     With J = I + ml², h = ml and Ω = v/r: tan(tilt)·(hg + JΩ² cos(tilt)) = hΩ² r. The body's axial inertia, under 0.2 % of
     J here, is left out.
     """
     h, inertia = params.first_moment, params.pivot_inertia
-    rate2 = h * params.gravity * math.tan(tilt) / (h * radius - inertia * math.sin(tilt))
-    return radius * math.sqrt(rate2)
+    sin_tilt, cos_tilt = ops.sin(tilt), ops.cos(tilt)
+    return radius * ops.sqrt(h * params.gravity * sin_tilt / cos_tilt / (h * radius - inertia * sin_tilt))
 
 
 def orbit_tilt(params: BallbotParams, radius: float, speed: float) -> float:

@@ -10,7 +10,7 @@ from ballbot_gym import dynamics, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.simulator import Marker
-from ballbot_gym.tasks.base import Reference, Task, cubic, scaled, squared, then_stay
+from ballbot_gym.tasks.base import Reference, Task, between, cubic, scaled, squared, then_stay
 
 _GUESS_SECONDS = 2.5  # how long a guessed path takes to come to rest
 
@@ -54,13 +54,13 @@ class Stabilize(Task):
     start_lean_rate: float = 1.0
     """rad/s."""
 
+    state_draws = 8
     id = "BallbotStabilize-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0)
 
-    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         limits = (self.start_position, self.start_lean, self.start_speed, self.start_lean_rate)
-        limit = np.repeat(limits, 2)
-        return rng.uniform(-limit, limit)
+        return tuple(between(z[i], -limits[i // 2], limits[i // 2]) for i in range(8))
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         px, py, *rest = ops.components(x)

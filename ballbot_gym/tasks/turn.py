@@ -10,7 +10,7 @@ from ballbot_gym import dynamics, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.simulator import Marker
-from ballbot_gym.tasks.base import Reference, Task, cubic, scaled, squared
+from ballbot_gym.tasks.base import Reference, Task, between, cubic, scaled, squared
 
 _START, _GATE = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # m, the paper's turn
 _LINEAR_SECONDS_PER_SPEED = 0.6  # s per m/s: with less LQR falls, with more it dawdles (0.5 to 1.0 tried)
@@ -58,17 +58,20 @@ class Turn(Task):
     id = "BallbotTurn-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 5.0)
     constant_names = ("speed",)
+    constant_draws = 1
     first_exit = True
 
-    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
-        return rng.uniform(self.min_speed, self.max_speed, 1)
+    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        return (between(z[0], self.min_speed, self.max_speed),)
 
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         if not 0 < c[0] <= 12:
             raise ValueError(f"{self.id}: speed must be in (0, 12] m/s, not {c[0]:g}")
 
-    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
-        return np.array([*_START, 0.0, 0.0, 0.0, c[0], 0.0, 0.0])
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        (speed,) = c
+        zero = 0.0 * speed  # of the shape of a batch, if c is one
+        return (zero + _START[0], zero + _START[1], zero, zero, zero, speed, zero, zero)
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)

@@ -10,11 +10,12 @@ from ballbot_gym import ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.simulator import Marker
-from ballbot_gym.tasks.base import Reference, Task, scaled, squared, then_stay
+from ballbot_gym.tasks.base import Reference, Task, between, scaled, squared, then_stay
 from ballbot_gym.tasks.stabilize import at_rest
 
 MAX_OBSTACLES = 5
 
+_FREE_STRETCH = 1.0  # m along x before, between and behind obstacles
 _GUESS_SECONDS = 3.5  # how long a guessed path takes to the goal
 
 
@@ -40,7 +41,7 @@ class Weave(Task):
     | name | meaning | unit | range |
     |---|---|---|---|
     | goal_x, goal_y | where to rest | m | goal_x drawn from [6, 9], goal_y 0 |
-    | obstacle{i}_x, _y | centre of obstacle i | m | at least 1.2 m before and behind it are free along x |
+    | obstacle{i}_x, _y | centre of obstacle i | m | at least 1 m from the next along x |
     | obstacle{i}_radius | | m | [0.25, 0.45]; set to any > 0 |
 
     Obstacles are numbered along the way, and alternate about the straight line; unused numbers repeat the last one.
@@ -68,19 +69,29 @@ class Weave(Task):
         f"obstacle{i}_{what}" for i in range(MAX_OBSTACLES) for what in ("x", "y", "radius")
     )
 
-    def sample_constants(self, rng: np.random.Generator, params: BallbotParams) -> np.ndarray:
-        count = int(rng.integers(2, MAX_OBSTACLES + 1))
-        distance = rng.uniform(6.0, 9.0)
-        # free stretches of at least 1.2 m before, between and behind, the rest of the way shared out at random
-        stretches = 1.2 + (distance - 1.2 * (count + 1)) * rng.dirichlet(np.full(count + 1, 2.0))
-        x = np.cumsum(stretches)[:-1]
-        side = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(count)
-        radius = rng.uniform(0.25, 0.45, count)
-        # Each bars the straight line, but reaches further across it on its own side: so weaving mostly pays.
-        y = side * rng.uniform(0.5, 0.95, count) * (radius + self.ball_radius)
-        obstacles = np.column_stack([x, y, radius])
-        padded = np.concatenate([obstacles, np.repeat(obstacles[-1:], MAX_OBSTACLES - count, axis=0)])
-        return np.concatenate([[distance, 0.0], padded.ravel()])
+    constant_draws = 4 + 3 * MAX_OBSTACLES
+    state_draws = 1
+
+    def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        which, length, first_side, *shared = z
+        stretch, offset, size = (shared[i : i + MAX_OBSTACLES] for i in (0, MAX_OBSTACLES, 2 * MAX_OBSTACLES))
+        count = 2 + (which >= 0.25) + (which >= 0.5) + (which >= 0.75)
+        distance = between(length, 6.0, 9.0)
+        # Free stretches before, between and behind obstacles: 1.2 m, and the rest of the way shared out at random.
+        shares = [ops.where(i < count, 0.5 + stretch[i], 0.0) for i in range(MAX_OBSTACLES)]
+        spare = (distance - _FREE_STRETCH * (count + 1)) / (sum(shares) + 0.5 + shared[-1])
+        side = ops.where(first_side < 0.5, -1.0, 1.0)
+        obstacles: list[tuple[Any, Any, Any]] = []
+        x = 0.0 * distance
+        for i in range(MAX_OBSTACLES):
+            x = x + _FREE_STRETCH + spare * shares[i]
+            radius = between(size[i], 0.25, 0.45)
+            # Each bars the straight line, but reaches further across it on its own side: so weaving mostly pays.
+            y = side * (-1) ** i * between(offset[i], 0.5, 0.95) * (radius + self.ball_radius)
+            drawn = (x, y, radius)
+            last = obstacles[-1] if obstacles else drawn
+            obstacles.append(tuple(ops.where(i < count, new, old) for new, old in zip(drawn, last, strict=True)))
+        return (distance, 0.0 * distance, *(value for obstacle in obstacles for value in obstacle))
 
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         goal, obstacles = split_constants(c)
@@ -90,8 +101,9 @@ class Weave(Task):
             if np.hypot(x - goal[0], y - goal[1]) <= radius + self.ball_radius:
                 raise ValueError(f"{self.id}: the goal lies in obstacle {i}")
 
-    def sample_state(self, rng: np.random.Generator, c: np.ndarray, params: BallbotParams) -> np.ndarray:
-        return np.array([0.0, rng.uniform(-0.3, 0.3), 0, 0, 0, 0, 0, 0])
+    def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        zero = 0.0 * z[0]
+        return (zero, between(z[0], -0.3, 0.3), zero, zero, zero, zero, zero, zero)
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         px, py, *rest = ops.components(x)

@@ -1,0 +1,208 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("casadi")
+
+from ballbot_baselines.controller import FunctionController, rollout
+from ballbot_baselines.linearize import discretize, goal_weight, linearize, quadratic_cost
+from ballbot_baselines.lqr import (
+    LqrController,
+    closed_gains,
+    continuous_lqr,
+    discrete_lqr,
+    final_weight,
+    is_equilibrium,
+    tracking_gains,
+)
+from ballbot_baselines.optimum import find_optimum
+from ballbot_gym import dynamics
+from ballbot_gym.tasks.orbit import Orbit
+from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_gym.tasks.turn import Turn
+
+ORIGIN, NO_FORCE, NO_CONSTANTS = np.zeros(8), np.zeros(2), np.zeros(0)
+HIGH_LEAN = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 5.0, 0.0, 0.0])  # the paper's two stabilizations
+LOW_LEAN = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+
+
+def peak_lean(trajectory):
+    """Degrees, of |γ| and |θ|."""
+    return np.degrees(np.abs(trajectory.x[:, 2:4]).max())
+
+
+def step(params, x, u):
+    return dynamics.step(params, x, u, 0.02)
+
+
+def test_weights_are_read_off_the_tasks_cost(params):
+    q, r = quadratic_cost(Stabilize(), HIGH_LEAN[None], NO_FORCE[None], NO_CONSTANTS)
+    np.testing.assert_allclose(q[0], np.diag([1, 1, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]), atol=1e-12)
+    np.testing.assert_allclose(r[0], 5e-4 * np.eye(2), atol=1e-15)
+
+
+def test_weights_are_positive_semidefinite_where_the_cost_is_curved_the_other_way():
+    # inside its circle Orbit's radius error squared has a negative second derivative along the circle
+    q, _ = quadratic_cost(Orbit(), np.array([[0.1, 0, 0, 0, 0, 0, 0, 0]]), NO_FORCE[None], np.array([2.0, 3.0]))
+    assert np.linalg.eigvalsh(q[0]).min() >= -1e-12
+
+
+def test_discrete_model_is_the_continuous_ones_exponential(params):
+    from scipy.linalg import expm
+
+    a, b = linearize(params, ORIGIN, NO_FORCE)
+    ad, bd = discretize(params, ORIGIN[None], NO_FORCE[None], 0.02)
+    exact = expm(0.02 * np.block([[a, b], [np.zeros((2, 10))]]))
+    # RK4 over 10 ms: (7.77·0.01)⁵/120 twice is 5e-8, times rates of up to 60
+    np.testing.assert_allclose(ad[0], exact[:8, :8], atol=2e-6)
+    np.testing.assert_allclose(bd[0], exact[:8, 8:], atol=2e-8)
+
+
+def test_step_model_along_a_trajectory_is_the_steps_derivative(params, rng):
+    x, u = rng.uniform(-1, 1, (5, 8)), rng.uniform(-200, 200, (5, 2))
+    a, b = discretize(params, x, u, 0.02)
+    h = 1e-6
+    for k in range(5):
+        columns = [(step(params, x[k] + h * e, u[k]) - step(params, x[k] - h * e, u[k])) / (2 * h) for e in np.eye(8)]
+        np.testing.assert_allclose(a[k].T, columns, atol=1e-7)
+        columns = [(step(params, x[k], u[k] + e) - step(params, x[k], u[k] - e)) / 2 for e in np.eye(2)]
+        np.testing.assert_allclose(b[k].T, columns, atol=1e-5)
+
+
+def small_starts(rng, p, scale, count):
+    """States from which LQR stays linear, with the cost that P predicts."""
+    starts = rng.normal(size=(count, 8)) * scale
+    return [(x, x @ p @ x) for x in starts]
+
+
+def test_measured_cost_from_small_states_is_the_riccati_cost(make_env, physics, params, rng):
+    """The env's convention: forces held, cost summed over control steps."""
+    task = Stabilize()
+    _, p = discrete_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
+    env = make_env(task, physics=physics)
+    for x, predicted in small_starts(rng, p, 0.003, 8):
+        episode = rollout(env, LqrController(task, params), options={"state": x})
+        # measured: below 1e-4 with rk4, 1.7e-3 with Bullet's 1 ms steps
+        assert episode.cost == pytest.approx(predicted, rel=5e-3)
+        assert episode.success
+
+
+def test_measured_cost_with_short_steps_is_the_continuous_riccati_cost(make_env, physics, params, rng):
+    task = Stabilize(control_dt=0.001)
+    k, p = continuous_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
+    env = make_env(task, physics=physics)
+    for x, predicted in small_starts(rng, p, 0.003, 2):
+        episode = rollout(env, FunctionController(lambda t, x: -k @ x), options={"state": x})
+        assert episode.cost == pytest.approx(predicted, rel=5e-3)  # measured: 7e-4, the first-order sum
+
+
+def test_discrete_lqr_tends_to_the_continuous_one(params):
+    args = (params, ORIGIN, NO_FORCE, NO_CONSTANTS)
+    task = Stabilize(control_dt=0.001)
+    _, p = continuous_lqr(task, *args)
+    excess = discrete_lqr(task, *args)[1] - p
+    assert np.abs(excess).max() < 1e-4 * p.max()  # measured: 3.8e-5, and 6.8e-3 at 20 ms
+    # a sum over steps counts the first state ½·control_dt longer than the integral does
+    assert excess[0, 0] == pytest.approx(0.5 * task.position_weight * task.control_dt, rel=0.01)
+
+
+def test_discrete_lqr_solves_its_riccati_equation_and_is_stable(params):
+    task = Stabilize()
+    k, p = discrete_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
+    a, b = (m[0] for m in discretize(params, ORIGIN[None], NO_FORCE[None], task.control_dt))
+    q, r = (m[0] * task.control_dt for m in quadratic_cost(task, ORIGIN[None], NO_FORCE[None], NO_CONSTANTS))
+    closed = a - b @ k
+    np.testing.assert_allclose(q + k.T @ r @ k + closed.T @ p @ closed, p, rtol=1e-8, atol=1e-8)
+    assert np.abs(np.linalg.eigvals(closed)).max() < 1
+
+
+def test_tracking_gains_along_an_equilibrium_converge_to_lqr(params):
+    task = Stabilize()
+    k, p = discrete_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
+    n = 1000  # 20 s; the slowest closed-loop mode decays below 1e-8 of itself
+    gains = tracking_gains(task, params, np.zeros((n, 8)), np.zeros((n, 2)), NO_CONSTANTS, np.eye(8))
+    np.testing.assert_allclose(gains.k[0], k, rtol=1e-6)
+    np.testing.assert_allclose(gains.p[0], p, rtol=1e-6, atol=1e-9)
+    from_lqr = tracking_gains(task, params, np.zeros((5, 8)), np.zeros((5, 2)), NO_CONSTANTS, p)
+    np.testing.assert_allclose(from_lqr.k, np.tile(k, (5, 1, 1)), rtol=1e-8)
+
+
+def test_only_rest_upright_is_an_equilibrium(params):
+    assert is_equilibrium(params, [3.0, -2.0, *[0.0] * 6], NO_FORCE)
+    assert not is_equilibrium(params, LOW_LEAN, NO_FORCE)
+    assert not is_equilibrium(params, ORIGIN, np.array([1.0, 0.0]))
+
+
+def test_final_weight_is_lqrs_at_rest_and_the_goals_elsewhere(params):
+    p = discrete_lqr(Stabilize(), params, ORIGIN, NO_FORCE, NO_CONSTANTS)[1]
+    np.testing.assert_array_equal(final_weight(Stabilize(), params, ORIGIN, NO_CONSTANTS), p)
+    gate = np.array([1.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0])
+    c = np.array([4.0])
+    np.testing.assert_array_equal(final_weight(Turn(), params, gate, c), 10 * goal_weight(Turn(), gate, c))
+
+
+def test_goal_weight_is_one_per_squared_tolerance():
+    weight = goal_weight(Stabilize(), ORIGIN, NO_CONSTANTS)
+    tolerance = np.array([0.1, 0.1, np.radians(2), np.radians(2), 0.1, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(np.diag(weight), 1 / tolerance**2, rtol=1e-3)  # 1 − cos is quadratic to 1e-4
+
+
+def test_lqr_around_a_circle_is_periodic(params, rng):
+    task = Orbit()
+    x, c = task.sample(rng, params)
+    reference = task.reference(x, c, params)
+    gains = closed_gains(task, params, reference, c)
+    again = tracking_gains(task, params, reference.x, reference.u, c, gains.p[0])
+    np.testing.assert_allclose(again.p, gains.p, rtol=1e-4, atol=1e-6 * gains.p.max())
+
+
+def test_lqr_controller_at_its_reference_applies_the_reference_force(task, params, rng):
+    x, c = task.sample(rng, params)
+    controller = LqrController(task, params)
+    controller.reset(0.0, x, c)
+    reference = task.reference(x, c, params)
+    for i in (0, len(reference.x) // 2):
+        force = controller.act(i * task.control_dt, reference.x[i])
+        np.testing.assert_allclose(force, reference.u[i], atol=1e-6)
+
+
+def test_lqr_holds_a_slow_orbit(make_env, params):
+    env = make_env("orbit", physics="rk4")
+    task = env.task
+    episode = rollout(env, LqrController(task, params), options={"constants": {"radius": 2.5, "speed": 2.0}}, seed=0)
+    assert episode.success
+
+
+def test_lqr_oscillates_to_high_lean_where_the_optimum_does_not(make_env, params):
+    """The paper's Fig. 3, LQR in near-continuous time as in the paper."""
+    task = Stabilize(control_dt=0.001)
+    lqr = rollout(make_env(task, physics="rk4"), LqrController(task, params), options={"state": HIGH_LEAN})
+    optimum = find_optimum(Stabilize(), params, HIGH_LEAN, NO_CONSTANTS)
+    assert 50 < peak_lean(lqr.trajectory) < 60  # measured: 55.9°
+    assert 36 < peak_lean(optimum.trajectory) < 42  # measured: 39.2°
+    assert lqr.cost > 3 * optimum.cost  # measured: 4.2
+
+
+def test_lqr_at_low_lean_is_nearly_the_optimum(make_env, params):
+    """The paper's Fig. 2."""
+    task = Stabilize(control_dt=0.001)
+    lqr = rollout(make_env(task, physics="rk4"), LqrController(task, params), options={"state": LOW_LEAN})
+    optimum = find_optimum(Stabilize(), params, LOW_LEAN, NO_CONSTANTS)
+    assert peak_lean(lqr.trajectory) == pytest.approx(peak_lean(optimum.trajectory), abs=0.5)  # 9.75° and 9.57°
+    assert lqr.cost == pytest.approx(optimum.cost, rel=0.02)
+
+
+def test_lqr_costs_no_less_than_the_optimum(make_env, params, rng):
+    task = Stabilize()
+    env = make_env(task, physics="rk4")
+    for _ in range(5):
+        x = 0.3 * task.sample(rng, params)[0]
+        lqr = rollout(env, LqrController(task, params), options={"state": x})
+        assert lqr.cost >= find_optimum(task, params, x, NO_CONSTANTS).cost * (1 - 1e-6)
+
+
+def test_heavier_price_on_effort_means_less_of_it(params):
+    cheap = discrete_lqr(Stabilize(), params, ORIGIN, NO_FORCE, NO_CONSTANTS)[1]
+    dear = discrete_lqr(replace(Stabilize(), effort_weight=5e-2), params, ORIGIN, NO_FORCE, NO_CONSTANTS)[1]
+    assert (np.linalg.eigvalsh(dear - cheap) > 0).all()

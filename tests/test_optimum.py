@@ -1,0 +1,382 @@
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("casadi")
+
+import casadi
+
+from ballbot_baselines import compiled
+from ballbot_baselines.controller import rollout
+from ballbot_baselines.lqr import LqrController
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
+from ballbot_baselines.optimum import FEASIBLE, Backoff, PlanError, find_optimum, is_feasible
+from ballbot_gym import dynamics
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_gym.tasks.weave import Weave, split_constants
+
+SEEDS = (3, 4)
+
+
+def episode(task, seed):
+    return task.sample(np.random.default_rng(seed), default_params())
+
+
+@pytest.fixture(scope="module")
+def optimum_of():
+    """The optimum of each episode is found once."""
+    optima = {}
+
+    def find(task, seed):
+        if (task, seed) not in optima:
+            optima[task, seed] = find_optimum(task, default_params(), *episode(task, seed))
+        return optima[task, seed]
+
+    return find
+
+
+@pytest.fixture(params=SEEDS)
+def seed(request):
+    return request.param
+
+
+def bump(steps):
+    """(steps+1, 2) a detour of up to 0.15 m that leaves both ends where they are."""
+    s = np.linspace(0, 1, steps + 1)
+    return 0.15 * np.column_stack([np.sin(2 * np.pi * s), -np.sin(np.pi * s)])
+
+
+# --- every task's optimum ---
+
+
+def test_each_state_of_a_plan_follows_from_the_one_before(task, seed, optimum_of, params):
+    trajectory = optimum_of(task, seed).trajectory
+    after = dynamics.step(params, trajectory.x[:-1], trajectory.u, task.control_dt)
+    np.testing.assert_allclose(after, trajectory.x[1:], atol=1e-6)
+    np.testing.assert_array_equal(trajectory.x[0], episode(task, seed)[0])
+    np.testing.assert_allclose(np.diff(trajectory.t), task.control_dt, rtol=1e-9)
+
+
+def test_cost_of_a_plan_is_the_tasks(task, seed, optimum_of):
+    optimum, (_, c) = optimum_of(task, seed), episode(task, seed)
+    cost = task.cost(optimum.trajectory.x[:-1], optimum.trajectory.u, c).sum() * task.control_dt
+    assert optimum.cost == pytest.approx(cost, rel=1e-9)
+
+
+def test_plan_stays_within_forces_and_margins(task, seed, optimum_of, params):
+    trajectory, (_, c) = optimum_of(task, seed).trajectory, episode(task, seed)
+    assert np.abs(trajectory.u).max() <= params.force_limit
+    assert min(np.min(margin) for margin in task.margins(trajectory.x, c)) >= 0
+
+
+def test_plan_lasts_the_episode_or_reaches_the_goal_at_its_end(task, seed, optimum_of):
+    trajectory, (_, c) = optimum_of(task, seed).trajectory, episode(task, seed)
+    reached = [task.is_goal(tuple(x), tuple(c)) for x in trajectory.x]
+    assert reached[-1]
+    if task.first_exit:
+        assert not any(reached[:-1])  # else it would have ended, and cost less, before
+        assert len(trajectory.u) <= task.steps
+    else:
+        assert len(trajectory.u) == task.steps
+
+
+def test_optimum_says_how_it_was_found(task, seed, optimum_of):
+    optimum = optimum_of(task, seed)
+    assert optimum.status == "Solve_Succeeded"
+    assert optimum.violation < FEASIBLE
+    assert optimum.solver in ("fatrop", "ipopt")
+    assert optimum.iterations > 0
+
+
+def test_optimum_costs_no_more_than_lqr(task, seed, optimum_of, make_env, params):
+    x0, c = episode(task, seed)
+    lqr = rollout(make_env(task, physics="rk4"), LqrController(task, params), options={"state": x0, "constants": c})
+    assert optimum_of(task, seed).cost <= lqr.cost * (1 + 1e-6)
+
+
+def test_falling_never_pays(task, seed, optimum_of):
+    assert optimum_of(task, seed).cost < task.failure_cost
+
+
+def test_perturbed_guess_leads_back_to_the_same_optimum(task, seed, optimum_of, params):
+    optimum, (x0, c) = optimum_of(task, seed), episode(task, seed)
+    path = optimum.trajectory.x[:, :2] + bump(len(optimum.trajectory.u))
+    again = find_optimum(task, params, x0, c, paths=[path])
+    assert again.cost == pytest.approx(optimum.cost, rel=1e-4)
+
+
+def test_no_other_guess_finds_anything_better(task, seed, optimum_of, params):
+    optimum, (x0, c) = optimum_of(task, seed), episode(task, seed)
+    paths = [path + bump(len(path) - 1) for path in task.guess_paths(x0, c, params)[:3]]
+    assert find_optimum(task, params, x0, c, paths=paths).cost >= optimum.cost * (1 - 1e-4)
+
+
+def test_small_changes_of_the_forces_gain_nothing(optimum_of, params, rng):
+    # first-order optimality, checked by simulation: 0.5 s only, because the plant is unstable
+    task = Stabilize(duration=0.5)
+    x0 = episode(task, 3)[0]
+    optimum = optimum_of(task, 3)
+    assert simulated_cost(task, params, x0, optimum.trajectory.u) == pytest.approx(optimum.cost, rel=1e-9)
+    for _ in range(20):
+        u = optimum.trajectory.u + rng.normal(size=optimum.trajectory.u.shape)
+        assert simulated_cost(task, params, x0, u) > optimum.cost
+
+
+def simulated_cost(task, params, x, forces):
+    cost = 0.0
+    for u in forces:
+        cost += task.cost(x, u, ()) * task.control_dt
+        x = dynamics.step(params, x, u, task.control_dt)
+    return cost
+
+
+def test_optimum_without_a_choice_of_guess_is_symmetric(params):
+    # mirroring the start mirrors the optimum: nothing in the solver prefers a side
+    x0 = episode(Stabilize(), 3)[0]
+    left, right = (find_optimum(Stabilize(), params, sign * x0, ()) for sign in (1, -1))
+    assert left.cost == pytest.approx(right.cost, rel=1e-9)
+    np.testing.assert_allclose(left.trajectory.x, -right.trajectory.x, atol=1e-6)
+
+
+def test_backoff_keeps_its_distances_and_costs_more(params):
+    task = Weave()
+    x0, c = episode(task, 3)
+    kept = find_optimum(task, params, x0, c, Backoff(margin=0.03, goal=0.5, force=0.05), guesses=1)
+    tight = find_optimum(task, params, x0, c, guesses=1)
+    assert np.abs(kept.trajectory.u).max() <= 0.95 * params.force_limit + 1e-6
+    assert min(np.min(margin) for margin in task.margins(kept.trajectory.x, c)) >= 0.03 - 1e-6
+    assert kept.cost > tight.cost
+
+
+def test_backoff_from_the_goal_ends_well_inside_it(params):
+    task = TASKS["turn"]()
+    x0, c = episode(task, 3)
+    kept = find_optimum(task, params, x0, c, Backoff(goal=0.5))
+    assert max(np.max(g) for g in task.goal(kept.trajectory.x[-1], c)) <= 0.5**2 - 1 + 1e-6
+
+
+def test_weave_tries_both_sides_and_keeps_the_cheaper(params):
+    task = Weave()
+    x0, c = episode(task, 3)
+    goal, obstacles = split_constants(c)
+    sides = [(1,) * len(obstacles), (-1,) * len(obstacles)]
+    costs = [
+        find_optimum(task, params, x0, c, paths=[task.side_path(x0, goal, obstacles, side)]).cost for side in sides
+    ]
+    assert find_optimum(task, params, x0, c).cost <= min(costs) * (1 + 1e-6)
+
+
+def test_hopeless_start_raises_with_every_solvers_status_and_violation(params):
+    # 74° of tilt, and falling at 5 rad/s: no 350 N catch that
+    task = Stabilize(duration=1.0)
+    x0 = np.array([0.0, 0.0, 1.3, 0.0, 0.0, 0.0, 5.0, 0.0])
+    assert task.is_safe(tuple(x0), ())
+    with pytest.raises(PlanError) as error:
+        find_optimum(task, params, x0, np.zeros(0))
+    message = str(error.value)
+    assert "BallbotStabilize-v0: no feasible episode from x = [0.0, 0.0, 1.3" in message
+    for solver in ("fatrop", "ipopt"):
+        part = message[message.index(f"{solver}: ") :]
+        assert float(part[part.index("violation ") + 10 :].split(";")[0].rstrip(")")) > FEASIBLE
+
+
+@pytest.mark.slow
+def test_exhaustive_search_over_sides_rarely_finds_a_better_slalom(params):
+    task, better = Weave(), []
+    for seed in range(30):
+        x0, c = episode(task, seed)
+        found = find_optimum(task, params, x0, c)
+        best = find_optimum(task, params, x0, c, guesses=32)
+        if best.cost < found.cost * (1 - 0.005):
+            better.append((seed, found.cost / best.cost))
+    assert len(better) <= 2, better
+
+
+# --- the solver itself, on a small problem that uses every kind of constraint ---
+
+N = 8
+
+
+def toy():
+    """Nonlinear, with path and final constraints of both kinds, a parameter, and an initial state with linked parts."""
+    return Ocp(
+        name="toy",
+        states=3,
+        inputs=2,
+        params=1,
+        next=lambda s, w, p: (
+            s + 0.2 * casadi.vertcat(s[1], casadi.sin(s[2]) + w[0], w[1] * casadi.cos(s[0]) - p * s[1])
+        ),
+        cost=lambda s, w, p: s[0] ** 2 + 0.1 * s[1] ** 4 + casadi.exp(0.3 * s[2]) + 0.05 * (w[0] ** 2 + w[1] ** 2),
+        equalities=lambda s, w, p: w[0] + 0.3 * w[1] - 0.1 * s[1] * w[1],
+        inequalities=lambda s, w, p: casadi.vertcat(0.3 - s[0] ** 2 - 0.1 * w[1] ** 2, 0.3 + w[0] * s[2]),
+        final_cost=lambda s, p: 3 * s[0] ** 2 + p * casadi.cos(s[1]),
+        final_equalities=lambda s, p: s[2] ** 2 + s[2] - 0.2,
+        final_inequalities=lambda s, p: s[1] + 0.6,
+        initial_matrix=np.array([[1.0, 0.0, -2.0]]),
+    )
+
+
+def toy_bounds(ocp):
+    bounds = Bounds.free(ocp, N)
+    bounds.state_lower[0, 1] = bounds.state_upper[0, 1] = -0.3
+    bounds.state_lower[0, 0] = 0.4
+    bounds.input_lower[:], bounds.input_upper[:] = -2, 1.5
+    return bounds
+
+
+def solve_toy(solver, p=0.4):
+    ocp = toy()
+    return OcpSolver(ocp, N, solver).solve(np.full((N + 1, 3), 0.1), np.full((N, 2), 0.1), toy_bounds(ocp), [p])
+
+
+def solve_toy_by_casadi(p=0.4):
+    """The same problem written out in one piece and differentiated by CasADi: cost, states, inputs, iterations."""
+    ocp, bounds = toy(), toy_bounds(toy())
+    s, w = casadi.SX.sym("s", 3, N + 1), casadi.SX.sym("w", 2, N)
+    columns = [(s[:, k], w[:, k], p) for k in range(N)]
+    equal = [casadi.mtimes(casadi.DM(ocp.initial_matrix), s[:, 0]), ocp.final_equalities(s[:, N], p)]
+    equal += [s[:, k + 1] - ocp.next(*columns[k]) for k in range(N)] + [ocp.equalities(*column) for column in columns]
+    unequal = [ocp.inequalities(*column) for column in columns] + [ocp.final_inequalities(s[:, N], p)]
+    equal, unequal = casadi.vertcat(*equal), casadi.vertcat(*unequal)
+    cost = sum(ocp.cost(*column) for column in columns) + ocp.final_cost(s[:, N], p)
+    z = casadi.vertcat(casadi.vec(s), casadi.vec(w))
+    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8}}
+    solver = casadi.nlpsol("plain", "ipopt", {"x": z, "f": cost, "g": casadi.vertcat(equal, unequal)}, options)
+    result = solver(
+        x0=0.1,
+        lbx=np.concatenate([bounds.state_lower.ravel(), bounds.input_lower.ravel()]),
+        ubx=np.concatenate([bounds.state_upper.ravel(), bounds.input_upper.ravel()]),
+        lbg=0,
+        ubg=np.concatenate([np.zeros(equal.shape[0]), np.full(unequal.shape[0], np.inf)]),
+    )
+    values = np.array(result["x"]).ravel()
+    states, inputs = values[: 3 * (N + 1)].reshape(N + 1, 3), values[3 * (N + 1) :].reshape(N, 2)
+    assert solver.stats()["success"]
+    return float(result["f"]), states, inputs, solver.stats()["iter_count"]
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+@pytest.mark.parametrize("p", [0.4, -1.0])
+def test_staged_problem_has_the_solution_of_the_problem_written_out(solver, p):
+    cost, states, inputs, _ = solve_toy_by_casadi(p)
+    staged = solve_toy(solver, p)
+    assert is_feasible(staged)
+    assert staged.cost == pytest.approx(cost, rel=1e-7)
+    np.testing.assert_allclose(staged.states, states, atol=1e-4)
+    np.testing.assert_allclose(staged.inputs, inputs, atol=1e-4)
+
+
+def test_staged_derivatives_are_exact_to_second_order():
+    # a wrong gradient or Jacobian misses the solution; a wrong Hessian takes more iterations to it
+    *_, iterations = solve_toy_by_casadi()
+    assert solve_toy("ipopt").iterations == iterations
+
+
+def test_violation_is_the_largest_of_constraints_and_bounds():
+    ocp = toy()
+    solution = OcpSolver(ocp, N, "ipopt", max_iterations=1).solve(
+        np.zeros((N + 1, 3)), np.zeros((N, 2)), toy_bounds(ocp), [0.4]
+    )
+    s, w = solution.states, solution.inputs
+    defects = [s[k + 1] - np.array(ocp.next(*(casadi.DM(v) for v in (s[k], w[k])), 0.4)).ravel() for k in range(N)]
+    assert not solution.success
+    assert not is_feasible(solution)
+    assert "Maximum_Iterations" in solution.status
+    assert solution.violation >= np.abs(defects).max()
+    assert solution.violation >= abs(s[0] @ ocp.initial_matrix[0])
+
+
+def test_infeasible_bounds_are_reported_not_hidden():
+    ocp = toy()
+    bounds = toy_bounds(ocp)
+    bounds.state_lower[3:, 0] = 2.0  # where 0.3 − s₀² ≥ 0 cannot hold
+    for solver in ("ipopt", "fatrop"):
+        solution = OcpSolver(ocp, N, solver, max_iterations=50).solve(
+            np.zeros((N + 1, 3)), np.zeros((N, 2)), bounds, [0.4]
+        )
+        assert not solution.success
+        assert solution.violation > 1e-3
+        assert solution.status
+
+
+# --- compiled derivatives ---
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_compiled_and_interpreted_functions_lead_to_the_same_solution(monkeypatch, solver):
+    fast = solve_toy(solver)
+    monkeypatch.setattr(compiled, "_compiler", lambda: None)
+    slow = solve_toy(solver)
+    assert slow.cost == pytest.approx(fast.cost, rel=1e-12)
+    np.testing.assert_allclose(slow.states, fast.states, atol=1e-9)
+
+
+def square():
+    x = casadi.SX.sym("x")
+    return (casadi.Function("square", [x], [x * x]), casadi.Function("cube", [x], [x**3]))
+
+
+needs_compiler = pytest.mark.skipif(compiled._compiler() is None, reason="no C compiler")
+
+
+@needs_compiler
+def test_functions_are_compiled_once_and_then_read_from_the_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "cache"))
+    first = compiled.compiled("powers", square())
+    assert [float(f(3.0)) for f in first] == [9.0, 27.0]
+    (library,) = (tmp_path / "cache").iterdir()
+    assert library.name.startswith("powers-")
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("compiled again")
+
+    monkeypatch.setattr(subprocess, "run", refuse)
+    again = compiled.compiled("powers", square())
+    assert [float(f(3.0)) for f in again] == [9.0, 27.0]
+
+
+@needs_compiler
+def test_other_functions_get_another_library(monkeypatch, tmp_path):
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
+    x = casadi.SX.sym("x")
+    compiled.compiled("powers", square())
+    compiled.compiled("powers", (casadi.Function("square", [x], [2 * x * x]),))
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_without_a_compiler_functions_stay_as_they_are(monkeypatch):
+    monkeypatch.setattr(compiled, "_compiler", lambda: None)
+    functions = square()
+    assert compiled.compiled("powers", functions) is functions
+
+
+@pytest.mark.skipif(shutil.which("false") is None, reason="a program that fails")
+def test_compiler_that_fails_is_logged_and_functions_stay_as_they_are(monkeypatch, tmp_path, caplog):
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiled, "_compiler", lambda: "false")
+    functions = square()
+    assert compiled.compiled("powers", functions) is functions
+    assert "stay interpreted" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cache_lies_in_the_users_cache_folder_unless_told_otherwise(monkeypatch, tmp_path):
+    monkeypatch.delenv("BALLBOT_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert compiled.cache_folder() == tmp_path / "ballbot-gym"
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "other"))
+    assert compiled.cache_folder() == tmp_path / "other"
+
+
+def test_other_robot_has_another_optimum(params):
+    x0 = episode(Stabilize(), 3)[0]
+    weak = replace(params, force_limit=120.0)
+    optimum = find_optimum(Stabilize(), weak, x0, ())
+    assert np.abs(optimum.trajectory.u).max() <= 120.0
+    assert optimum.cost >= find_optimum(Stabilize(), params, x0, ()).cost
