@@ -155,10 +155,14 @@ class BallbotEnv(gymnasium.Env):
             return None
         if self._state is None:
             raise gymnasium.error.ResetNeeded("render() before reset()")
+        return self.render_state(self._state)
+
+    def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
+        """As `render`, but of any state x (8,): to draw a recorded trajectory among this episode's markers."""
         if self._scene is None:
             self._scene = Scene(self.params, human=self.render_mode == "human")
             self._scene.set_markers(self.task.markers(self._constants_array))
-        return self._scene.draw(self._state)
+        return self._scene.draw(tuple(map(float, x)))
 
     def close(self) -> None:
         """Releases the physics client and the window; may be called again."""

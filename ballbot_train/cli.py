@@ -1,4 +1,4 @@
-"""The command line: `ballbot benchmark`, `paper`, `optimize`, `certify`."""
+"""The command line: `ballbot benchmark`, `paper`, `optimize`, `replay`, `certify`."""
 
 import importlib.metadata
 import json
@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.certify import episode, evaluation_set
+from ballbot_baselines import certify as certification
 from ballbot_baselines.controller import rollout, simulate
 from ballbot_baselines.optimum import Optimum, PlanError, find_optimum
 from ballbot_baselines.paper import EFFORT_WEIGHT, PAPER_PROBLEMS, REST_WEIGHT, PaperProblem
@@ -208,6 +208,43 @@ def optimize(
     console.print(f"trajectory: {path}\nfigure: {picture}")
 
 
+def replay(
+    task: str,
+    /,
+    controller: str = "trajopt",
+    episode: int = 0,
+    physics: Literal["bullet", "rk4"] = "bullet",
+    frames: int = 5,
+    seconds: float | None = None,
+    out: Path = Path("runs/replay"),
+) -> None:
+    """Draws a certified episode under a controller: a strip of rendered frames.
+
+    Args:
+        task: name of a task.
+        controller: name of a controller.
+        episode: index of the certified episode.
+        physics: "bullet" or "rk4".
+        frames: how many, at equal times.
+        seconds: of the last frame; default the end of the episode.
+        out: folder of TASK-CONTROLLER-EPISODE.png.
+    """
+    evaluate.check_names("task", [task], TASKS)
+    evaluate.check_names("controller", [controller], CONTROLLERS)
+    env = BallbotEnv(task, physics=physics, render_mode="rgb_array")
+    episode_set = certified.load(env.task)
+    if not 0 <= episode < len(episode_set):
+        raise ValueError(f"episode must be 0 to {len(episode_set) - 1}, not {episode}")
+    run = rollout(env, CONTROLLERS[controller](env.task, env.params), options=episode_set.options(episode))
+    end = min(seconds or math.inf, run.trajectory.duration)
+    steps = np.linspace(0, end / env.task.control_dt, frames).round().astype(int)
+    pictures = [env.render_state(run.trajectory.x[k]) for k in steps]
+    env.close()
+    titles = [f"{k * env.task.control_dt:.2f} s, {math.degrees(run.trajectory.tilt[k]):.0f}°" for k in steps]
+    path = figures.save(figures.strip_figure(pictures, titles), out / f"{task}-{controller}-{episode}.png")
+    console.print(f"picture: {path}")
+
+
 def certify(
     tasks: tuple[str, ...] = tuple(TASKS),
     episodes: int = certified.EPISODES,
@@ -237,7 +274,7 @@ def certify(
             if len(optima) == episodes:
                 task = make_task(name)
                 path = certified.path_of(task) if out is None else out / certified.path_of(task).name
-                evaluation_set(task, default_params(), optima).save(task, path)
+                certification.evaluation_set(task, default_params(), optima).save(task, path)
                 progress.console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     if failed:
         raise PlanError("no optimum for\n" + "\n".join(failed))
@@ -247,14 +284,14 @@ def _certify_one(job: tuple[str, int]) -> Optimum | str:
     """The optimum, or the message of why there is none: an exception would end the pool."""
     task, params = make_task(job[0]), default_params()
     try:
-        return find_optimum(task, params, *episode(task, params, job[1]))
+        return find_optimum(task, params, *certification.episode(task, params, job[1]))
     except PlanError as error:
         return str(error)
 
 
 def main() -> None:
     """Runs the command line; errors a user can cause end with one line and exit status 1."""
-    commands = {"benchmark": benchmark, "paper": paper, "optimize": optimize, "certify": certify}
+    commands = {"benchmark": benchmark, "paper": paper, "optimize": optimize, "replay": replay, "certify": certify}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="ballbot", description="Ballbot control, by its regret.")
     except (ValueError, TypeError, ImportError, PlanError, OSError) as error:

@@ -109,6 +109,18 @@ def regret_figure(results: Sequence[Result]) -> Figure:
     return figure
 
 
+def strip_figure(pictures: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
+    """Rendered frames (h, w, 3) side by side, with a title each."""
+    figure, axes = plt.subplots(
+        1, len(pictures), figsize=(2.6 * len(pictures), 2.25), layout="constrained", squeeze=False
+    )
+    for axis, picture, title in zip(axes[0], pictures, titles, strict=True):
+        axis.imshow(picture)
+        axis.set_title(title, fontsize=9)
+        axis.axis("off")
+    return figure
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Writes a PNG and closes the figure."""
     buffer = io.BytesIO()

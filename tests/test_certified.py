@@ -1,0 +1,95 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballbot_gym import certified, dynamics
+from ballbot_gym.tasks import TASKS
+
+
+@pytest.fixture
+def evaluation(task):
+    return certified.load(task)
+
+
+def test_set_has_200_episodes_and_20_trajectories(evaluation):
+    assert len(evaluation) == certified.EPISODES == 200
+    assert len(evaluation.trajectories) == certified.TRAJECTORIES == 20
+    for name in ("states", "constants", "durations", "violations", "statuses"):
+        assert len(getattr(evaluation, name)) == 200
+
+
+def test_episodes_are_the_tasks_own_and_all_different(task, evaluation, params):
+    certify = pytest.importorskip("ballbot_baselines.certify")
+    for i in (0, 1, 199):
+        x, c = certify.episode(task, params, i)
+        np.testing.assert_array_equal(evaluation.states[i], x)
+        np.testing.assert_array_equal(evaluation.constants[i], c)
+    assert len({(*x, *c) for x, c in zip(evaluation.states, evaluation.constants, strict=True)}) == 200
+
+
+def test_every_episode_can_be_started_and_is_certified(task, evaluation, make_env):
+    env = make_env(task, physics="rk4")
+    for i in range(len(evaluation)):
+        _, info = env.reset(seed=0, options=evaluation.options(i))
+        np.testing.assert_array_equal(info["state"], evaluation.states[i])
+    assert evaluation.violations.max() < 1e-6
+    assert all(status.endswith("Solve_Succeeded") for status in evaluation.statuses)
+    assert (evaluation.costs > 0).all()
+    assert (evaluation.costs < task.failure_cost).all()
+    assert (evaluation.durations <= task.duration + 1e-9).all()
+
+
+def test_each_stored_state_follows_from_the_one_before(task, evaluation, params):
+    for trajectory in evaluation.trajectories:
+        after = dynamics.step(params, trajectory.x[:-1], trajectory.u, task.control_dt)
+        np.testing.assert_allclose(after, trajectory.x[1:], atol=1e-6)
+
+
+def test_stored_trajectories_are_feasible_and_cost_what_is_stored(task, evaluation, params):
+    for i, trajectory in enumerate(evaluation.trajectories):
+        c = evaluation.constants[i]
+        np.testing.assert_array_equal(trajectory.x[0], evaluation.states[i])
+        assert trajectory.duration == pytest.approx(evaluation.durations[i])
+        cost = task.cost(trajectory.x[:-1], trajectory.u, c).sum() * task.control_dt
+        assert evaluation.costs[i] == pytest.approx(cost, rel=1e-9)
+        assert np.abs(trajectory.u).max() <= params.force_limit
+        assert min(np.min(margin) for margin in task.margins(trajectory.x, c)) >= 0
+        if task.first_exit:
+            assert task.is_goal(tuple(trajectory.x[-1]), tuple(c))
+
+
+def test_solving_again_from_another_guess_gives_the_same_cost(task, evaluation, params):
+    pytest.importorskip("casadi")
+    from ballbot_baselines.optimum import find_optimum
+
+    for i in (0, 7, 13):
+        path = evaluation.trajectories[i].x[:, :2]
+        s = np.linspace(0, np.pi, len(path))
+        detour = path + 0.15 * np.column_stack([np.sin(2 * s), -np.sin(s)])
+        again = find_optimum(task, params, evaluation.states[i], evaluation.constants[i], paths=[detour])
+        assert again.cost == pytest.approx(evaluation.costs[i], rel=1e-4)
+
+
+def test_set_survives_saving(task, evaluation, tmp_path):
+    loaded = certified.load(task, evaluation.save(task, tmp_path / "set.npz"))
+    np.testing.assert_array_equal(loaded.costs, evaluation.costs)
+    np.testing.assert_array_equal(loaded.statuses, evaluation.statuses)
+    for a, b in zip(loaded.trajectories, evaluation.trajectories, strict=True):
+        np.testing.assert_array_equal(a.x, b.x)
+        np.testing.assert_array_equal(a.u, b.u)
+
+
+def test_set_of_other_fields_is_refused(task):
+    other = replace(task, failure_cost=2 * task.failure_cost)
+    with pytest.raises(certified.CertificateError, match=rf"{task.id}\.npz was computed for"):
+        certified.load(other)
+
+
+def test_missing_set_says_how_to_make_one(task, tmp_path):
+    with pytest.raises(certified.CertificateError, match=r"no evaluation set.*ballbot certify"):
+        certified.load(task, tmp_path / "none.npz")
+
+
+def test_all_sets_together_are_under_3_megabytes():
+    assert sum(certified.path_of(task()).stat().st_size for task in TASKS.values()) < 3e6
