@@ -3,12 +3,13 @@
     minimize   Σ_k cost(x_k, u_k, c)·control_dt        over forces u_k, |u_k| ≤ limit, held for control_dt
     subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n.
 
-So an episode under physics="rk4" that applies the optimal forces returns minus this cost. The problem is solved by multiple
-shooting from each of the task's guessed paths, and the best solution is kept: a local optimum certified feasible, and as
-global as the guesses.
+So an episode under physics="rk4" that follows the optimal trajectory returns minus this cost. The problem is solved by
+multiple shooting from each of the task's guessed paths, and the best solution is kept: a local optimum certified
+feasible, and as global as the guesses.
 """
 
 import math
+import time
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -39,7 +40,9 @@ class PlanError(RuntimeError):
 class Optimum:
     """The best episode found: its cost, trajectory (forces held), and what the solver said of it.
 
-    `guess` is the index of the task's guessed path that led there; `seconds` the wall time of all tries.
+    `guess` is the index of the task's guessed path that led there; `seconds` the wall time of the
+    whole search. `costates` (n, 8)
+    are the slopes of the cost still to come with respect to the states x_1 … x_n.
     """
 
     cost: float
@@ -50,6 +53,7 @@ class Optimum:
     solver: str
     guess: int
     seconds: float
+    costates: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,7 @@ def find_optimum(
     """
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     paths = task.guess_paths(x0, c, params)[:guesses] if paths is None else paths
+    started = time.perf_counter()
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
     tried = solve(task, params, x0, c, backoff, paths)
     best = min((t for t in tried if is_feasible(t[1])), key=lambda t: t[1].cost, default=None)
@@ -108,7 +113,8 @@ def find_optimum(
         iterations=solution.iterations,
         solver=solution.solver,
         guess=index,
-        seconds=sum(s.seconds for _, s in tried),
+        seconds=time.perf_counter() - started,
+        costates=solution.costates,
     )
 
 
@@ -138,7 +144,7 @@ def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
         states=8,
         inputs=2,
         params=nc + 2,
-        next=lambda x, a, p: dynamics.step(params, x, limit * a, dt, dynamics.substeps_for(dt)),
+        next=lambda x, a, p: dynamics.step(params, x, limit * a, dt, dynamics.substeps_for(task.control_dt)),
         cost=lambda x, a, p: task.cost(x, limit * a, p[:nc]) * dt,
         inequalities=lambda x, a, p: margins(x, p),
         final_inequalities=final,

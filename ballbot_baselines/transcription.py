@@ -155,6 +155,7 @@ def solve(
     n, at = problem.intervals, _Layout(len(problem.free), problem.periodic)
     ocp = hermite_simpson(problem, params)
     bounds = _bounds(problem, ocp, at)
+    _check_bounds(problem, bounds)
     knots = np.column_stack([guess.x, guess.u / params.force_limit])
     start = guess.x[0] if problem.periodic else ()
     constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
@@ -180,6 +181,15 @@ def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:
     for i, (low, high) in enumerate(problem.free):
         lower[0, at.q.start + i], upper[0, at.q.start + i] = low, high
     return bounds
+
+
+def _check_bounds(problem: Problem, bounds: Bounds) -> None:
+    for knot, i in np.argwhere(bounds.state_lower > bounds.state_upper)[:1]:
+        name = dynamics.STATE[i][0] if i < 8 else "a decision variable"
+        low, high = bounds.state_lower[knot, i], bounds.state_upper[knot, i]
+        raise PlanError(
+            f"{problem.name}: at knot {knot}, {name} has lower bound {low:g} above its upper bound {high:g}"
+        )
 
 
 def _plan(params: BallbotParams, result: OcpSolution, at: _Layout) -> Plan:

@@ -194,12 +194,14 @@ class BallbotEnv(gymnasium.Env):
         x = np.array(task.draw_state(tuple(draws[task.constant_draws :]), tuple(c.tolist()), self.params), np.float64)
         if state is not None:
             x = _finite_vector(state, 8, "state")
-            if not task.is_safe(tuple(x.tolist()), tuple(c.tolist())):
-                values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
-                raise ValueError(
-                    f"start state is out of range: it violates a margin of {task.id} ({values}; tilt "
-                    f"{math.degrees(_tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
-                )
+        margins = task.margins(tuple(x.tolist()), tuple(c.tolist()))
+        violated = [name for name, margin in zip(task.margin_names, margins, strict=True) if not margin >= 0]
+        if violated:
+            values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
+            raise ValueError(
+                f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
+                f"tilt {math.degrees(_tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
+            )
         return x, c
 
     def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[float]:

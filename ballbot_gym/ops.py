@@ -24,17 +24,17 @@ def _library(a: Any) -> ModuleType:
 
 def sin(a: Any) -> Any:
     """Sine, elementwise."""
-    return math.sin(a) if isinstance(a, float) else _library(a).sin(a)
+    return math.sin(a) if isinstance(a, float | int) else _library(a).sin(a)
 
 
 def cos(a: Any) -> Any:
     """Cosine, elementwise."""
-    return math.cos(a) if isinstance(a, float) else _library(a).cos(a)
+    return math.cos(a) if isinstance(a, float | int) else _library(a).cos(a)
 
 
 def sqrt(a: Any) -> Any:
     """Square root, elementwise."""
-    return math.sqrt(a) if isinstance(a, float) else _library(a).sqrt(a)
+    return math.sqrt(a) if isinstance(a, float | int) else _library(a).sqrt(a)
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:

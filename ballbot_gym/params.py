@@ -80,8 +80,7 @@ class BallbotParams:
         for joint, (kind, axis, parent, child) in _CHAIN.items():
             urdf.check_joint(joint, kind, axis, parent, child)
         for link in _MASSLESS_LINKS:
-            if urdf.mass(link) != 0:
-                raise urdf.error(f"link '{link}' has mass {urdf.mass(link)} kg; it must have 0")
+            urdf.check_massless(link)
         ball_mass = urdf.positive_mass("ball")
         urdf.principal_inertias("ball")
         transverse, transverse_y, axial = urdf.principal_inertias("body")
@@ -194,9 +193,27 @@ class _Urdf:
         kinds = ("continuous", "revolute") if kind == "continuous" else (kind,)
         if joint.get("type") not in kinds:
             raise self.error(f"joint '{name}' is of type '{joint.get('type')}'; it must be {kind}")
+        x, y, z = self._vector(joint.find("origin"), "0 0 0", f"origin of joint '{name}'")
+        if (x, y) != (0, 0) or (z != 0 and name != "x"):
+            raise self.error(f"joint '{name}' is displaced by {(x, y, z)} m; only joint 'x' may be, upwards")
+        self._check_unrotated(joint.find("origin"), f"joint '{name}'")
         found_axis = self._vector(joint.find("axis"), "1 0 0", f"axis of joint '{name}'")
         if found_axis != axis:
             raise self.error(f"joint '{name}' has axis {found_axis}; it must be {axis}")
+
+    def check_massless(self, link: str) -> None:
+        if self.mass(link) != 0:
+            raise self.error(f"link '{link}' has mass {self.mass(link)} kg; it must have 0")
+        inertia = self._child("link", link, "inertial/inertia")
+        where = f"inertia of link '{link}'"
+        for name in ("ixx", "iyy", "izz"):
+            if self._number(inertia, name, where) != 0:
+                raise self.error(f"{where}: {name} must be 0, as its mass is")
+
+    def _check_unrotated(self, origin: ElementTree.Element | None, where: str) -> None:
+        text = "0 0 0" if origin is None else origin.get("rpy", "0 0 0")
+        if any(part.strip("+-0.") for part in text.split()):
+            raise self.error(f"{where} is rotated: rpy = '{text}' must be 0 0 0")
 
     def mass(self, link: str) -> float:
         mass = self._number(self._child("link", link, "inertial/mass"), "value", f"mass of link '{link}'")
@@ -214,7 +231,7 @@ class _Urdf:
         inertia = self._child("link", link, "inertial/inertia")
         where = f"inertia of link '{link}'"
         for name in ("ixy", "ixz", "iyz"):
-            if float(inertia.get(name, "0")) != 0:
+            if inertia.get(name) is not None and self._number(inertia, name, where) != 0:
                 raise self.error(f"{where}: {name} must be 0")
         moments = tuple(self._number(inertia, name, where) for name in ("ixx", "iyy", "izz"))
         if min(moments) <= 0:
@@ -222,9 +239,9 @@ class _Urdf:
         return moments
 
     def com_height(self, link: str) -> float:
-        x, y, z = self._vector(
-            self._child("link", link, "inertial/origin"), "0 0 0", f"centre of mass of link '{link}'"
-        )
+        origin = self._child("link", link, "inertial/origin")
+        self._check_unrotated(origin, f"inertial of link '{link}'")
+        x, y, z = self._vector(origin, "0 0 0", f"centre of mass of link '{link}'")
         if (x, y) != (0, 0) or z <= 0:
             raise self.error(f"link '{link}' must have its centre of mass on the axis above the ball, not at {x, y, z}")
         return z

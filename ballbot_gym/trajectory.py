@@ -1,5 +1,7 @@
 """Trajectory: states and forces over time, with interpolation and a file format."""
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +36,7 @@ class Trajectory:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, np.asarray(value, np.float64))
-        n = len(self.t) - 1
+        n = self.t.size - 1
         if n < 0 or self.t.shape != (n + 1,) or self.x.shape != (n + 1, 8):
             raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, 8)")
         if self.u.shape not in ((n, 2), (n + 1, 2)):
@@ -119,5 +121,5 @@ class Trajectory:
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 return cls(**{name: arrays[name] for name in ("t", "x", "u", "xdot") if name in arrays})
-        except (OSError, ValueError, TypeError, EOFError) as error:
+        except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise TrajectoryError(f"{path}: not a trajectory file: {error}") from error

@@ -99,7 +99,7 @@ def test_optimum_costs_no_more_than_lqr(task, seed, optimum_of, make_env, params
     assert optimum_of(task, seed).cost <= lqr.cost * (1 + 1e-6)
 
 
-def test_falling_never_pays(task, seed, optimum_of):
+def test_optimum_is_cheaper_than_a_fall(task, seed, optimum_of):
     assert optimum_of(task, seed).cost < task.failure_cost
 
 

@@ -73,7 +73,9 @@ def test_orbit_at_4_metres_per_second_is_a_circle_of_1063_mm_at_40_degrees(plan_
     assert abs(plan.q[0]) == pytest.approx(1.063, abs=5e-4)
     np.testing.assert_allclose(np.hypot(x[:, 0], x[:, 1]), 1.0627, atol=1e-4)
     np.testing.assert_allclose(np.hypot(x[:, 4], x[:, 5]), 4.0, atol=1e-6)
-    np.testing.assert_allclose(np.degrees(plan.trajectory.tilt), 40, atol=1)  # but for the axial inertia it is constant
+    tilt = np.degrees(plan.trajectory.tilt)
+    assert tilt.mean() == pytest.approx(40, abs=0.5)
+    assert np.ptp(tilt) < 0.1  # measured: 0.04°, from the axial inertia
     np.testing.assert_allclose(x[-1], x[0], atol=1e-6)
 
 
@@ -85,8 +87,8 @@ def test_some_orbit_leans_almost_45_degrees(plan_of):
 def test_steady_orbit_formula_predicts_the_optimized_orbit(plan_of, params):
     plan = plan_of("orbit-4")
     predicted = orbit_tilt(params, abs(plan.q[0]), 4.0)
-    # collocation at 40 knots and the neglected axial inertia; measured 0.1° apart in the mean
-    assert np.degrees(plan.trajectory.tilt[:-1].mean() - predicted) == pytest.approx(0, abs=0.5)
+    # collocation at 40 knots and the neglected axial inertia; measured 0.1° apart
+    assert np.degrees(plan.trajectory.tilt[:-1].mean() - predicted) == pytest.approx(0, abs=0.2)
 
 
 def test_weave_keeps_its_distances_and_passes_both_sides(plan_of):

@@ -392,6 +392,14 @@ def test_slaloms_keep_start_and_goal_free(params):
             assert (np.hypot(*(obstacles[:, :2] - point).T) > reach).all()
 
 
+def test_gaps_between_obstacles_are_wider_than_the_robot(params):
+    _, c = draw(Weave(), params, 2000)
+    for constants in c:
+        _, obstacles = split_constants(constants)
+        gap = np.hypot(*np.diff(obstacles[:, :2], axis=0).T) - obstacles[:-1, 2] - obstacles[1:, 2]
+        assert gap.min() > 2 * params.ball_radius  # measured: 0.29 m at least
+
+
 def test_every_slalom_has_a_guessed_path_that_clears_all_obstacles(params):
     task = Weave()
     x, c = draw(task, params, 200)

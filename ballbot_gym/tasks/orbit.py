@@ -47,6 +47,23 @@ class Orbit(Task):
 
     Ends: tilt beyond `max_tilt` fails; after `duration` the episode is truncated, a success if the ball is then within
     0.2 m of the circle and a fifth of v of its velocity.
+
+    Arguments, each a keyword of `gymnasium.make`:
+
+    | name | meaning | unit | default |
+    |---|---|---|---|
+    | radius_weight | of e_r² | 1/(m² s) | 10 |
+    | velocity_weight | of the squared velocity error | s/m² | 2 |
+    | lean_rate_weight | of γ̇² + θ̇² | s | 0.02 |
+    | effort_weight | of Fx² + Fy² | 1/(N² s) | 2e-5 |
+    | min_radius | smallest radius drawn | m | 1 |
+    | max_radius | largest radius drawn | m | 3 |
+    | min_steady_tilt | smallest steady tilt drawn | rad | 10° |
+    | max_steady_tilt | largest steady tilt drawn | rad | 45° |
+    | duration | longest episode | s | 8 |
+    | control_dt | how long each force is held | s | 0.02 |
+    | max_tilt | tilt of a fall | rad | 80° |
+    | failure_cost | price of a fall | | 1000 |
     """
 
     radius_weight: float = 10.0
@@ -138,8 +155,8 @@ class Orbit(Task):
 def orbit_speed(params: BallbotParams, radius: Any, tilt: Any) -> Any:
     """Speed, m/s, at which a steady orbit of this radius, m, leans inwards by this tilt, rad.
 
-    With J = I + ml², h = ml and Ω = v/r: tan(tilt)·(hg + JΩ² cos(tilt)) = hΩ² r. The body's axial inertia, under 0.2 % of
-    J here, is left out.
+    With J = I + ml², h = ml and Ω = v/r: tan(tilt)·(hg + JΩ² cos(tilt)) = hΩ² r. The body's axial inertia, 1.1 % of J
+    here, is left out: with it the orbit is steady to 2 % of the ball's and 4.5 % of the leans' accelerations at 45°.
     """
     h, inertia = params.first_moment, params.pivot_inertia
     sin_tilt, cos_tilt = ops.sin(tilt), ops.cos(tilt)

@@ -37,6 +37,22 @@ class Stabilize(Task):
 
     Ends: tilt beyond `max_tilt` fails; after `duration` the episode is truncated, a success if the robot then stands
     within 0.1 m of the origin, slower than 0.1 m/s, leaning less than 2° and turning slower than 0.1 rad/s.
+
+    Arguments, each a keyword of `gymnasium.make`:
+
+    | name | meaning | unit | default |
+    |---|---|---|---|
+    | position_weight | of x² + y² | 1/(m² s) | 1 |
+    | rest_weight | of squared leans, speeds and lean rates | SI | 0.5 |
+    | effort_weight | of Fx² + Fy² | 1/(N² s) | 5e-4 |
+    | start_position | how far x and y may be at the start | m | 2 |
+    | start_speed | the same of ẋ and ẏ | m/s | 5 |
+    | start_lean | the same of γ and θ | rad | 0.6 |
+    | start_lean_rate | the same of γ̇ and θ̇ | rad/s | 1 |
+    | duration | longest episode | s | 8 |
+    | control_dt | how long each force is held | s | 0.02 |
+    | max_tilt | tilt of a fall | rad | 80° |
+    | failure_cost | price of a fall | | 1000 |
     """
 
     position_weight: float = 1.0

@@ -42,6 +42,20 @@ class Turn(Task):
 
     Ends: within 0.2 m of the gate, 0.5 m/s of its velocity, tilt < 10° and lean rate < 1 rad/s at once: success, and no
     further cost. Tilt beyond `max_tilt` fails. After `duration` the episode is truncated.
+
+    Arguments, each a keyword of `gymnasium.make`:
+
+    | name | meaning | unit | default |
+    |---|---|---|---|
+    | time_weight | of time | 1/s | 5 |
+    | lean_weight | of squared leans and lean rates | SI | 0.5 |
+    | effort_weight | of Fx² + Fy² | 1/(N² s) | 2e-4 |
+    | min_speed | smallest speed drawn | m/s | 2 |
+    | max_speed | largest speed drawn | m/s | 10 |
+    | duration | longest episode | s | 8 |
+    | control_dt | how long each force is held | s | 0.02 |
+    | max_tilt | tilt of a fall | rad | 80° |
+    | failure_cost | price of a fall | | 1000 |
     """
 
     time_weight: float = 5.0
@@ -111,7 +125,7 @@ class Turn(Task):
         # past the gate's line, around to the left, and through the gate from behind
         reach = max(1.0, 0.08 * c[0] ** 2)  # m: about the radius of a turn at full force
         over = np.array([-reach, reach])
-        steps = round(2.0 / self.control_dt)
+        steps = round(min(2.0, self.duration / 2) / self.control_dt)
         half = cubic(x[:2], x[4:6], over, np.array([-c[0], -c[0]]) / 2, steps, self.control_dt)
         back = cubic(over, np.array([-c[0], -c[0]]) / 2, _GATE, gate_velocity, steps, self.control_dt)
         paths.append(np.concatenate([half, back[1:]]))

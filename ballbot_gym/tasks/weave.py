@@ -52,6 +52,19 @@ class Weave(Task):
 
     Ends: touching an obstacle with the ball, or tilt beyond `max_tilt`, fails; after `duration` the episode is truncated,
     a success if the robot then rests at the goal by Stabilize's tolerances.
+
+    Arguments, each a keyword of `gymnasium.make`:
+
+    | name | meaning | unit | default |
+    |---|---|---|---|
+    | position_weight | of the squared distance to the goal | 1/(m² s) | 1 |
+    | rest_weight | of squared leans, speeds and lean rates | SI | 0.5 |
+    | effort_weight | of Fx² + Fy² | 1/(N² s) | 5e-4 |
+    | ball_radius | of the robot, counted when it touches | m | 0.1 |
+    | duration | longest episode | s | 8 |
+    | control_dt | how long each force is held | s | 0.02 |
+    | max_tilt | tilt of a fall | rad | 80° |
+    | failure_cost | price of a fall or a touch | | 1000 |
     """
 
     position_weight: float = 1.0
@@ -65,6 +78,7 @@ class Weave(Task):
 
     id = "BallbotWeave-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0) + (5.0, 5.0, 1.0) * MAX_OBSTACLES
+    margin_names = ("tilt", *(f"obstacle {i}" for i in range(MAX_OBSTACLES)))
     constant_names = ("goal_x", "goal_y") + tuple(
         f"obstacle{i}_{what}" for i in range(MAX_OBSTACLES) for what in ("x", "y", "radius")
     )
