@@ -84,6 +84,7 @@ def benchmark(
     pictures = [figures.save(figures.regret_figure(results), out / "figures" / "regret.png")]
     pictures += [_episode_figure(task, list(controllers), physics, out) for task in tasks]
     table = [_cells(row) for row in rows]
+    files.write(out / "leaderboard.md", _markdown(_HEADER, table))
     report = write_report("ballbot-gym: leaderboard", _HEADER, table, pictures, about, out / "report.html")
     shutil.rmtree(out / "episodes", ignore_errors=True)  # only needed to resume: episodes.csv has it all
     (out / "unfinished.json").unlink(missing_ok=True)
@@ -319,8 +320,8 @@ _HEADER = [
 
 
 def _cells(row: evaluate.Row) -> list[str]:
-    def shown(value: float, form: str) -> str:
-        return format(value, form) if math.isfinite(value) else "–"
+    def shown(value: float, form: str, unit: str = "") -> str:
+        return format(value, form) + unit if math.isfinite(value) else "–"
 
     return [
         row.task,
@@ -331,11 +332,16 @@ def _cells(row: evaluate.Row) -> list[str]:
         shown(row.regret_median, ".2%"),
         shown(row.cost_mean, ".2f"),
         shown(row.cost_median, ".2f"),
-        shown(row.peak_tilt_median, ".1f") + "°",
-        shown(row.settle_time_median, ".2f") + " s",
-        shown(row.plan_ms_median, ".0f") + " ms",
-        shown(row.step_us_median, ".0f") + " µs",
+        shown(row.peak_tilt_median, ".1f", "°"),
+        shown(row.settle_time_median, ".2f", " s"),
+        shown(row.plan_ms_median, ".0f", " ms"),
+        shown(row.step_us_median, ".0f", " µs"),
     ]
+
+
+def _markdown(header: list[str], rows: list[list[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _episode_figure(task: str, controllers: list[str], physics: str, out: Path) -> Path:
@@ -387,7 +393,7 @@ def _paper_circles(entry: PaperProblem, plan: Plan) -> list[figures.Circle]:
 
 
 def _task_circles(markers: list[Marker]) -> list[figures.Circle]:
-    return [figures.Circle(*marker.position, marker.radius, filled=not marker.ring) for marker in markers]
+    return [figures.Circle(*marker.position, marker.radius, not marker.ring, marker.color[:3]) for marker in markers]
 
 
 def _slug(text: str) -> str:

@@ -41,6 +41,7 @@ class Circle:
     y: float
     radius: float
     filled: bool = True
+    color: tuple[float, ...] | str = "0.75"
 
 
 def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Circle] = ()) -> Figure:
@@ -105,7 +106,8 @@ def regret_figure(results: Sequence[Result]) -> Figure:
         axis.set(xscale="log", xlim=(0.01, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %")
         axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("episodes that succeed, %")
-    axes[0][0].legend(fontsize=8, loc="upper left")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return figure
 
 
@@ -154,16 +156,11 @@ def _plot_forces(axis: plt.Axes, curve: Curve) -> None:
 
 def _finish_path(axis: plt.Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
     for circle in circles:
-        axis.add_patch(
-            plt.Circle(
-                (circle.x, circle.y),
-                circle.radius,
-                fill=circle.filled,
-                color="0.75" if circle.filled else "0.6",
-                ls="-" if circle.filled else "--",
-                zorder=0,
-            )
+        line = "-" if circle.filled else "--"
+        shape = plt.Circle(
+            (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
         )
+        axis.add_patch(shape).set_zorder(0)
     start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
     axis.plot(*start[:2], "o", color="k", ms=5)
     axis.plot(*end[:2], "s", color="k", ms=5)
