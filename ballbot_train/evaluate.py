@@ -5,7 +5,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, fields
 from multiprocessing import get_context
 from pathlib import Path
@@ -154,19 +154,21 @@ def benchmark(
             missing.append(chunk)
     # spawn: a forked child would share PyBullet's clients and CasADi's state with this process
     with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
-        for chunk, done in zip(missing, pool.map(_run_chunk, missing), strict=True):
-            files.write(_chunk_path(out, *chunk), json.dumps([asdict(result) for result in done]))
-            results += done
-            on_progress(chunk[0], len(done))
+        running = {pool.submit(evaluate_episodes, *chunk): chunk for chunk in missing}
+        try:
+            for future in as_completed(running):
+                chunk, done = running[future], future.result()
+                files.write(_chunk_path(out, *chunk), json.dumps([asdict(result) for result in done]))
+                results += done
+                on_progress(chunk[0], len(done))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # else an interrupt would wait for every chunk
+            raise
     order = {(task, controller): i for i, (task, controller, *_) in enumerate(chunks)}
     return sorted(results, key=lambda result: (order[result.task, result.controller], result.episode))
 
 
 _CHUNK = 10  # episodes
-
-
-def _run_chunk(chunk: tuple[str, str, str, range]) -> list[Result]:
-    return evaluate_episodes(*chunk)
 
 
 def _chunk_path(out: Path, task: str, controller: str, physics: str, episodes: range) -> Path:
