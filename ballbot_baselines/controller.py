@@ -38,6 +38,21 @@ class FunctionController:
         return np.asarray(self.function(t, x), np.float64)
 
 
+class DelayedController:
+    """Another controller whose forces act a number of control steps late, as a slow computer's do; before the first, 0."""
+
+    def __init__(self, controller: Controller, steps: int):
+        self._controller, self._steps = controller, steps
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._pending = [np.zeros(2)] * self._steps
+        self._controller.reset(t, x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        self._pending.append(self._controller.act(t, x))
+        return self._pending.pop(0)
+
+
 @dataclass(frozen=True)
 class Episode:
     """One episode under one controller.

@@ -70,7 +70,8 @@ class OcpSolution:
     """What a solver returned. Look at `success` before anything else.
 
     `states` is (N+1, ns), `inputs` (N, nw), `violation` the largest amount by which a constraint or bound is missed, in
-    the constraint's unit, and `seconds` the wall time of this solve.
+    the constraint's unit, and `seconds` the wall time of this solve. `costates` (N, ns) are the slopes of the optimal cost
+    with respect to s_1 … s_N, had the episode begun there: the multipliers of the dynamics.
     """
 
     success: bool
@@ -82,6 +83,7 @@ class OcpSolution:
     iterations: int
     seconds: float
     solver: str
+    costates: np.ndarray
 
 
 class _Stage:
@@ -141,6 +143,7 @@ class OcpSolver:
             + [True] * equal_finals
             + [False] * (finals - equal_finals)
         )
+        self._rows, self._initials = ocp.states + paths, initials
         self._g_lower = np.zeros(len(equality))
         self._g_upper = np.where(equality, 0.0, np.inf)
 
@@ -217,7 +220,14 @@ class OcpSolver:
             iterations=int(stats["iter_count"]),
             seconds=seconds,
             solver=self.solver,
+            costates=self._costates(np.array(result["lam_g"]).ravel()),
         )
+
+    def _costates(self, multipliers: np.ndarray) -> np.ndarray:
+        # Constraints are s_{k+1} − next_k = 0: raising their right-hand side moves s_{k+1}, and costs minus the multiplier.
+        first = self._rows + self._initials + self._rows * np.arange(-1, self.intervals - 1)
+        first[0] = 0
+        return -multipliers[first[:, None] + np.arange(self.ocp.states)]
 
 
 def _nlp_functions(ocp: Ocp, n: int, dynamics: _Stage, running: _Stage, final: _Stage, paths: int) -> dict[str, object]:

@@ -40,9 +40,8 @@ class PlanError(RuntimeError):
 class Optimum:
     """The best episode found: its cost, trajectory (forces held), and what the solver said of it.
 
-    `guess` is the index of the task's guessed path that led there; `seconds` the wall time of the
-    whole search. `costates` (n, 8)
-    are the slopes of the cost still to come with respect to the states x_1 … x_n.
+    `guess` is the index of the task's guessed path that led there; `seconds` the wall time of the whole search. `costates`
+    (n, 8) are the slopes of the cost still to come with respect to the states x_1 … x_n.
     """
 
     cost: float

@@ -18,9 +18,9 @@ from ballbot_gym import files
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluate import Result
 
-COLORS = {"lqr": "#c0392b", "trajopt": "#1f6fb2"}
+COLORS = {"lqr": "#c0392b", "trajopt": "#1f6fb2", "nmpc": "#e08a00"}
 _OTHER_COLORS = ("#2e8b57", "#8e44ad", "#b9770e", "#34495e")
-LABELS = {"lqr": "LQR", "trajopt": "trajectory optimization + TVLQR"}
+LABELS = {"lqr": "LQR", "trajopt": "trajectory optimization + TVLQR", "nmpc": "NMPC"}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,506 @@
+"""Nonlinear model predictive control: the task's own problem over a receding horizon, solved at every control step.
+
+    minimize    Σ_j cost(x_j, u_j, c)·h_j + ρ Σ_j s_j + V(x_N)        over u_j, |u_j| ≤ limit, and slacks s_j ≥ 0
+    subject to  x_{j+1} = step(x_j, u_j, h_j),   margins(x_j, c) + s_j ≥ back-off,   x_0 the (predicted) state
+
+The plan of the whole episode, found at `reset`, supplies what lies beyond the horizon: V(x) ≈ λᵀ(x − x̄) + (x − x̄)ᵀP(x − x̄)
+about the plan's state x̄ at the horizon's end, with λ the plan's costate (the multiplier of its dynamics) and P the TVLQR
+cost-to-go along it. So on the plan the horizon changes nothing, whatever the task, and off it the step is a Newton step.
+
+Every iteration linearizes dynamics and margins about the last solution, shifted by one control step, and solves one
+quadratic program by HPIPM: the sequential quadratic programming of Diehl et al., "A real-time iteration scheme for nonlinear
+optimization in optimal feedback control" (2005). One iteration per step is that scheme; more iterate to convergence. The
+Hessian is the cost's along the plan, so a converged solution is a stationary point of the nonlinear problem.
+
+The horizon's intervals are whole numbers of control steps: the first is one, as the env holds its force, and where there
+are more control steps than nodes the later intervals hold theirs longer. Near the plan's end intervals shrink to nothing.
+"""
+
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+
+import casadi
+import numpy as np
+
+from ballbot_baselines.compiled import compiled
+from ballbot_baselines.linearize import quadratic_cost
+from ballbot_baselines.lqr import final_weight
+from ballbot_baselines.optimum import Backoff, Optimum, PlanError, find_optimum
+from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan: half of TrajoptController's for the goal
+_SLACK_PRICE = 100.0  # per unit of a violated margin and node: above what any violation gains
+_MARGINS = 2  # per node, the nearest to being violated: the others are far off, and each costs time
+_SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
+_LEAST_CURVATURE = 1e-6  # of inputs whose interval has shrunk to nothing
+_RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
+_QP_ITERATIONS = 30
+
+
+@dataclass
+class Counts:
+    """What happened since the controller was made.
+
+    `steps` are calls of `act` that wanted a solution, `iterations` quadratic programs solved, `failed` the steps without
+    a usable solution (`injected` of them on purpose), `late` solutions that came after the deadline, `cut` searches that
+    the deadline ended before they converged, and `fallbacks` the steps taken under TVLQR: failed + late. `replans` are
+    whole plans made anew because a first-exit goal was missed at the plan's end: they take longer than a step.
+    """
+
+    steps: int = 0
+    iterations: int = 0
+    failed: int = 0
+    injected: int = 0
+    late: int = 0
+    cut: int = 0
+    fallbacks: int = 0
+    replans: int = 0
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The horizon in control steps: node j lies `offsets[j]` after now, (N+1,); interval j is `lengths[j]` long, (N,)."""
+
+    lengths: np.ndarray
+    offsets: np.ndarray
+
+    @classmethod
+    def make(cls, steps: int, nodes: int) -> "Grid":
+        """`nodes` intervals over a number of control steps: the first one step, the rest as equal as can be.
+
+        Raises:
+            ValueError: fewer than 2 nodes, or fewer control steps than nodes.
+        """
+        if not 2 <= nodes <= steps:
+            raise ValueError(f"a horizon of {steps} control steps takes 2 to {steps} nodes, not {nodes}")
+        base, longer = divmod(steps - 1, nodes - 1)
+        lengths = np.array([1] + [base] * (nodes - 1 - longer) + [base + 1] * longer)
+        return cls(lengths, np.concatenate([[0], np.cumsum(lengths)]))
+
+    def shift_states(self) -> np.ndarray:
+        """(N+1, N+1) takes values at the nodes to the values one control step later, linear between, constant beyond."""
+        return np.array([np.interp(self.offsets + 1, self.offsets, unit) for unit in np.eye(len(self.offsets))]).T
+
+    def shift_inputs(self) -> np.ndarray:
+        """(N, N) takes values held over the intervals to their means one control step later; beyond the end they are 0."""
+        held = np.repeat(np.eye(len(self.lengths)), self.lengths, axis=0)  # (steps, N)
+        later = np.vstack([held[1:], np.zeros((1, len(self.lengths)))])
+        return np.add.reduceat(later, self.offsets[:-1], axis=0) / self.lengths[:, None]
+
+
+class HorizonQp:
+    """The quadratic program of one iteration, for N intervals; arrays are allocated once and filled in place.
+
+    Variables are changes δa_0, δx_1, δa_1, s_1, … δx_N: x_0 is known and no variable, inputs a are fractions of the force
+    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins; x_N, at which
+    CasADi's interface allows no slack, has none.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, nodes: int):
+        """Differentiates the stage and builds the solver; compiles on first use on a machine."""
+        count = len(task.margins((0.0,) * 8, (1.0,) * len(task.constant_names)))
+        self.distinct = np.arange(count)
+        """Indices of the task's margins that are considered."""
+        self._make_stage(task, params, nodes, count)
+        self._make_program(nodes, min(count, _MARGINS))
+
+    def _make_stage(self, task: Task, params: BallbotParams, n: int, m: int) -> None:
+        nc = len(task.constant_names)
+        self.x, self.a = np.zeros((n + 1, 8)), np.zeros((n + 1, 2))
+        self.h, self.c = np.zeros(n + 1), np.zeros((n + 1, nc))
+        self._next, self._jacobian = np.zeros((n + 1, 8)), np.zeros((n + 1, 10, 8))
+        self._gradient = np.zeros((n + 1, 10))
+        self._margin, self._margin_jacobian = np.zeros((n + 1, m)), np.zeros((n + 1, 8, m))
+        self._stage = _InPlace(
+            _stage_function(task, params).map(n + 1),
+            [self.x, self.a, self.h, self.c],
+            [self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian],
+        )
+
+    def _make_program(self, n: int, m: int) -> None:
+        hessian, constraints = _patterns(n, m)
+        program = casadi.conic(
+            "qp",
+            "hpipm",
+            {"h": hessian, "a": constraints},
+            {
+                "print_time": False,
+                "error_on_fail": False,
+                "N": n,
+                "nx": [0] + [8] * n,
+                "nu": [2] + [3] * (n - 1) + [0],
+                "ng": [0] + [m] * (n - 1) + [0],
+                "hpipm": {
+                    "mode": "speed",
+                    "mu0": 1.0,
+                    "iter_max": _QP_ITERATIONS,
+                    **dict.fromkeys(("res_g_max", "res_b_max", "res_d_max", "res_m_max"), _RESIDUAL),
+                },
+            },
+        )
+        h, a = np.zeros(hessian.nnz()), np.zeros(constraints.nnz())
+        g, z = np.zeros(hessian.shape[0]), np.zeros(hessian.shape[0])
+        low, high = np.zeros(constraints.shape[0]), np.zeros(constraints.shape[0])
+        self._lower, self._upper = np.full(len(z), -np.inf), np.full(len(z), np.inf)
+        self._cost = np.zeros(1)
+        # HPIPM's interface reads every input and writes every output, so all have an array.
+        self._unused = [np.zeros(len(z)), np.zeros(len(z)), np.zeros(len(low)), np.zeros(len(low)), np.zeros(len(z))]
+        start, multipliers, row_multipliers, *duals = self._unused
+        self._program = _InPlace(
+            program,
+            [h, g, a, low, high, self._lower, self._upper, start, multipliers, row_multipliers],
+            [z, self._cost, *duals],
+        )
+        self._divide(h, g, a, low, high, z, n, m)
+        # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
+        self._lower_stages[:, 10] = 0.0
+        self._h[:, 68] = _SLACK_CURVATURE
+        self._g[:, 10] = _SLACK_PRICE
+        self._high[:, 8:] = np.inf
+
+    def _divide(
+        self,
+        h: np.ndarray,
+        g: np.ndarray,
+        a: np.ndarray,
+        low: np.ndarray,
+        high: np.ndarray,
+        z: np.ndarray,
+        n: int,
+        m: int,
+    ) -> None:
+        """Views of the solver's arrays stage by stage; constants of the constraints' matrix are put in."""
+        self._g0, self._g, self._g_end = _stages(g, 2, n - 1, 11)
+        self._z0, self._z, self._z_end = _stages(z, 2, n - 1, 11)
+        self._h0, self._h, self._h_end = _stages(h, 4, n - 1, 69)
+        self._a0, a_stages, a_end = _stages(a, 16, n - 1, 8 * (9 + m) + 16 + m)
+        self._low0, self._low, _ = _stages(low, 8, n - 1, 8 + m)
+        self._high0, self._high, _ = _stages(high, 8, n - 1, 8 + m)
+        self._a_x = a_stages[:, : 8 * (9 + m)].reshape(n - 1, 8, 9 + m)
+        self._a_u = a_stages[:, 8 * (9 + m) : 8 * (9 + m) + 16].reshape(n - 1, 2, 8)
+        self._a_x[:, :, 0], a_end[:] = -1.0, -1.0  # on the next state
+        a_stages[:, 8 * (9 + m) + 16 :] = 1.0  # on slacks
+        self._lower0, self._lower_stages, _ = _stages(self._lower, 2, n - 1, 11)
+        self._upper0, self._upper_stages, _ = _stages(self._upper, 2, n - 1, 11)
+
+    def set_weights(self, q: np.ndarray, r: np.ndarray, p: np.ndarray, slope: np.ndarray, target: np.ndarray) -> None:
+        """Sets the Hessian and the cost beyond the horizon.
+
+        Args:
+            q: (N, 8, 8) Hessians of the intervals' costs with respect to states.
+            r: (N, 2, 2) the same with respect to inputs.
+            p, slope, target: V(x) = slopeᵀ(x − target) + (x − target)ᵀ p (x − target).
+        """
+        r = r + _LEAST_CURVATURE * np.eye(2)
+        self._h0[:] = r[0].ravel()
+        self._h[:, :64] = q[1:].reshape(-1, 64)
+        self._h[:, 64:68] = r[1:].reshape(-1, 4)
+        self._h_end[:] = 2 * p.ravel()
+        self._beyond = p, slope, target
+
+    def iterate(self, margin: float) -> bool:
+        """Linearizes about (x, a), solves, and puts the solution into x[1:] and a, if there is one.
+
+        Args:
+            margin: what margins keep from 0, in their own units.
+        """
+        x, a = self.x, self.a
+        self._stage()
+        if not np.isfinite(self._next).all():
+            return False
+        self._set_constraints(margin)
+        p, slope, target = self._beyond
+        self._g0[:], self._g[:, :10] = self._gradient[0, 8:], self._gradient[1:-1]
+        self._g_end[:] = slope + 2 * p @ (x[-1] - target)
+        self._lower0[:], self._upper0[:] = -1 - a[0], 1 - a[0]
+        self._lower_stages[:, 8:10], self._upper_stages[:, 8:10] = -1 - a[1:-1], 1 - a[1:-1]
+        if not (self._program() and self._program.solved and np.isfinite(self._cost[0])):
+            return False
+        a[0] += self._z0
+        a[1:-1] += self._z[:, 8:10]
+        x[1:-1] += self._z[:, :8]
+        x[-1] += self._z_end
+        return True
+
+    def _set_constraints(self, margin: float) -> None:
+        jacobian = self._jacobian
+        gaps = self.x[1:] - self._next[:-1]
+        margins, slopes = self._nearest_margins()
+        self._a0[:] = jacobian[0, 8:].ravel()
+        self._a_x[:, :, 1:9], self._a_x[:, :, 9:], self._a_u[:] = jacobian[1:-1, :8], slopes, jacobian[1:-1, 8:]
+        self._low0[:] = self._high0[:] = gaps[0]
+        self._low[:, :8] = self._high[:, :8] = gaps[1:]
+        self._low[:, 8:] = margin - margins
+
+    def _nearest_margins(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N−1, m) the least of the inner nodes' distinct margins, and their slopes (N−1, 8, m)."""
+        margins, slopes = self._margin[1:-1, self.distinct], self._margin_jacobian[1:-1][:, :, self.distinct]
+        rows = self._low.shape[1] - 8
+        if margins.shape[1] == rows:
+            return margins, slopes
+        least = np.argpartition(margins, rows - 1, axis=1)[:, :rows]
+        return np.take_along_axis(margins, least, 1), np.take_along_axis(slopes, least[:, None, :], 2)
+
+
+class NmpcController:
+    """Model predictive control about the episode's plan. One iteration per control step by default (real-time iteration).
+
+    `plan` is the episode's plan, `counts` what happened so far; `reset` raises a PlanError where there is no plan.
+
+    A step whose program fails, or whose solution is late, applies the last plan under TVLQR: the last solution, shifted,
+    plus the episode plan's gain times the distance from it.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        nodes: int = 40,
+        horizon: float = 1.0,
+        iterations: int = 1,
+        tolerance: float = 1e-4,
+        backoff: Backoff = _BACKOFF,
+        delay: float = 0.0,
+        deadline: float | None = None,
+        failure_rate: float = 0.0,
+        seed: int = 0,
+    ):
+        """Builds the program; `reset` does the planning.
+
+        Args:
+            task: the problem.
+            params: the robot.
+            nodes: intervals of the horizon, at most one per control step.
+            horizon: s, whole control steps.
+            iterations: most iterations per step: 1 is the real-time iteration, some 20 converge.
+            tolerance: largest change of an input, as a fraction of the force limit, that counts as converged.
+            backoff: how far the plan keeps from its limits; the horizon's margins keep half of it.
+            delay: s, whole control steps, from `act` until its force acts. Forces already commanded are taken into account.
+            deadline: s of wall time per step; a later solution is not used. None makes results repeatable.
+            failure_rate: share of steps whose solution is thrown away, drawn with `seed`: fault injection.
+            seed: of the injected failures.
+
+        Raises:
+            ValueError: a horizon or delay that is no whole number of control steps, or a horizon of fewer than 2.
+        """
+        self._task, self._params, self._backoff = task, params, backoff
+        self._iterations, self._tolerance = iterations, tolerance
+        self._deadline, self._failure_rate = deadline, failure_rate
+        self._rng = np.random.default_rng(seed)
+        self._delay = _whole_steps(delay, task.control_dt, "delay")
+        steps = _whole_steps(horizon, task.control_dt, "horizon")
+        nodes = min(nodes, steps)
+        self._grid = Grid.make(steps, nodes)
+        self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
+        self._qp = _horizon_qp(task, params, nodes)
+        self.plan: Optimum | None = None
+        self.counts = Counts()
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        """Plans from the state that the first force will meet."""
+        self._start, self._c, self._lost = t, np.asarray(c, np.float64), False
+        self._commanded = [np.zeros(2)] * self._delay
+        self.follow(find_optimum(self._task, self._params, self._predicted(x), self._c, self._backoff))
+
+    def follow(self, plan: Optimum) -> None:
+        """Takes a plan of the episode, and starts the horizon on it."""
+        task, c, trajectory = self._task, self._c, plan.trajectory
+        self.plan = plan
+        self._tracker = TvlqrController.for_task(task, self._params, trajectory, c)
+        self._tracker.reset(self._start, trajectory.x[0], c)
+        self._length = len(trajectory.u)
+        q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
+        self._q, self._r = 2 * q, 2 * r * self._params.force_limit**2
+        self._p = np.concatenate([self._tracker.gains.p, final_weight(task, self._params, trajectory.x[-1], c)[None]])
+        self._slopes = np.concatenate([np.zeros((1, 8)), plan.costates])
+        self._sums = np.concatenate([np.zeros((1, 2)), np.cumsum(trajectory.u, axis=0)]) / self._params.force_limit
+        self._step = 0
+        margins = np.array([task.margins(x, c) for x in trajectory.x])
+        self._distinct = np.unique(margins, axis=1, return_index=True)[1]  # unused obstacles repeat others
+        nodes = len(self._grid.lengths)
+        self._dx, self._da = np.zeros((nodes + 1, 8)), np.zeros((nodes, 2))
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        began = time.perf_counter()
+        elapsed = round((t - self._start) / self._task.control_dt)
+        x = self._predicted(x)
+        if elapsed >= self._length and self._missed_goal(t, x):
+            elapsed = 0
+        if elapsed >= self._length:
+            u = self._tracker.act(t, x)  # the plan's end is held
+        else:
+            self._advance(elapsed)
+            solved = self._solve(x, began)
+            u = self._params.force_limit * self._qp.a[0] if solved else self._fall_back(x)
+        u = np.clip(u, -self._params.force_limit, self._params.force_limit)
+        self._commanded = [*self._commanded, u][1:] if self._delay else []
+        return u
+
+    def _missed_goal(self, t: float, x: np.ndarray) -> bool:
+        """Whether the plan's time is over before a first-exit goal was reached, and there is a plan that still does."""
+        if not self._task.first_exit or self._lost:
+            return False
+        self.counts.replans += 1
+        try:
+            plan = find_optimum(self._task, self._params, x, self._c, self._backoff)
+        except PlanError:
+            self._lost = True
+            return False
+        self._start = t
+        self.follow(plan)
+        return True
+
+    def _predicted(self, x: np.ndarray) -> np.ndarray:
+        """The state that the force commanded now will meet."""
+        dt = self._task.control_dt
+        for u in self._commanded:
+            x = dynamics.step(self._params, x, u, dt, dynamics.substeps_for(dt))
+        return np.asarray(x, np.float64)
+
+    def _advance(self, elapsed: int) -> None:
+        """Shifts the last solution to now. It is kept as a deviation from the plan, which stays small and smooth."""
+        for _ in range(elapsed - self._step):
+            self._dx, self._da = self._shift_states @ self._dx, self._shift_inputs @ self._da
+        self._step = elapsed
+        n, grid = self._length, self._grid
+        at = np.minimum(elapsed + grid.offsets, n)
+        self._lengths = np.diff(at)
+        self._nodes = at
+        trajectory = self.plan.trajectory
+        self._x_plan = trajectory.x[at]
+        self._a_plan = (self._sums[at[1:]] - self._sums[at[:-1]]) / np.maximum(self._lengths, 1)[:, None]
+
+    def _solve(self, x: np.ndarray, began: float) -> bool:
+        """Whether a solution for state x is there in time; it is then in the program's x and a."""
+        qp, counts = self._qp, self.counts
+        counts.steps += 1
+        self._load(x)
+        found = False
+        for _ in range(self._iterations):
+            before = qp.a.copy()
+            if not qp.iterate(0.5 * self._backoff.margin):
+                found = False
+                break
+            counts.iterations += 1
+            found = True
+            if self._iterations == 1 or np.abs(qp.a - before).max() < self._tolerance:
+                break
+            # after the first, one more iteration takes at most as long as all so far
+            if self._deadline is not None and time.perf_counter() - began > 0.5 * self._deadline:
+                counts.cut += 1
+                break
+        injected = self._failure_rate > 0 and self._rng.random() < self._failure_rate
+        counts.injected += injected
+        found = found and not injected
+        if not found:
+            counts.failed += 1
+            return False
+        # A late solution is no use to this step, but it is the next one's start.
+        self._dx, self._da = qp.x - self._x_plan, qp.a[:-1] - self._a_plan
+        if self._deadline is not None and time.perf_counter() - began > self._deadline:
+            counts.late += 1
+            return False
+        return True
+
+    def _load(self, x: np.ndarray) -> None:
+        qp, dt, at = self._qp, self._task.control_dt, np.minimum(self._nodes[:-1], self._length - 1)
+        self._guess_x, self._guess_a = self._x_plan + self._dx, self._a_plan + self._da
+        qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
+        qp.x[0] = x
+        qp.distinct = self._distinct
+        qp.h[:-1], qp.c[:] = dt * self._lengths, self._c
+        weight = (dt * self._lengths)[:, None, None]
+        end = self._nodes[-1]
+        qp.set_weights(
+            self._q[at] * weight, self._r[at] * weight, self._p[end], self._slopes[end], self.plan.trajectory.x[end]
+        )
+
+    def _fall_back(self, x: np.ndarray) -> np.ndarray:
+        """The last plan under TVLQR: the last solution, shifted, with the episode plan's gains."""
+        self.counts.fallbacks += 1
+        gain = self._tracker.gains.k[self._step]
+        return self._params.force_limit * self._guess_a[0] - gain @ (x - self._guess_x[0])
+
+
+def _whole_steps(seconds: float, dt: float, what: str) -> int:
+    steps = round(seconds / dt)
+    if steps < 0 or abs(steps * dt - seconds) > 1e-9:
+        raise ValueError(f"{what} must be a whole number of control steps of {dt} s, not {seconds} s")
+    return steps
+
+
+@lru_cache(maxsize=16)
+def _horizon_qp(task: Task, params: BallbotParams, nodes: int) -> HorizonQp:
+    return HorizonQp(task, params, nodes)
+
+
+@lru_cache(maxsize=16)
+def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
+    """(x, a, h, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian."""
+    x, a, h = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("h")
+    c = casadi.SX.sym("c", len(task.constant_names))
+    z, u = casadi.vertcat(x, a), params.force_limit * a
+    after = dynamics.step(params, x, u, h, 2)  # two RK4 steps, as the env takes per control step
+    margins = casadi.vertcat(*task.margins(x, c))
+    outputs = [
+        after,
+        casadi.densify(casadi.jacobian(after, z)),
+        casadi.densify(casadi.gradient(task.cost(x, u, c) * h, z)),
+        margins,
+        casadi.densify(casadi.jacobian(margins, x)),
+    ]
+    function = casadi.Function("stage", [x, a, h, c], outputs, {"cse": True})
+    return compiled(f"{task.id}-nmpc", (function,))[0]
+
+
+def _patterns(n: int, m: int) -> tuple[casadi.Sparsity, casadi.Sparsity]:
+    """Of the program's Hessian and constraints, as `HorizonQp` fills them."""
+    state, inputs, slack = casadi.Sparsity.dense(8, 8), casadi.Sparsity.dense(2, 2), casadi.Sparsity.dense(1, 1)
+    hessian = casadi.diagcat(inputs, *[state, inputs, slack] * (n - 1), state)
+    width, height = 11, 8 + m
+    entries = [(i, j) for j in range(2) for i in range(8)]
+    for k in range(1, n + 1):
+        row, column = 8 + (k - 1) * height, 2 + (k - 1) * width
+        above = row - height if k > 1 else 0
+        own = range(row, row + height if k < n else row)
+        for j in range(8):
+            entries += [(above + j, column + j), *((i, column + j) for i in own)]
+        entries += [(i, column + j) for j in (8, 9) for i in own[:8]]
+        entries += [(i, column + 10) for i in own[8:]]
+    rows, columns = zip(*entries, strict=True)
+    shape = (8 + (n - 1) * height, 2 + (n - 1) * width + 8)
+    return hessian, casadi.Sparsity.triplet(*shape, list(rows), list(columns))
+
+
+def _stages(array: np.ndarray, first: int, count: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Views of the first stage's entries, of the middle stages' (count, width), and of the last's."""
+    middle = first + count * width
+    return array[:first], array[first:middle].reshape(count, width), array[middle:]
+
+
+class _InPlace:
+    """A function that reads and writes given arrays: a call through `casadi.DM` costs as much as its work."""
+
+    def __init__(self, function: casadi.Function, inputs: list[np.ndarray], outputs: list[np.ndarray]):
+        self._buffer = function.buffer()[0]
+        self._inputs, self._outputs = ([memoryview(array) for array in arrays] for arrays in (inputs, outputs))
+
+    def __call__(self) -> bool:
+        """Whether it ran without an error."""
+        buffer = self._buffer
+        # HPIPM's interface uses up the pointers it is given (seen in CasADi 3.8.2), so they are given anew.
+        for i, view in enumerate(self._inputs):
+            buffer.set_arg(i, view)
+        for i, view in enumerate(self._outputs):
+            buffer.set_res(i, view)
+        buffer._eval()
+        return buffer.ret() == 0
+
+    @property
+    def solved(self) -> bool:
+        """Whether a solver reports success."""
+        return bool(self._buffer.stats()["success"])

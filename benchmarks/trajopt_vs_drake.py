@@ -1,0 +1,241 @@
+"""The paper's four point-to-point problems, by this package and by what the paper's author used: Drake with SNOPT.
+
+The same URDF, the same problem and the same transcription (Hermite–Simpson, forces linear between knots, one free step,
+cost summed over knots), from the same guesses. Equal optima are asserted. Building and compiling are timed apart from
+solving, for both. Needs the [bench] extra: `pip install -e ".[bench]"`.
+"""
+
+import csv
+import io
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.planning import DirectCollocation
+from pydrake.solvers import SnoptSolver
+
+from ballbot_baselines.guess import straight_line
+from ballbot_baselines.ocp import OcpSolver
+from ballbot_baselines.optimum import PlanError
+from ballbot_baselines.paper import PAPER_PROBLEMS
+from ballbot_baselines.transcription import Guess, Problem, hermite_simpson, solve
+from ballbot_gym import files
+from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
+
+PROBLEMS = ("stabilize-1", "stabilize-5", "turn-3", "turn-10")
+_EQUAL = 1e-3  # relative difference of optima that counts as none
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One problem from one guess by one program; seconds are medians, NaN where it found no optimum."""
+
+    problem: str
+    guess: str
+    program: str
+    cost: float
+    build_s: float
+    cold_s: float
+    warm_s: float
+
+
+def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: bool = False) -> None:
+    """Times both programs side by side in one run.
+
+    Args:
+        out: folder of trajopt_vs_drake.csv and .png.
+        repeats: solves of which the median is taken.
+        quick: two problems, one solve each.
+    """
+    params, rows = default_params(), []
+    repeats = 1 if quick else repeats
+    for name in PROBLEMS[:2] if quick else PROBLEMS:
+        entry = PAPER_PROBLEMS[name]
+        smooth = entry.guess(params)
+        for label, guess in (("straight line", _straight(entry.problem, smooth)), ("cubic Hermite", smooth)):
+            drake = time_drake(entry.problem, params, guess, repeats)
+            ours = time_ours(entry.problem, params, guess, repeats)
+            for program, timing in (("Drake + SNOPT", drake), ("ballbot, fatrop", ours)):
+                rows.append(Timing(name, label, program, *timing))
+                print(_line(rows[-1]), flush=True)
+    compile_seconds = time_compilation(params)
+    print(f"compiling one problem's derivatives, once per machine: {compile_seconds:.1f} s")
+    check_equal_optima(rows)
+    summary = ratios(rows)
+    for line in summary:
+        print(line)
+    files.write(out / "trajopt_vs_drake.csv", _csv(rows))
+    files.write(out / "trajopt_vs_drake.txt", "\n".join([*map(_line, rows), *summary]) + "\n")
+    _figure(rows, out / "trajopt_vs_drake.png")
+    print(f"written to {out}")
+
+
+def time_ours(problem: Problem, params: BallbotParams, guess: Guess, repeats: int) -> tuple[float, ...]:
+    """Cost, and seconds to build, to solve from the guess, and to solve again from the solution."""
+    start = time.perf_counter()
+    OcpSolver(hermite_simpson(problem, params), problem.intervals, "fatrop")
+    built = time.perf_counter() - start
+    try:
+        plans = [solve(problem, params, guess, "fatrop") for _ in range(repeats)]
+    except PlanError:
+        return np.nan, built, np.nan, np.nan
+    found = plans[0].trajectory
+    again = Guess(found.x, found.u, float(found.t[1]), tuple(plans[0].q))
+    warm = [solve(problem, params, again, "fatrop").seconds for _ in range(repeats)]
+    return plans[0].cost, built, float(np.median([plan.seconds for plan in plans])), float(np.median(warm))
+
+
+def time_drake(problem: Problem, params: BallbotParams, guess: Guess, repeats: int) -> tuple[float, ...]:
+    """The same of Drake's DirectCollocation with SNOPT."""
+    start = time.perf_counter()
+    collocation = drake_collocation(problem, params)
+    built = time.perf_counter() - start
+    program = collocation.prog()
+    _set_guess(collocation, guess)
+    first = program.initial_guess().copy()
+    solver = SnoptSolver()
+    cold, result = _median_seconds(lambda: solver.Solve(program, first, None), repeats)
+    if not result.is_success():
+        return np.nan, built, np.nan, np.nan
+    found = result.GetSolution()
+    warm, _ = _median_seconds(lambda: solver.Solve(program, found, None), repeats)
+    return result.get_optimal_cost(), built, cold, warm
+
+
+def drake_collocation(problem: Problem, params: BallbotParams) -> DirectCollocation:
+    """A paper problem between two states, on the URDF that this package simulates."""
+    plant = MultibodyPlant(time_step=0.0)
+    Parser(plant).AddModels(str(URDF_PATH))
+    plant.Finalize()
+    n = problem.intervals
+    collocation = DirectCollocation(
+        plant,
+        plant.CreateDefaultContext(),
+        n + 1,
+        *problem.step,
+        input_port_index=plant.get_actuation_input_port().get_index(),
+    )
+    collocation.AddEqualTimeIntervalsConstraints()
+    program, limit, lean = collocation.prog(), params.force_limit, problem.lean_limit
+    h = collocation.time_step(0)[0]
+    for k in range(n + 1):
+        x, u = collocation.state(k), collocation.input(k)
+        program.AddBoundingBoxConstraint(-limit, limit, u)
+        program.AddBoundingBoxConstraint(-lean, lean, x[2:4])
+        if k < n:
+            program.AddCost(problem.cost(tuple(x), tuple(u), h, ()))
+    for knot, (low, high) in ((0, problem.initial), (n, problem.final)):
+        program.AddBoundingBoxConstraint(low, high, collocation.state(knot))
+    return collocation
+
+
+def time_compilation(params: BallbotParams) -> float:
+    """Seconds that an empty cache costs one problem."""
+    problem, kept = PAPER_PROBLEMS[PROBLEMS[0]].problem, os.environ.get("BALLBOT_CACHE")
+    seconds = []
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["BALLBOT_CACHE"] = folder
+        for _ in range(2):  # with an empty cache, then with a full one
+            start = time.perf_counter()
+            OcpSolver(hermite_simpson(problem, params), problem.intervals, "fatrop")
+            seconds.append(time.perf_counter() - start)
+    if kept is None:
+        del os.environ["BALLBOT_CACHE"]
+    else:
+        os.environ["BALLBOT_CACHE"] = kept
+    return seconds[0] - seconds[1]
+
+
+def check_equal_optima(rows: list[Timing]) -> None:
+    """Raises an AssertionError where both programs found an optimum and it is not the same."""
+    for problem in dict.fromkeys(row.problem for row in rows):
+        costs = [row.cost for row in rows if row.problem == problem and np.isfinite(row.cost)]
+        assert max(costs) <= min(costs) * (1 + _EQUAL), f"{problem}: optima differ: {costs}"
+
+
+def ratios(rows: list[Timing]) -> list[str]:
+    """How many times faster, per problem, from each guess and with the best guess of each program."""
+    lines, best, cold = [], [], {(row.problem, row.guess, row.program): row.cold_s for row in rows}
+    for problem in dict.fromkeys(row.problem for row in rows):
+        mine = {g: s for (p, g, program), s in cold.items() if p == problem and program.startswith("ballbot")}
+        drake = {g: s for (p, g, program), s in cold.items() if p == problem and program.startswith("Drake")}
+        each = ", ".join(f"{drake[guess] / mine[guess]:.0f} from the {guess}" for guess in drake)
+        paper = drake["straight line"] / np.nanmin(list(mine.values()))
+        fastest = np.nanmin(list(drake.values())) / np.nanmin(list(mine.values()))
+        best.append((paper, fastest))
+        lines.append(
+            f"{problem}: Drake's time / ours: {each}; its straight line / our best {paper:.0f}; best / best {fastest:.0f}"
+        )
+    means = np.exp(np.nanmean(np.log(best), axis=0))
+    return [*lines, f"geometric means: straight line / our best {means[0]:.0f}; best / best {means[1]:.0f}"]
+
+
+def _straight(problem: Problem, like: Guess) -> Guess:
+    n = problem.intervals
+    return Guess(straight_line(problem.initial[0], problem.final[0], n), np.zeros((n + 1, 2)), like.h)
+
+
+def _set_guess(collocation: DirectCollocation, guess: Guess) -> None:
+    program = collocation.prog()
+    for k in range(len(guess.x)):
+        program.SetInitialGuess(collocation.state(k), guess.x[k])
+        program.SetInitialGuess(collocation.input(k), guess.u[k])
+        if k < len(guess.x) - 1:
+            program.SetInitialGuess(collocation.time_step(k)[0], guess.h)
+
+
+def _median_seconds(run: Callable, repeats: int) -> tuple:
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = run()
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds)), result
+
+
+def _line(row: Timing) -> str:
+    return (
+        f"{row.problem:12s} {row.guess:14s} {row.program:16s} J* {row.cost:9.4f}  build {1e3 * row.build_s:7.1f} ms  "
+        f"cold {1e3 * row.cold_s:8.2f} ms  warm {1e3 * row.warm_s:8.2f} ms"
+    )
+
+
+def _csv(rows: list[Timing]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(vars(rows[0])), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(vars(row) for row in rows)
+    return text.getvalue()
+
+
+def _figure(rows: list[Timing], path: Path) -> None:
+    problems = list(dict.fromkeys(row.problem for row in rows))
+    figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
+    groups = list(dict.fromkeys((row.program, row.guess) for row in rows))
+    colors = ("#c0392b", "#1f6fb2", "#e6a9a0", "#93bfe0")
+    for i, group in enumerate(groups):
+        seconds = [next(r.cold_s for r in rows if (r.problem, r.program, r.guess) == (p, *group)) for p in problems]
+        places = np.arange(len(problems)) + 0.2 * (i - 1.5)
+        axis.bar(places, 1e3 * np.array(seconds), 0.18, label=", ".join(group), color=colors[i])
+    axis.set(yscale="log", ylabel="time to solve, cold, ms", xticks=range(len(problems)), xticklabels=problems)
+    axis.legend(fontsize=8)
+    axis.grid(axis="y", alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
