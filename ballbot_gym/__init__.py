@@ -4,9 +4,16 @@ import gymnasium
 
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS, Task
 
-__all__ = ["TASKS", "BallbotEnv", "BallbotParams", "Task"]
+__all__ = ["TASKS", "BallbotEnv", "BallbotParams", "Randomization", "Task"]
 
 for _name, _task in TASKS.items():
-    gymnasium.register(id=_task.id, entry_point="ballbot_gym.env:BallbotEnv", kwargs={"task": _name})
+    gymnasium.register(
+        id=_task.id,
+        entry_point="ballbot_gym.env:BallbotEnv",
+        # imported, with torch, when first used
+        vector_entry_point="ballbot_gym.vector:BallbotVectorEnv",
+        kwargs={"task": _name},
+    )

@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.simulator import PHYSICS, Scene
 from ballbot_gym.tasks import TASKS, Task
 
@@ -44,6 +45,7 @@ class BallbotEnv(gymnasium.Env):
         render_mode: str | None = None,
         params: BallbotParams | None = None,
         physics_dt: float | None = None,
+        randomization: Randomization | None = None,
         **task_fields: Any,
     ):
         """Makes the environment; usually through `gymnasium.make("BallbotStabilize-v0", ...)`.
@@ -54,6 +56,8 @@ class BallbotEnv(gymnasium.Env):
             render_mode: None, "rgb_array" or "human".
             params: the robot; default, the paper's.
             physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
+            randomization: what varies; default, nothing. In Bullet each new `com_height` is a URDF loaded anew, for which
+                PyBullet takes 2 ms and 5 kB that it never gives back.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -75,6 +79,10 @@ class BallbotEnv(gymnasium.Env):
         self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         limit = self.task.OBSERVATION_LIMIT
+        self.randomization = Randomization() if randomization is None else randomization
+        self._disturbance = (
+            Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
+        )
         self.observation_space = spaces.Box(-limit, limit, (len(self.task.observation_scale),), np.float32)
         self._simulator = PHYSICS[physics](self.params, self.task.control_dt, physics_dt)
         self._constants: tuple[float, ...] = ()
@@ -100,6 +108,10 @@ class BallbotEnv(gymnasium.Env):
         x, c = self._draw(dict(options or {}))
         self._constants, self._constants_array = tuple(c.tolist()), c
         self._state = tuple(x.tolist())
+        if self._disturbance is not None:
+            self._disturbance.reset(self.np_random)
+            if self.randomization.varies_robot:
+                self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
         self._steps_left = self.task.steps
         if self._scene is not None:
@@ -125,9 +137,12 @@ class BallbotEnv(gymnasium.Env):
                 "step() before reset()" if self._state is None else "the episode has ended; call reset()"
             )
         force, clipped = self._force(action)
-        task, c = self.task, self._constants
+        task, c, total = self.task, self._constants, force
+        if self._disturbance is not None:
+            force = self._disturbance.actuate(force)
+            total = self._disturbance.pushed(force, self.np_random)
         cost = task.cost(self._state, force, c) * task.control_dt
-        self._state = x = self._simulator.step(force)
+        self._state = x = self._simulator.step(total)
         self._steps_left -= 1
         failure = not task.is_safe(x, c)
         if failure:
@@ -146,6 +161,11 @@ class BallbotEnv(gymnasium.Env):
             last and not terminated,
             self._info(cost, force, success, failure, clipped),
         )
+
+    @property
+    def episode_params(self) -> BallbotParams:
+        """The robot of the running episode: `params`, unless randomized."""
+        return self.params if self._disturbance is None else self._disturbance.params
 
     def render(self) -> np.ndarray | None:
         """The current state as an image (height, width, 3), uint8, or in the window of render_mode="human"."""
@@ -225,7 +245,10 @@ class BallbotEnv(gymnasium.Env):
         return (limit * ax, limit * ay), clipped
 
     def _observation(self) -> np.ndarray:
-        return np.array(self.task.observe(self._state, self._constants), np.float32)
+        x = self._state
+        if self._disturbance is not None:
+            x = self._disturbance.sensed(x, self.np_random)
+        return np.array(self.task.observe(x, self._constants), np.float32)
 
     def _info(
         self, cost: float, force: tuple[float, float], success: bool, failure: bool, clipped: bool

@@ -37,6 +37,16 @@ def sqrt(a: Any) -> Any:
     return math.sqrt(a) if isinstance(a, float | int) else _library(a).sqrt(a)
 
 
+def exp(a: Any) -> Any:
+    """Exponential, elementwise."""
+    return math.exp(a) if isinstance(a, float) else _library(a).exp(a)
+
+
+def log(a: Any) -> Any:
+    """Natural logarithm, elementwise."""
+    return math.log(a) if isinstance(a, float) else _library(a).log(a)
+
+
 def where(condition: Any, a: Any, b: Any) -> Any:
     """a where the condition holds, else b, elementwise. Not for CasADi: what tasks ask of optimizers is smooth."""
     if isinstance(condition, bool):

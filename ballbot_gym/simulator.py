@@ -32,6 +32,9 @@ class Simulator(Protocol):
     def reset(self, x: State) -> None:
         """Puts the robot into state x."""
 
+    def set_params(self, params: BallbotParams) -> None:
+        """Replaces the robot; call `reset` after it."""
+
     def step(self, u: tuple[float, float]) -> State:
         """Holds force u, N, for one control step and returns the state after it."""
 
@@ -53,6 +56,9 @@ class Rk4Simulator:
 
     def reset(self, x: State) -> None:
         self._x = x
+
+    def set_params(self, params: BallbotParams) -> None:
+        self._params = params
 
     def step(self, u: tuple[float, float]) -> State:
         self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps)
@@ -86,12 +92,27 @@ class BulletSimulator:
         # Substeps run in C++ with the torque held, bitwise equal to as many calls and a third faster.
         bullet.setPhysicsEngineParameter(fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client)
         bullet.setGravity(0, 0, -params.gravity, physicsClientId=self._client)
-        self._bullet = bullet
+        self._bullet, self._com_height = bullet, params.com_height
 
     def reset(self, x: State) -> None:
         # Joints are reset in place: reloading the URDF takes a hundred times longer.
         for i, joint in enumerate(self._joints):
             self._bullet.resetJointState(self._robot, joint, x[i], x[i + 4], physicsClientId=self._client)
+
+    def set_params(self, params: BallbotParams) -> None:
+        bullet, client = self._bullet, self._client
+        if params.com_height != self._com_height:
+            # Loaded anew, because changeDynamics cannot move a link's centre of mass.
+            bullet.removeBody(self._robot, physicsClientId=client)
+            self._robot, self._joints = _load_robot(bullet, client, params)
+            self._com_height = params.com_height
+            return
+        ball, body = self._joints[1], self._joints[3]  # a link has the index of the joint that carries it
+        inertia = (params.inertia, params.inertia, params.axial_inertia)
+        bullet.changeDynamics(self._robot, ball, mass=params.ball_mass, physicsClientId=client)
+        bullet.changeDynamics(
+            self._robot, body, mass=params.body_mass, localInertiaDiagonal=inertia, physicsClientId=client
+        )
 
     def step(self, u: tuple[float, float]) -> State:
         bullet, client, robot = self._bullet, self._client, self._robot

@@ -137,7 +137,7 @@ def _figure(pushes: list[Push], path: Path) -> None:
         bearings = np.radians([push.bearing for push in [*mine, mine[0]]])
         axis.plot(bearings, [push.impulse for push in [*mine, mine[0]]], "o-", color=color, label=name, ms=3)
     axis.set_title("largest impulse on the body survived, N·s")
-    axis.legend(loc="lower right", fontsize=9)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -230,7 +230,7 @@ def _figure(rows: list[Timing], path: Path) -> None:
         places = np.arange(len(problems)) + 0.2 * (i - 1.5)
         axis.bar(places, 1e3 * np.array(seconds), 0.18, label=", ".join(group), color=colors[i])
     axis.set(yscale="log", ylabel="time to solve, cold, ms", xticks=range(len(problems)), xticklabels=problems)
-    axis.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside upper center", ncols=2)
     axis.grid(axis="y", alpha=0.3)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

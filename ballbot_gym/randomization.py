@@ -1,0 +1,241 @@
+"""Domain randomization: robots, actuators, sensors and pushes that vary, for one environment and for batches alike.
+
+Nothing here draws: every function takes uniform numbers in [0, 1), as floats or as batches, so that `BallbotEnv` and the
+batched simulator follow the same lines.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import ops
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks.base import between
+
+Range = tuple[float, float]
+"""(low, high), both included; drawn uniformly."""
+
+
+@dataclass(frozen=True)
+class Randomization:
+    """What varies, and how far. Everything is off by default. Ranges are (low, high), drawn uniformly.
+
+    Cost, margins, goal and `info["state"]` see the true state and the force that the actuator really applies; tasks draw
+    their episodes for the nominal robot. Pushes do not count as effort.
+
+    Raises:
+        ValueError: a range that is reversed, not finite or out of its domain; the message names the field.
+    """
+
+    body_mass: Range = (1.0, 1.0)
+    """Factor on the body's mass, drawn per episode."""
+    ball_mass: Range = (1.0, 1.0)
+    """Factor on the ball's mass, drawn per episode."""
+    com_height: Range = (1.0, 1.0)
+    """Factor on the height of the body's centre of mass above the ball's centre, drawn per episode."""
+    inertia: Range = (1.0, 1.0)
+    """Factor on both of the body's inertias about its centre of mass, drawn per episode."""
+    actuator_lag: Range = (0.0, 0.0)
+    """Time constant of the force's first-order response, s, drawn per episode."""
+    actuator_delay: Range = (0.0, 0.0)
+    """Dead time before the force responds, s: whole control steps, drawn per episode."""
+    position_noise: float = 0.0
+    """Standard deviation of observed x and y, m, anew at each observation."""
+    lean_noise: float = 0.0
+    """Standard deviation of observed γ and θ, rad."""
+    velocity_noise: float = 0.0
+    """Standard deviation of observed ẋ and ẏ, m/s."""
+    lean_rate_noise: float = 0.0
+    """Standard deviation of observed γ̇ and θ̇, rad/s."""
+    push_impulse: Range = (0.0, 0.0)
+    """Horizontal impulse on the ball, N·s, in a random direction, spread over one control step."""
+    push_interval: float = 1.0
+    """Mean time between pushes, s; in each control step one comes with probability control_dt / push_interval."""
+
+    EPISODE_DRAWS = 6
+    """Uniform numbers that `draw` takes."""
+    PUSH_DRAWS = 3
+    """Uniform numbers that `push` takes."""
+    NOISE_DRAWS = 8
+    """Uniform numbers that `sensed` takes."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(field.default, float):
+                if not (math.isfinite(value) and value >= 0):
+                    raise ValueError(f"Randomization: {field.name} must be finite and at least 0, not {value}")
+                continue
+            low, high = _pair(field.name, value)
+            if not (math.isfinite(high) and low <= high):
+                raise ValueError(f"Randomization: {field.name} must be a finite range (low, high), not {value}")
+            if low < 0 or (low == 0 and field.default == (1.0, 1.0)):
+                bound = "positive factors" if field.default == (1.0, 1.0) else "at least 0"
+                raise ValueError(f"Randomization: {field.name} must be {bound}, not {value}")
+        if self.push_interval == 0:
+            raise ValueError("Randomization: push_interval must be positive, not 0")
+
+    @property
+    def varies_robot(self) -> bool:
+        """Whether robots differ from the nominal one."""
+        return any(r != (1.0, 1.0) for r in (self.body_mass, self.ball_mass, self.com_height, self.inertia))
+
+    @property
+    def varies_actuator(self) -> bool:
+        """Whether the force lags or is delayed."""
+        return self.actuator_lag[1] > 0 or self.actuator_delay[1] > 0
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether observations carry noise."""
+        return any(self.noise)
+
+    @property
+    def pushes(self) -> bool:
+        """Whether pushes come."""
+        return self.push_impulse[1] > 0
+
+    @property
+    def active(self) -> bool:
+        """Whether anything varies."""
+        return self.varies_robot or self.varies_actuator or self.is_noisy or self.pushes
+
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """Standard deviation of each observed state component, in its unit; order as in `dynamics.STATE`."""
+        groups = (self.position_noise, self.lean_noise, self.velocity_noise, self.lean_rate_noise)
+        return tuple(std for std in groups for _ in range(2))
+
+    def delay_steps(self, control_dt: float) -> tuple[int, int]:
+        """`actuator_delay` in control steps of control_dt seconds.
+
+        Raises:
+            ValueError: it is not whole control steps.
+        """
+        low, high = (round(seconds / control_dt) for seconds in self.actuator_delay)
+        if not all(
+            math.isclose(steps * control_dt, seconds, rel_tol=1e-9, abs_tol=1e-12)
+            for steps, seconds in zip((low, high), self.actuator_delay, strict=True)
+        ):
+            raise ValueError(
+                f"Randomization: actuator_delay {self.actuator_delay} s must be whole control steps of {control_dt} s"
+            )
+        return low, high
+
+    def draw(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
+        """What 6 uniform numbers stand for in an episode.
+
+        Returns:
+            Factors on body mass, ball mass, centre-of-mass height and inertia; then for `actuate` the share of the way
+            to its command that the force goes in one control step, and the delay in control steps.
+        """
+        ranges = (self.body_mass, self.ball_mass, self.com_height, self.inertia)
+        factors = tuple(between(z[i], *ranges[i]) for i in range(4))
+        # The tiny constant makes no lag an exact gain of 1.
+        gain = 1.0 - ops.exp(-control_dt / (between(z[4], *self.actuator_lag) + 1e-9))
+        low, high = self.delay_steps(control_dt)
+        delay = 0.0 * z[5] + low
+        for k in range(low, high):
+            delay = ops.where(z[5] * (high - low + 1) >= k - low + 1, 0.0 * z[5] + (k + 1), delay)
+        return (*factors, gain, delay)
+
+    def robot(self, params: BallbotParams, factors: tuple[Any, ...]) -> BallbotParams:
+        """The robot with factors (4) on body mass, ball mass, centre-of-mass height and inertia."""
+        body_mass, ball_mass, com_height, inertia = factors
+        return replace(
+            params,
+            body_mass=params.body_mass * body_mass,
+            ball_mass=params.ball_mass * ball_mass,
+            com_height=params.com_height * com_height,
+            inertia=params.inertia * inertia,
+            axial_inertia=params.axial_inertia * inertia,
+        )
+
+    def push(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, Any]:
+        """Push (2), N, in a control step for which 3 uniform numbers were drawn; mostly zero."""
+        strength = between(z[1], *self.push_impulse) / control_dt
+        force = ops.where(z[0] < control_dt / self.push_interval, strength, 0.0 * strength)
+        bearing = 2 * math.pi * z[2]
+        return force * ops.cos(bearing), force * ops.sin(bearing)
+
+    def sensed(self, x: tuple[Any, ...], z: tuple[Any, ...]) -> tuple[Any, ...]:
+        """State (8) as the sensors report it, for 8 uniform numbers."""
+        return tuple(
+            value + std * normal if std else value for value, std, normal in zip(x, self.noise, normals(z), strict=True)
+        )
+
+
+class Disturbance:
+    """The randomization of one environment: what is drawn for its episode, and its actuator's memory."""
+
+    def __init__(self, randomization: Randomization, params: BallbotParams, control_dt: float):
+        """Args: params: the nominal robot. control_dt: s."""
+        self._randomization, self._nominal, self._dt = randomization, params, control_dt
+        self._past_steps = randomization.delay_steps(control_dt)[1]
+        self.params = params
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Draws the episode's robot and actuator."""
+        *factors, self._gain, self._delay = self._randomization.draw(
+            tuple(rng.random(Randomization.EPISODE_DRAWS).tolist()), self._dt
+        )
+        if self._randomization.varies_robot:
+            self.params = self._randomization.robot(self._nominal, tuple(factors))
+        self._force: tuple[float, float] = (0.0, 0.0)
+        self._past: tuple[tuple[float, float], ...] = ((0.0, 0.0),) * self._past_steps
+
+    def actuate(self, command: tuple[float, float]) -> tuple[float, float]:
+        """Force, N, that the actuator applies in the control step of this command, N."""
+        self._force = actuate(command, self._past, self._force, self._gain, self._delay)
+        self._past = (command, *self._past)[: self._past_steps]
+        return self._force
+
+    def pushed(self, force: tuple[float, float], rng: np.random.Generator) -> tuple[float, float]:
+        """The force, N, with the push of this control step, if one comes."""
+        if not self._randomization.pushes:
+            return force
+        push = self._randomization.push(tuple(rng.random(Randomization.PUSH_DRAWS).tolist()), self._dt)
+        return force[0] + push[0], force[1] + push[1]
+
+    def sensed(self, x: tuple[float, ...], rng: np.random.Generator) -> tuple[float, ...]:
+        """State (8) as the sensors report it."""
+        if not self._randomization.is_noisy:
+            return x
+        return self._randomization.sensed(x, tuple(rng.random(Randomization.NOISE_DRAWS).tolist()))
+
+
+def actuate(
+    command: tuple[Any, Any], past: tuple[tuple[Any, Any], ...], force: tuple[Any, Any], gain: Any, delay: Any
+) -> tuple[Any, Any]:
+    """Force (2), N, that the actuator applies in the next control step.
+
+    Args:
+        command: (2,) N, asked for now.
+        past: earlier commands, the latest first, as many as the longest delay in control steps.
+        force: (2,) N, applied in the last control step.
+        gain: share of the way to the due command that the force goes in one control step.
+        delay: control steps until a command is due.
+    """
+    due = command
+    for age, old in enumerate(past, start=1):
+        due = tuple(ops.where(delay == age, a, b) for a, b in zip(old, due, strict=True))
+    return tuple(gain * d + (1.0 - gain) * f for d, f in zip(due, force, strict=True))
+
+
+def normals(z: tuple[Any, ...]) -> tuple[Any, ...]:
+    """As many standard normal numbers as there are uniform ones, an even number, by Box and Muller's transform."""
+    out: list[Any] = []
+    for z1, z2 in zip(z[::2], z[1::2], strict=True):
+        radius, bearing = ops.sqrt(-2.0 * ops.log(1.0 - z1)), 2 * math.pi * z2
+        out += [radius * ops.cos(bearing), radius * ops.sin(bearing)]
+    return tuple(out)
+
+
+def _pair(name: str, value: Any) -> Range:
+    try:
+        low, high = value
+        return float(low), float(high)
+    except (TypeError, ValueError):
+        raise ValueError(f"Randomization: {name} must be a finite range (low, high), not {value!r}") from None

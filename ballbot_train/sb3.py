@@ -1,0 +1,101 @@
+"""Stable-Baselines3 on the batched environments, which it does not take as Gymnasium offers them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from ballbot_gym.vector import BallbotVectorEnv
+
+
+class BallbotVecEnv(VecEnv):
+    """A `BallbotVectorEnv` as a Stable-Baselines3 `VecEnv`: `PPO("MlpPolicy", BallbotVecEnv(make_vec(...)))`.
+
+    The `infos` of a step are empty for running episodes, and have, where one ended:
+
+    | key | meaning |
+    |---|---|
+    | terminal_observation | (no,) the observation that the episode ended with |
+    | TimeLimit.truncated | it ran out of time, so that the value of that observation still counts |
+    | is_success | the task's goal held at the end; logged as `rollout/success_rate` |
+    | failure | a margin was violated |
+
+    Wrap it in `VecMonitor` to log episodes' returns and lengths.
+    """
+
+    def __init__(self, env: BallbotVectorEnv):
+        """Args: env: the vector env, from now on stepped through this object only.
+
+        Raises:
+            TypeError: env is something else; `.unwrapped` of what `gymnasium.make_vec` returns is right.
+        """
+        if not isinstance(env, BallbotVectorEnv):
+            raise TypeError(f"BallbotVecEnv needs a BallbotVectorEnv, not {type(env).__name__}")
+        self.env = env
+        self._actions: np.ndarray | None = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Starts an episode in every env, with the seeds and options set since the last reset."""
+        seeded = any(seed is not None for seed in self._seeds)
+        observation, _ = self.env.reset(seed=self._seeds if seeded else None, options=_merged(self._options))
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        observation, reward, terminated, truncated, infos = self.env.step(self._actions)
+        done = terminated | truncated
+        listed: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(done).tolist():
+            listed[i] = {
+                "terminal_observation": infos["final_obs"][i],
+                "TimeLimit.truncated": bool(truncated[i]),
+                "is_success": bool(infos["final_info"]["success"][i]),
+                "failure": bool(infos["final_info"]["failure"][i]),
+            }
+        return observation, reward.astype(np.float32), done, listed
+
+    def close(self) -> None:
+        self.env.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        return self.env.render() or [None] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        values = self.env.get_attr(attr_name)
+        return [values[i] for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        self.env.set_attr(attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        values = self.env.call(method_name, *method_args, **method_kwargs)
+        return [values[i] for i in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+
+def _merged(options: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """One dict of reset options for all envs from one for each.
+
+    Raises:
+        ValueError: some envs have options that others have not.
+    """
+    if not any(options):
+        return None
+    if any(set(option) != set(options[0]) for option in options):
+        raise ValueError("reset options must have the same keys for every env")
+    return {
+        key: {name: np.array([option[key][name] for option in options]) for name in value}
+        if isinstance(value, dict)
+        else np.stack([option[key] for option in options])
+        for key, value in options[0].items()
+    }

@@ -1,0 +1,246 @@
+"""Control steps per second: ours, single and batched, against the raw PyBullet loop, EnvPool and Gymnasium's MuJoCo.
+
+Random actions, resets included, one measurement after another, each in a process of its own. EnvPool and MuJoCo come with
+the extra `[bench]`; what is not installed is said so in the table.
+"""
+
+import csv
+import importlib.util
+import os
+import resource
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import gymnasium
+import matplotlib
+import numpy as np
+import tyro
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from ballbot_gym import TASKS, BallbotEnv
+from ballbot_gym.params import default_params
+from ballbot_gym.simulator import BulletSimulator
+
+_CONTROL_DT = 0.02  # s
+_EPISODE = 40  # control steps after which the raw loop resets, about as long as random forces leave the robot upright
+
+
+@dataclass
+class Row:
+    """One measurement: control steps of one robot per second of wall time, all robots together."""
+
+    what: str
+    env: str
+    batch: int
+    device: str = "cpu"
+    steps_per_second: float = float("nan")
+    first_step_seconds: float = float("nan")
+    note: str = ""
+
+
+def main(
+    batches: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384, 65536),
+    seconds: float = 3.0,
+    tasks: tuple[str, ...] = tuple(TASKS),
+    peers: bool = True,
+    soak: int = 0,
+    threads: int = os.cpu_count() or 1,
+    out: Path = Path("runs/throughput"),
+) -> None:
+    """Measures throughput, prints the table, and writes throughput.csv and throughput.png.
+
+    Args:
+        batches: batch sizes at which BallbotStabilize-v0 is measured, eager and compiled.
+        seconds: how long each measurement runs, after its first step.
+        tasks: which other tasks are measured, compiled, at 16,384.
+        peers: also measure EnvPool and Gymnasium's MuJoCo envs.
+        soak: if not 0, as many steps are taken at 16,384 and the growth of the process's memory is reported.
+        threads: of torch and EnvPool. On a machine that others use too, fewer than its cores may be much faster: every
+            operation waits for the slowest thread.
+        out: folder of the results.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    for measure, args in _plan(batches, tasks, peers, soak):
+        # a new process for each, so that none inherits another's threads, caches or memory
+        context = get_context("spawn")
+        with ProcessPoolExecutor(1, mp_context=context, initializer=_use_threads, initargs=(threads,)) as pool:
+            row = pool.submit(_guarded, measure, args, seconds).result()
+        rows.append(row)
+        print(
+            f"{row.what:28} {row.env:28} {row.batch:6} {row.device:5} {row.steps_per_second:14,.0f} steps/s"
+            f" {row.first_step_seconds:7.2f} s to the first step  {row.note}",
+            flush=True,
+        )
+        with (out / "throughput.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(asdict(rows[0])))
+            writer.writeheader()
+            writer.writerows(asdict(row) for row in rows)
+    _plot(rows, out / "throughput.png")
+    print(f"written: {out / 'throughput.csv'}, {out / 'throughput.png'}")
+
+
+def _plan(batches: tuple[int, ...], tasks: tuple[str, ...], peers: bool, soak: int) -> list[tuple[Callable, tuple]]:
+    import torch
+
+    plan: list[tuple[Callable, tuple]] = [(raw_bullet, ()), (single, ("bullet",)), (single, ("rk4",))]
+    if peers:
+        plan += [(envpool, ("InvertedPendulum-v4", count)) for count in (16, 256, 1024)]
+        plan += [(envpool, ("InvertedDoublePendulum-v4", 256))]
+        plan += [(mujoco, (name, 1)) for name in ("InvertedPendulum-v5", "InvertedDoublePendulum-v5")]
+    for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
+        plan += [(batched, ("stabilize", count, device, mode)) for mode in (False, True) for count in batches]
+        plan += [(batched, (task, 16384, device, True)) for task in tasks if task != "stabilize"]
+        if soak:
+            plan.append((batched, ("stabilize", 16384, device, True, soak)))
+    return plan
+
+
+def _use_threads(threads: int) -> None:
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+def _guarded(measure: Callable[..., Row], args: tuple, seconds: float) -> Row:
+    try:
+        return measure(*args, seconds=seconds)
+    except ImportError as error:
+        return Row(measure.__name__, str(args[0]), args[1], note=f"not installed: {error}")
+
+
+def raw_bullet(seconds: float) -> Row:
+    """What PyBullet itself needs for a control step: torques in, 20 substeps of 1 ms, joint states out."""
+    simulator = BulletSimulator(default_params(), _CONTROL_DT)
+    bullet, client = simulator._bullet, simulator._client
+    robot, joints = simulator._robot, simulator._joints
+    start = (0.0, 0.0, 0.3, 0.1, 1.0, 0.0, 0.0, 0.0)
+    count = 0
+
+    def step() -> None:
+        nonlocal count
+        if count % _EPISODE == 0:
+            simulator.reset(start)
+        count += 1
+        bullet.setJointMotorControlArray(
+            robot, joints[:2], bullet.TORQUE_CONTROL, forces=(10.0, -5.0), physicsClientId=client
+        )
+        bullet.stepSimulation(physicsClientId=client)
+        bullet.getJointStates(robot, joints, physicsClientId=client)
+
+    return _timed(Row("raw PyBullet loop", "ballbot.urdf", 1), step, seconds)
+
+
+def single(physics: str, seconds: float) -> Row:
+    """One BallbotEnv."""
+    env = BallbotEnv("stabilize", physics=physics)
+    env.reset(seed=0)
+    actions = iter(_forever(np.random.default_rng(0).uniform(-1, 1, (1000, 2)).astype(np.float32)))
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(next(actions))
+        if terminated or truncated:
+            env.reset()
+
+    return _timed(Row(f"BallbotEnv, {physics}", env.task.id, 1), step, seconds)
+
+
+def batched(task: str, count: int, device: str, compile: bool, soak: int = 0, *, seconds: float) -> Row:
+    """BallbotVectorEnv, NumPy in and out; with `soak`, that many steps, and what the process grew by."""
+    env = gymnasium.make_vec(TASKS[task].id, num_envs=count, device=device, compile=compile)
+    env.reset(seed=0)
+    row = Row("BallbotVectorEnv, " + ("compiled" if compile else "eager"), TASKS[task].id, count, device)
+    rng = np.random.default_rng(0)
+    actions = iter(_forever([rng.uniform(-1, 1, (count, 2)).astype(np.float32) for _ in range(8)]))
+    row = _timed(row, lambda: env.step(next(actions)), seconds)
+    if soak:
+        before = _resident()
+        for _ in range(soak // count):
+            env.step(next(actions))
+        row.what = "soak"
+        row.note = f"{soak:.0e} steps, resident memory {before:.1f} -> {_resident():.1f} MiB"
+    return row
+
+
+def envpool(name: str, count: int, seconds: float) -> Row:
+    """EnvPool's MuJoCo env."""
+    import envpool
+    import torch
+
+    env = envpool.make_gymnasium(name, num_envs=count, num_threads=torch.get_num_threads())
+    env.reset()
+    rng = np.random.default_rng(0)
+    actions = iter(_forever([rng.uniform(-1, 1, (count, 1)) for _ in range(8)]))
+    return _timed(Row("EnvPool", name, count), lambda: env.step(next(actions)), seconds)
+
+
+def mujoco(name: str, count: int, seconds: float) -> Row:
+    """Gymnasium's MuJoCo env, single."""
+    if importlib.util.find_spec("mujoco") is None:
+        raise ImportError("mujoco")
+    env = gymnasium.make(name)
+    env.reset(seed=0)
+    actions = iter(_forever(np.random.default_rng(0).uniform(-1, 1, (1000, 1))))
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(next(actions))
+        if terminated or truncated:
+            env.reset()
+
+    return _timed(Row("Gymnasium MuJoCo", name, count), step, seconds)
+
+
+def _timed(row: Row, step: Callable[[], object], seconds: float) -> Row:
+    start = time.perf_counter()
+    step()
+    row.first_step_seconds = time.perf_counter() - start
+    for _ in range(3):
+        step()
+    steps, start = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - start) < seconds:
+        for _ in range(10):
+            step()
+        steps += 10
+    row.steps_per_second = steps * row.batch / elapsed
+    return row
+
+
+def _forever(items: object) -> object:
+    while True:
+        yield from items
+
+
+def _resident() -> float:
+    """Memory of this process, MiB: what is resident now, or where the system does not say, its peak."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize() / 2**20
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+
+
+def _plot(rows: list[Row], path: Path) -> None:
+    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    curves: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.what != "soak" and row.steps_per_second > 0:
+            curves.setdefault(f"{row.what}, {row.env}" + (f", {row.device}" if row.device != "cpu" else ""), []).append(
+                row
+            )
+    for label, points in curves.items():
+        axes.loglog([p.batch for p in points], [p.steps_per_second for p in points], "o-", label=label, ms=4)
+    axes.set(xlabel="environments in the batch", ylabel="control steps per second")
+    axes.grid(which="major", alpha=0.3)
+    axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

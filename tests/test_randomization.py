@@ -1,0 +1,299 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+
+from ballbot_gym import Randomization
+from ballbot_gym.randomization import actuate, normals
+from ballbot_gym.vector import BallbotBatch, BallbotVectorEnv
+
+ROBOTS = Randomization(body_mass=(0.8, 1.3), ball_mass=(0.5, 2.0), com_height=(0.9, 1.1), inertia=(0.7, 1.4))
+EVERYTHING = replace(
+    ROBOTS,
+    actuator_lag=(0.0, 0.05),
+    actuator_delay=(0.0, 0.06),
+    position_noise=0.01,
+    lean_noise=0.02,
+    velocity_noise=0.03,
+    lean_rate_noise=0.04,
+    push_impulse=(1.0, 5.0),
+    push_interval=0.5,
+)
+
+
+def play(env, actions, seed=0):
+    """(observation, reward, state) of each step, over ends of episodes."""
+    observation, info = env.reset(seed=seed)
+    results = [(observation, 0.0, info["state"])]
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        results.append((observation, reward, info["state"]))
+        if terminated or truncated:
+            observation, info = env.reset()
+            results.append((observation, 0.0, info["state"]))
+    return results
+
+
+def assert_same(got, expected):
+    for a, b in zip(got, expected, strict=True):
+        for left, right in zip(a, b, strict=True):
+            np.testing.assert_array_equal(left, right)
+
+
+# --- the ranges ---
+
+
+def test_everything_is_off_by_default(physics, make_env, rng):
+    assert not Randomization().active
+    actions = rng.uniform(-1, 1, (60, 2))
+    assert_same(
+        play(make_env(physics=physics, randomization=Randomization()), actions),
+        play(make_env(physics=physics), actions),
+    )
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("body_mass", (1.2, 0.8), "body_mass must be a finite range"),
+        ("body_mass", (0.0, 1.0), "body_mass must be positive"),
+        ("com_height", (1.0, math.inf), "com_height must be a finite range"),
+        ("inertia", 1.0, "inertia must be a finite range"),
+        ("actuator_lag", (-0.1, 0.1), "actuator_lag must be at least 0"),
+        ("lean_noise", -0.1, "lean_noise must be finite and at least 0"),
+        ("push_impulse", (math.nan, 1.0), "push_impulse must be"),
+        ("push_interval", 0.0, "push_interval must be positive"),
+    ],
+)
+def test_bad_range_is_refused_by_name(field, value, message):
+    with pytest.raises(ValueError, match=message):
+        Randomization(**{field: value})
+
+
+def test_delay_must_be_whole_control_steps(make_env):
+    assert Randomization(actuator_delay=(0.02, 0.06)).delay_steps(0.02) == (1, 3)
+    with pytest.raises(ValueError, match="whole control steps"):
+        make_env(randomization=Randomization(actuator_delay=(0.0, 0.03)))
+
+
+def test_draws_fill_their_ranges(rng):
+    drawn = np.array([EVERYTHING.draw(tuple(z), 0.02) for z in rng.random((4000, 6)).tolist()])
+    for i, (low, high) in enumerate((ROBOTS.body_mass, ROBOTS.ball_mass, ROBOTS.com_height, ROBOTS.inertia)):
+        assert low <= drawn[:, i].min() < low + 0.01 * (high - low)
+        assert high >= drawn[:, i].max() > high - 0.01 * (high - low)
+    assert drawn[:, 4].max() == pytest.approx(1, abs=1e-3)
+    assert drawn[:, 4].min() == pytest.approx(1 - math.exp(-0.02 / 0.05), abs=1e-3)
+    values, counts = np.unique(drawn[:, 5], return_counts=True)
+    assert values.tolist() == [0, 1, 2, 3]
+    assert counts.min() > 900
+
+
+# --- robots ---
+
+
+def test_each_episode_has_a_robot_of_its_own_within_the_ranges(physics, make_env, params):
+    env = make_env(physics=physics, randomization=ROBOTS)
+    robots = []
+    for seed in range(5):
+        env.reset(seed=seed)
+        robots.append(env.episode_params)
+        for name in ("body_mass", "ball_mass", "com_height", "inertia"):
+            low, high = getattr(ROBOTS, name)
+            assert low <= getattr(robots[-1], name) / getattr(params, name) <= high
+        assert robots[-1].axial_inertia / params.axial_inertia == pytest.approx(robots[-1].inertia / params.inertia)
+    assert len(set(robots)) == 5
+    assert env.params == params
+
+
+@pytest.mark.parametrize("robots", [ROBOTS, replace(ROBOTS, com_height=(1.0, 1.0))], ids=["all", "not the height"])
+def test_randomized_robot_moves_as_one_made_with_its_parameters(robots, physics, make_env, rng):
+    env = make_env(physics=physics, randomization=robots)
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        same = make_env(physics=physics, params=env.episode_params)
+        same.reset(options={"state": info["state"]})
+        for action in rng.uniform(-0.3, 0.3, (15, 2)):
+            np.testing.assert_array_equal(env.step(action)[4]["state"], same.step(action)[4]["state"])
+
+
+def test_task_starts_as_it_would_without_randomization(make_env):
+    plain, varied = make_env("weave", physics="rk4"), make_env("weave", physics="rk4", randomization=EVERYTHING)
+    a, b = plain.reset(seed=4)[1], varied.reset(seed=4)[1]
+    np.testing.assert_array_equal(a["state"], b["state"])
+    np.testing.assert_array_equal(a["constants"], b["constants"])
+
+
+def test_seed_repeats_a_randomized_episode(physics, make_env, rng):
+    env, actions = make_env(physics=physics, randomization=EVERYTHING), rng.uniform(-1, 1, (50, 2))
+    assert_same(play(env, actions, seed=2), play(env, actions, seed=2))
+
+
+# --- actuators ---
+
+
+def test_delayed_force_comes_the_drawn_number_of_steps_later(make_env):
+    env = make_env(physics="rk4", randomization=Randomization(actuator_delay=(0.04, 0.04)))
+    env.reset(seed=0, options={"state": np.zeros(8)})
+    forces = [env.step([0.01 * k, 0.0])[4]["force"][0] for k in range(1, 6)]
+    assert forces == pytest.approx([0, 0, 3.5, 7.0, 10.5])
+    env.reset(options={"state": np.zeros(8)})
+    assert env.step([1, 1])[4]["force"].tolist() == [0, 0]  # commands of the last episode are forgotten
+
+
+def test_lagging_force_approaches_its_command_exponentially(make_env):
+    env = make_env(physics="rk4", randomization=Randomization(actuator_lag=(0.05, 0.05)))
+    env.reset(seed=0, options={"state": np.zeros(8)})
+    forces = [env.step([0.1, 0.0])[4]["force"][0] for _ in range(6)]
+    expected = 35 * (1 - np.exp(-0.02 * np.arange(1, 7) / 0.05))
+    np.testing.assert_allclose(forces, expected, rtol=1e-6)  # the tiny constant in the gain is 2e-8 of the lag
+
+
+def test_actuator_without_lag_or_delay_is_exact():
+    gain, delay = Randomization().draw((0.3,) * 6, 0.02)[4:]
+    assert actuate((1.1, -2.3), (), (5.0, 7.0), gain, delay) == (1.1, -2.3)
+
+
+def test_cost_charges_the_force_applied(make_env, rng):
+    env = make_env(physics="rk4", randomization=EVERYTHING)
+    _, info = env.reset(seed=0)
+    for action in rng.uniform(-0.2, 0.2, (10, 2)):
+        x, c = info["state"], info["constants"]
+        _, reward, terminated, truncated, info = env.step(action)
+        assert not terminated
+        assert not truncated
+        assert -reward == pytest.approx(env.task.cost(x, info["force"], c) * 0.02)
+
+
+# --- sensors and pushes ---
+
+
+def test_normal_numbers_are_normal(rng):
+    sample = np.array(normals(tuple(rng.random((8, 20_000)))))
+    assert np.abs(sample.mean(1)).max() < 5 / math.sqrt(20_000)
+    assert np.abs(np.cov(sample) - np.eye(8)).max() < 5 * math.sqrt(2 / 20_000)
+    assert np.abs((sample**4).mean(1) - 3).max() < 5 * math.sqrt(96 / 20_000)
+
+
+def test_sensors_err_by_the_standard_deviations_given_and_info_tells_the_truth(make_env):
+    noise = Randomization(position_noise=0.05, lean_noise=0.02, velocity_noise=0.1, lean_rate_noise=0.2)
+    env = make_env(physics="rk4", randomization=noise)
+    errors = []
+    for _ in range(2000):
+        observation, info = env.reset(seed=None if errors else 0, options={"state": np.full(8, 0.1)})
+        np.testing.assert_array_equal(info["state"], np.full(8, 0.1))
+        errors.append(observation * env.task.observation_scale - 0.1)
+    assert np.abs(np.mean(errors, axis=0) / noise.noise).max() < 5 / math.sqrt(2000)
+    np.testing.assert_allclose(np.std(errors, axis=0), noise.noise, rtol=5 / math.sqrt(4000))
+
+
+def test_push_delivers_its_impulse_as_often_as_asked(rng):
+    pushes = Randomization(push_impulse=(2.0, 4.0), push_interval=0.2)
+    n = 50_000
+    impulse = 0.02 * np.hypot(*pushes.push(tuple(rng.random((3, n))), 0.02))
+    came = impulse > 0
+    assert came.mean() == pytest.approx(0.1, abs=5 * math.sqrt(0.09 / n))
+    assert impulse[came].min() >= 2
+    assert impulse[came].max() <= 4
+    assert impulse[came].mean() == pytest.approx(3, abs=0.05)
+
+
+def test_push_moves_the_ball_and_is_not_charged(physics, make_env, params):
+    """A push J in one control step changes ẋ by about c·J, the paper's c of its linearization."""
+    env = make_env(physics=physics, randomization=Randomization(push_impulse=(0.5, 0.5), push_interval=0.02))
+    env.reset(seed=0, options={"state": np.zeros(8)})
+    _, reward, *_, info = env.step([0, 0])
+    speed = np.hypot(*info["state"][4:6])
+    assert speed == pytest.approx(0.295172 * 0.5, rel=0.01)
+    assert reward == 0
+    assert info["force"].tolist() == [0, 0]
+
+
+# --- the same in batches ---
+
+
+def batch(count, randomization, **kwargs):
+    return BallbotBatch("stabilize", count, dtype=torch.float64, compile=False, randomization=randomization, **kwargs)
+
+
+def test_randomized_batch_moves_as_single_robots_with_its_parameters(make_env, rng):
+    vec = batch(6, ROBOTS)
+    vec.reset(seed=0)
+    singles = [make_env(physics="rk4", params=vec.robot(i)) for i in range(6)]
+    assert len({env.params for env in singles}) == 6
+    for i, env in enumerate(singles):
+        env.reset(options={"state": vec.state.x[:, i].numpy()})
+    for actions in rng.uniform(-0.1, 0.1, (8, 6, 2)):
+        result = vec.step(torch.from_numpy(actions))
+        for i, env in enumerate(singles):
+            _, reward, *_, info = env.step(actions[i])
+            np.testing.assert_allclose(result.final_x[:, i], info["state"], rtol=1e-11, atol=1e-12)
+            assert result.reward[i].item() == pytest.approx(reward, rel=1e-11)
+
+
+def test_batched_actuators_are_those_of_single_envs(make_env, rng):
+    slow = Randomization(actuator_lag=(0.03, 0.03), actuator_delay=(0.04, 0.04))
+    vec, env = batch(1, slow, duration=0.3), make_env(physics="rk4", randomization=slow, duration=0.3)
+    vec.reset(seed=0)
+    env.reset(options={"state": vec.state.x[:, 0].numpy()})
+    for action in rng.uniform(-0.3, 0.3, (40, 2)):
+        result = vec.step(torch.from_numpy(action[None]))
+        _, reward, terminated, truncated, info = env.step(action)
+        np.testing.assert_allclose(result.force[:, 0], info["force"], rtol=1e-9, atol=1e-9)
+        assert result.reward[0].item() == pytest.approx(reward, rel=1e-9)
+        if terminated or truncated:
+            env.reset(options={"state": vec.state.x[:, 0].numpy()})
+
+
+def test_randomized_episodes_depend_neither_on_batch_size_nor_on_position():
+    actions = torch.rand(40, 11, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    whole, part = batch(11, EVERYTHING, duration=0.4), batch(3, EVERYTHING, duration=0.4)
+    assert torch.equal(whole.reset(seed=0)[5:8], part.reset(seed=5))
+    for a in actions:
+        expected, got = whole.step(a), part.step(a[5:8])
+        assert torch.equal(expected.observation[5:8], got.observation)
+        assert torch.equal(expected.reward[5:8], got.reward)
+
+
+def test_batch_draws_a_new_robot_for_each_episode():
+    vec = batch(4, EVERYTHING, duration=0.02)
+    vec.reset(seed=0)
+    before = vec.state.drawn.clone()
+    vec.step(torch.zeros(4, 2))
+    assert (vec.state.drawn[:4] != before[:4]).all()
+
+
+def test_batched_sensors_and_pushes_have_the_statistics_asked_for():
+    n = 20_000
+    noise = Randomization(velocity_noise=0.1, push_impulse=(0.5, 0.5), push_interval=0.08)
+    vec = batch(n, noise)
+    observation = vec.reset(seed=0, x=torch.zeros(8, n, dtype=torch.float64))
+    assert observation[:, 4:6].std() * 5 == pytest.approx(0.1, rel=0.03)
+    assert (observation[:, :4] == 0).all()
+    assert torch.equal(vec.observe(vec.state), observation)  # looking twice shows the same
+    result = vec.step(torch.zeros(n, 2))
+    speed = torch.hypot(*result.final_x[4:6])
+    assert (speed > 0).double().mean() == pytest.approx(0.25, abs=5 * math.sqrt(0.19 / n))
+    assert speed[speed > 0].mean() == pytest.approx(0.295172 * 0.5, rel=0.01)
+    assert (result.reward == 0).all()
+
+
+def test_gradients_flow_through_randomized_robots_and_actuators():
+    vec = batch(3, EVERYTHING)
+    vec.reset(seed=0)
+    actions = torch.zeros(6, 3, 2, dtype=torch.float64, requires_grad=True)
+    cost = -sum(vec.step(a).reward.sum() for a in actions)
+    (gradient,) = torch.autograd.grad(cost, actions)
+    assert torch.isfinite(gradient).all()
+    assert (gradient[0] != 0).all()
+
+
+def test_vector_env_tells_the_robots_of_its_running_episodes(params):
+    vec = BallbotVectorEnv(3, randomization=ROBOTS)
+    vec.reset(seed=0)
+    assert len(set(vec.get_attr("episode_params"))) == 3
+    vec.close()

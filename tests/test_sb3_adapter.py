@@ -1,0 +1,100 @@
+import gymnasium
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor
+
+from ballbot_gym import dynamics
+from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_train.sb3 import BallbotVecEnv
+
+
+def make(num_envs=4, **kwargs):
+    return BallbotVecEnv(BallbotVectorEnv(num_envs, **kwargs))
+
+
+def test_what_make_vec_returns_can_be_wrapped():
+    env = BallbotVecEnv(gymnasium.make_vec("BallbotTurn-v0", num_envs=2))
+    assert env.reset().shape == (2, 9)
+    assert env.observation_space == gymnasium.make("BallbotTurn-v0", physics="rk4").observation_space
+    env.close()
+
+
+def test_only_a_ballbot_vector_env_is_taken():
+    with pytest.raises(TypeError, match="SyncVectorEnv"):
+        BallbotVecEnv(gymnasium.make_vec("BallbotTurn-v0", num_envs=1, vectorization_mode="sync", physics="rk4"))
+
+
+def test_terminal_observation_is_the_last_of_the_old_episode_and_the_returned_one_the_first_of_the_next():
+    env, same = make(duration=0.1), BallbotVectorEnv(4, duration=0.1)
+    env.seed(3)
+    first = env.reset()
+    np.testing.assert_array_equal(first, same.reset(seed=3)[0])
+    for _ in range(5):
+        observation, _, done, infos = env.step(np.zeros((4, 2)))
+        x = same.batch.state.x
+        expected, *_ = same.step(np.zeros((4, 2)))
+    assert done.all()
+    np.testing.assert_array_equal(observation, expected)
+    end = dynamics.step(same.params, x.unbind(0), (0 * x[0], 0 * x[0]), 0.02, 2)
+    terminal = np.stack([info["terminal_observation"] for info in infos])
+    np.testing.assert_array_equal(terminal, np.stack(same.task.observe(end, ()), axis=-1))
+    assert np.abs(observation - terminal).max() > 0.1
+
+
+def test_running_out_of_time_is_truncation_and_falling_is_not():
+    env = make(2, duration=0.2)
+    env.set_options([{"state": np.zeros(8)}, {"state": np.array([0, 0, 1.39, 0, 0, 0, 2.0, 0])}])
+    env.reset()
+    ends = {}
+    for _ in range(10):
+        _, reward, done, infos = env.step(np.zeros((2, 2)))
+        assert reward.dtype == np.float32
+        for i in np.flatnonzero(done):
+            ends.setdefault(int(i), (infos[i]["TimeLimit.truncated"], infos[i]["is_success"], infos[i]["failure"]))
+        assert all(info == {} for info, ended in zip(infos, done, strict=True) if not ended)
+    assert ends == {0: (True, True, False), 1: (False, False, True)}
+
+
+def test_seeds_and_options_are_used_once():
+    env = make()
+    env.seed(7)
+    first, second = env.reset(), env.reset()
+    assert not np.array_equal(first, second)
+    env.seed(7)
+    np.testing.assert_array_equal(env.reset(), first)
+    env.set_options({"state": np.zeros(8)})
+    np.testing.assert_array_equal(env.reset(), np.zeros((4, 8)))
+    assert np.abs(env.reset()).max() > 0
+
+
+def test_options_must_be_alike_for_every_env():
+    env = make(2)
+    env.set_options([{"state": np.zeros(8)}, {}])
+    with pytest.raises(ValueError, match="same keys"):
+        env.reset()
+
+
+def test_attributes_are_given_per_env():
+    env = make(3)
+    assert env.get_attr("task", [0, 2]) == [env.env.task] * 2
+    assert env.get_attr("render_mode") == [None] * 3
+    assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
+    with pytest.raises(AttributeError, match="cannot be set"):
+        env.set_attr("task", None)
+
+
+def test_ppo_learns_on_it_and_logs_episodes():
+    env = VecMonitor(make(16, duration=0.4))
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=256, n_epochs=2, seed=0, device="cpu")
+    before = [p.detach().clone() for p in model.policy.parameters()]
+    model.learn(3000)
+    assert model.num_timesteps >= 3000
+    assert len(model.ep_info_buffer) > 20
+    assert {"r", "l"} <= set(model.ep_info_buffer[0])
+    assert len(model.ep_success_buffer) > 20
+    assert any((a != b).any() for a, b in zip(before, model.policy.parameters(), strict=True))

@@ -1,0 +1,531 @@
+import logging
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+pytest.importorskip("torch")
+
+import torch
+
+from ballbot_gym import BallbotEnv, BallbotParams, dynamics, vector
+from ballbot_gym.simulator import BulletSimulator
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.vector import BallbotBatch, BallbotVectorEnv
+
+INFO = ("state", "cost", "tilt", "success", "failure", "force", "clipped", "constants")
+
+
+@pytest.fixture
+def make_vec():
+    """Makes vector envs that are closed after the test; float64 and eager unless said otherwise."""
+    envs = []
+
+    def make(num_envs, task="stabilize", dtype=torch.float64, compile=False, **kwargs):
+        envs.append(BallbotVectorEnv(num_envs, task, dtype=dtype, compile=compile, **kwargs))
+        return envs[-1]
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+def column(infos, i):
+    """The info of env i, with everything it holds marked by its mask."""
+    assert all(infos[f"_{key}"][i] for key in INFO)
+    return {key: infos[key][i] for key in INFO}
+
+
+def assert_same_info(got, expected, tolerance):
+    for key in INFO:
+        np.testing.assert_allclose(got[key], expected[key], rtol=tolerance, atol=tolerance, err_msg=key)
+
+
+# --- the same environment as BallbotEnv(physics="rk4") ---
+
+
+@pytest.mark.parametrize("scale", [0.05, 1.2], ids=["gentle", "violent"])
+def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task, scale, make_vec, make_env, rng):
+    """Actuated in the same way, in float64 they differ by the last digits of sine and cosine, which an unstable robot
+    multiplies by up to e^(7.8 · 0.5) here.
+    """
+    duration = 0.5
+    vec = make_vec(4, task.id.removeprefix("Ballbot").removesuffix("-v0").lower(), duration=duration)
+    singles = [make_env(type(task)(duration=duration), physics="rk4") for _ in range(4)]
+    observations, infos = vec.reset(seed=1)
+    ends = 0
+    for i, env in enumerate(singles):
+        observation, info = env.reset(options={"state": infos["state"][i], "constants": infos["constants"][i]})
+        np.testing.assert_array_equal(observations[i], observation)
+        assert_same_info(column(infos, i), info, 1e-12)
+    for _ in range(60):
+        actions = rng.uniform(-scale, scale, (4, 2))
+        observations, rewards, terminations, truncations, infos = vec.step(actions)
+        for i, env in enumerate(singles):
+            observation, reward, terminated, truncated, info = env.step(actions[i])
+            assert (terminations[i], truncations[i]) == (terminated, truncated)
+            assert rewards[i] == pytest.approx(reward, rel=1e-11)
+            if terminated or truncated:
+                ends += 1
+                np.testing.assert_allclose(infos["final_obs"][i], observation, rtol=1e-6, atol=1e-6)
+                assert_same_info(column(infos["final_info"], i), info, 1e-11)
+                start = {"state": infos["state"][i], "constants": infos["constants"][i]}
+                observation, info = env.reset(options=start)
+            np.testing.assert_allclose(observations[i], observation, rtol=1e-6, atol=1e-6)  # float32, as the spaces are
+            assert_same_info(column(infos, i), info, 1e-11)
+    assert ends >= 8
+
+
+def test_one_step_in_float32_is_within_its_rounding(task, make_env, rng):
+    """From equal states, 2 · 4 evaluations of the accelerations leave some 1e-6 of relative error."""
+    name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
+    batch = BallbotBatch(name, 64, compile=False)
+    batch.reset(seed=2)
+    env = make_env(name, physics="rk4")
+    for _ in range(3):
+        x, c = batch.state.x.T.double().numpy(), batch.state.c.T.double().numpy()
+        actions = rng.uniform(-1, 1, (64, 2)).astype(np.float32)
+        result = batch.step(torch.from_numpy(actions))
+        for i in range(64):
+            env.reset(options={"state": x[i], "constants": c[i]})
+            observation, reward, terminated, _, info = env.step(actions[i])
+            np.testing.assert_allclose(result.final_x[:, i], info["state"], rtol=5e-6, atol=5e-6)
+            np.testing.assert_allclose(result.final_observation[i], observation, rtol=5e-6, atol=5e-6)
+            assert result.reward[i].item() == pytest.approx(reward, rel=5e-6)
+            assert result.terminated[i] == terminated
+
+
+def test_reaching_turns_goal_ends_the_episode_as_a_success_without_further_cost(make_vec):
+    vec = make_vec(2, "turn")
+    gate = np.array([0.98, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    vec.reset(seed=0, options={"state": gate, "constants": {"speed": [3.0, 5.0]}})
+    _, rewards, terminations, truncations, infos = vec.step(np.zeros((2, 2)))
+    assert terminations.tolist() == [True, False]
+    assert not truncations.any()
+    assert infos["final_info"]["success"].tolist() == [True, False]
+    assert not infos["final_info"]["failure"].any()
+    assert -rewards[0] == pytest.approx(vec.task.cost(tuple(gate), (0.0, 0.0), (3.0,)) * 0.02)
+
+
+def test_resting_at_the_origin_to_the_end_is_a_success(make_vec):
+    vec = make_vec(2, duration=0.1)
+    vec.reset(seed=0, options={"state": np.stack([np.zeros(8), np.full(8, 0.3)])})
+    for _ in range(5):
+        *_, truncations, infos = vec.step(np.zeros((2, 2)))
+    assert truncations.all()
+    assert infos["final_info"]["success"].tolist() == [True, False]
+
+
+def test_state_that_is_not_finite_fails_and_its_neighbours_go_on():
+    batch = BallbotBatch("stabilize", 3, compile=False)
+    batch.reset(seed=0)
+    batch.state.x[2, 1] = math.nan
+    result = batch.step(torch.zeros(3, 2))
+    assert result.failure.tolist() == [False, True, False]
+    assert torch.isfinite(batch.state.x).all()
+
+
+def test_batch_agrees_with_pybullet_to_its_integrators_error(params):
+    """Bullet is of first order, so its distance from the RK4 model falls to a quarter with a quarter of its step."""
+    x0, action = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0), (60 / 350, -40 / 350)
+    batch = BallbotBatch("stabilize", 1, dtype=torch.float64, compile=False)
+    batch.reset(x=torch.tensor(x0, dtype=torch.float64)[:, None])
+    for _ in range(15):
+        batch.step(torch.tensor([action], dtype=torch.float64))
+    errors = []
+    for physics_dt in (1e-3, 0.25e-3):
+        bullet = BulletSimulator(params, 0.02, physics_dt)
+        bullet.reset(x0)
+        for _ in range(15):
+            x = bullet.step((60.0, -40.0))
+        bullet.close()
+        errors.append(np.abs(np.array(x) - batch.state.x[:, 0].numpy()).max())
+    assert errors[0] == pytest.approx(2.0e-2, rel=0.1)  # DESIGN: measured against the exact solution
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+
+
+# --- Gymnasium's rules ---
+
+
+def test_make_vec_gives_the_batched_env_with_the_spaces_of_the_single_one(task):
+    vec = gymnasium.make_vec(task.id, num_envs=3)
+    single = gymnasium.make(task.id, physics="rk4")
+    assert isinstance(vec, BallbotVectorEnv)
+    assert vec.spec.id == task.id
+    assert vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert vec.single_observation_space == single.observation_space
+    assert vec.single_action_space == single.action_space
+    observations, _ = vec.reset(seed=0)
+    assert observations in vec.observation_space
+    observations, rewards, terminations, truncations, _ = vec.step(vec.action_space.sample())
+    assert observations in vec.observation_space
+    assert [a.dtype for a in (rewards, terminations, truncations)] == [np.float64, np.bool_, np.bool_]
+    assert {a.shape for a in (rewards, terminations, truncations)} == {(3,)}
+    vec.close()
+    single.close()
+
+
+def test_infos_have_the_form_of_gymnasiums_own_vector_env(task, make_vec):
+    def form(infos):
+        if isinstance(infos, dict):
+            return {key: form(value) for key, value in infos.items()}
+        return infos.shape, infos.dtype
+
+    sync = gymnasium.make_vec(
+        task.id,
+        num_envs=3,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+        physics="rk4",
+        duration=0.2,
+    )
+    vec = gymnasium.make_vec(task.id, num_envs=3, dtype=torch.float64, duration=0.2)
+    _, expected = sync.reset(seed=0)
+    _, infos = vec.reset(seed=0)
+    assert form(infos) == form(expected)
+    options = {"state": expected["state"][0], "constants": expected["constants"][0]}
+    _, expected = sync.reset(options=dict(options))
+    _, infos = vec.reset(options=options)
+    np.testing.assert_array_equal(infos["state"], expected["state"])
+    for k in range(10):
+        *ours, infos = vec.step(np.zeros((3, 2)))
+        *theirs, expected = sync.step(np.zeros((3, 2)))
+        assert form(infos) == form(expected)
+        for a, b in zip(ours[k == 9 :], theirs[k == 9 :], strict=True):  # the next episodes are drawn apart
+            assert a.dtype == b.dtype
+            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(np.stack(infos["final_obs"]), np.stack(expected["final_obs"]), rtol=1e-6, atol=1e-6)
+    for key in INFO:
+        np.testing.assert_array_equal(infos["final_info"][f"_{key}"], [True] * 3)
+    sync.close()
+    vec.close()
+
+
+def test_only_ended_envs_have_final_observations(make_vec):
+    vec = make_vec(2)
+    _, infos = vec.reset(seed=0, options={"state": np.array([np.zeros(8), [0, 0, 1.39, 0, 0, 0, 2, 0]])})
+    *_, infos = vec.step(np.zeros((2, 2)))
+    assert infos["final_obs"][0] is None
+    assert infos["final_obs"][1].shape == (8,)
+    for key in ("_final_obs", "_final_info"):
+        assert infos[key].tolist() == [False, True]
+    assert infos["final_info"]["_state"].tolist() == [False, True]
+    assert infos["cost"][1] == 0
+    *_, infos = vec.step(np.zeros((2, 2)))
+    assert "final_obs" not in infos
+
+
+def test_only_masked_envs_are_reset(make_vec):
+    vec = make_vec(3)
+    vec.reset(seed=0)
+    before, *_ = vec.step(np.zeros((3, 2)))
+    mask = np.array([False, True, False])
+    after, infos = vec.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal((before == after).all(1), ~mask)
+    np.testing.assert_array_equal(infos["_state"], mask)
+    assert vec.batch.state.steps.tolist() == [1, 0, 1]
+    again, _ = vec.reset(seed=[None, 1, None], options={"reset_mask": mask})
+    np.testing.assert_array_equal(again[1], vec.reset(seed=0)[0][1])
+
+
+@pytest.mark.parametrize(
+    ("mask", "error", "message"),
+    [
+        ([True, False], TypeError, "NumPy array of bool"),
+        (np.array([1, 0]), TypeError, "NumPy array of bool"),
+        (np.array([True]), ValueError, "shape"),
+        (np.array([False, False]), ValueError, "True somewhere"),
+    ],
+)
+def test_bad_reset_mask_is_refused(mask, error, message, make_vec):
+    with pytest.raises(error, match=message):
+        make_vec(2).reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "message"),
+    [
+        ("stabilize", {"stat": 1}, "unknown reset options"),
+        ("stabilize", {"state": np.zeros(7)}, "state must be finite"),
+        ("stabilize", {"state": np.full((2, 8), np.nan)}, "state must be finite"),
+        ("stabilize", {"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a margin"),
+        ("orbit", {"constants": {"tempo": 1.0}}, "no constants"),
+        ("orbit", {"constants": [[0.5, 1.0], [2.0, 1.0]]}, "radius must exceed"),
+    ],
+)
+def test_bad_start_is_refused_and_changes_nothing(task, options, message, make_vec):
+    vec = make_vec(2, task)
+    vec.reset(seed=0)
+    before = vec.batch.state
+    with pytest.raises(ValueError, match=message):
+        vec.reset(seed=5, options=options)
+    assert vec.batch.state is before
+
+
+def test_bad_arguments_are_refused():
+    for kwargs, error, message in (
+        ({"num_envs": 0}, ValueError, "num_envs"),
+        ({"num_envs": 2, "dtype": torch.float16}, ValueError, "dtype"),
+        ({"num_envs": 2, "compile": "yes"}, ValueError, "compile"),
+        ({"num_envs": 2, "render_mode": "human"}, ValueError, "render_mode"),
+        ({"num_envs": 2, "task": "juggle"}, ValueError, "unknown task"),
+        ({"num_envs": 2, "physics": "bullet"}, TypeError, "physics"),
+    ):
+        with pytest.raises(error, match=message):
+            BallbotVectorEnv(**kwargs)
+
+
+def test_steps_before_reset_and_after_close_and_bad_actions_are_refused(make_vec):
+    vec = make_vec(2)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        vec.step(np.zeros((2, 2)))
+    vec.reset()
+    with pytest.raises(ValueError, match="shape"):
+        vec.step(np.zeros(2))
+    with pytest.raises(ValueError, match=r"envs \[1\]"):
+        vec.step(np.array([[0, 0], [0, np.nan]]))
+    for seed in ([1], [-1, 2]):
+        with pytest.raises(ValueError, match="seed"):
+            vec.reset(seed=seed)
+    vec.close()
+    for use in (vec.reset, lambda: vec.step(np.zeros((2, 2)))):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+            use()
+
+
+def test_what_a_step_returned_is_never_written_to_again(make_vec, rng):
+    vec = make_vec(8, dtype=torch.float32, duration=0.1)
+    returned = [vec.reset(seed=0)[0]]
+    copies = [returned[0].copy()]
+    for _ in range(12):
+        observations, rewards, *_, infos = vec.step(rng.uniform(-1, 1, (8, 2)))
+        returned += [observations, rewards, infos["state"]]
+        copies += [a.copy() for a in returned[-3:]]
+    for a, b in zip(returned, copies, strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(ValueError, match="read-only"):
+        infos["state"][0] = 0
+
+
+def test_gymnasiums_episode_statistics_are_minus_the_cost(make_vec, rng):
+    vec = RecordEpisodeStatistics(make_vec(4, duration=0.3))
+    vec.reset(seed=0)
+    total, seen = np.zeros(4), 0
+    for _ in range(40):
+        _, rewards, terminations, truncations, infos = vec.step(rng.uniform(-1, 1, (4, 2)))
+        total -= rewards
+        for i in np.flatnonzero(terminations | truncations):
+            assert infos["episode"]["r"][i] == pytest.approx(-total[i])
+            total[i], seen = 0, seen + 1
+    assert seen > 6
+
+
+def test_attributes_are_given_per_env(make_vec):
+    vec = make_vec(3)
+    vec.reset(seed=5)
+    assert vec.np_random_seed == vec.get_attr("np_random_seed") == (5, 6, 7)
+    assert vec.call("task") == (vec.task,) * 3
+    assert all(isinstance(params, BallbotParams) for params in vec.get_attr("episode_params"))
+    with pytest.raises(AttributeError):
+        vec.set_attr("task", None)
+
+
+def test_every_env_is_drawn(make_vec):
+    vec = make_vec(2, "weave", render_mode="rgb_array")
+    vec.reset(seed=0)
+    images = vec.render()
+    assert len(images) == 2
+    assert images[0].shape[2] == 3
+    assert (images[0] != images[1]).any()
+
+
+# --- reproducibility ---
+
+
+def play(batch, actions, first=0):
+    """Everything that steps return, for actions (n, B, 2)."""
+    batch.reset(seed=first)
+    results = [batch.step(a) for a in actions]
+    return [torch.stack([getattr(r, name) for r in results]) for name in ("observation", "reward", "terminated")]
+
+
+def test_results_depend_neither_on_batch_size_nor_on_position(task):
+    name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
+    generator = torch.Generator().manual_seed(0)
+    actions = torch.rand(40, 37, 2, generator=generator) * 2 - 1
+    whole = play(BallbotBatch(name, 37, compile=False, duration=0.5), actions)
+    for first, count in ((0, 1), (3, 16), (19, 18), (36, 1)):
+        part = play(BallbotBatch(name, count, compile=False, duration=0.5), actions[:, first : first + count], first)
+        for a, b in zip(part, whole, strict=True):
+            assert torch.equal(a, b[:, first : first + count])
+
+
+def test_seed_repeats_everything_and_without_one_the_next_episodes_come():
+    batch = BallbotBatch("weave", 5, compile=False)
+    first = batch.reset(seed=3)
+    second = batch.reset()
+    assert (first != second).any(dim=1).all()
+    assert torch.equal(batch.reset(seed=[3, 4, 5, 6, 7]), first)
+    assert torch.equal(batch.reset(), second)
+    other = BallbotBatch("weave", 5, compile=False)
+    assert (other.reset() != BallbotBatch("weave", 5, compile=False).reset()).any()
+
+
+def test_float32_and_float64_start_alike(task):
+    name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
+    single, double = (BallbotBatch(name, 9, dtype=dtype, compile=False) for dtype in (torch.float32, torch.float64))
+    np.testing.assert_allclose(single.reset(seed=1), double.reset(seed=1), rtol=1e-5, atol=1e-6)
+
+
+def test_hashed_numbers_are_uniform_and_uncorrelated():
+    n = 20_000
+    seed = torch.arange(n)
+    z = torch.stack(vector._uniforms(vector._key(seed, 0 * seed, 0 * seed), 8, torch.float64))
+    later = torch.stack(vector._uniforms(vector._key(seed, 0 * seed + 1, 0 * seed), 8, torch.float64))
+    assert z.min() >= 0
+    assert z.max() < 1
+    counts = torch.stack([torch.histc(row, 100, 0, 1) for row in z])
+    chi2 = ((counts - n / 100) ** 2 / (n / 100)).sum(1)
+    assert ((chi2 > 99 - 5 * 14.1) & (chi2 < 99 + 5 * 14.1)).all()  # 99 ± five standard deviations
+    both = torch.corrcoef(torch.cat([z, later, z[:, torch.roll(seed, 1)]]))
+    assert (both - torch.eye(24)).abs().max() < 5 / math.sqrt(n)
+    assert len(vector._mix(torch.arange(2**16)).unique()) == 2**16
+
+
+# --- gradients ---
+
+
+def rollout_cost(batch, x0, gain, forces):
+    """(B,) cost from x0 (8,) under u = −Kx + forces (n, B, 2) N."""
+    limit = batch.params.force_limit
+    batch.reset(x=x0[:, None].expand(8, batch.num_envs))
+    cost = torch.zeros(batch.num_envs, dtype=torch.float64)
+    for added in forces:
+        action = (added - batch.state.x.T @ gain.T) / limit
+        assert action.abs().max() < 1  # a clipped force would have no gradient
+        result = batch.step(action)
+        cost = cost - result.reward
+    return cost
+
+
+def casadi_gradient(task, params, x0, gain, forces):
+    """d cost / d forces (n, 2) of the same rollout, by CasADi's reverse mode."""
+    casadi = pytest.importorskip("casadi")
+    x, w = casadi.SX.sym("x", 8), casadi.SX.sym("w", 2)
+    u = w - casadi.DM(gain.numpy()) @ x
+    step = casadi.Function(
+        "step",
+        [x, w],
+        [dynamics.step(params, x, u, task.control_dt), task.cost(x, u, casadi.SX(0, 1)) * task.control_dt],
+    )
+    w_all = casadi.MX.sym("w", 2, len(forces))
+    _, costs = step.mapaccum(len(forces))(casadi.DM(x0.numpy()), w_all)
+    gradient = casadi.Function("gradient", [w_all], [casadi.gradient(casadi.sum2(costs), w_all)])
+    return np.array(gradient(forces.numpy().T)).T
+
+
+@pytest.mark.parametrize(("steps", "feedback"), [(400, True), (25, False)], ids=["8 s under LQR", "0.5 s open loop"])
+def test_gradient_of_the_cost_agrees_with_finite_differences_and_casadi(steps, feedback, params):
+    lqr = pytest.importorskip("ballbot_baselines.lqr")
+    batch = BallbotBatch("stabilize", 1, dtype=torch.float64, compile=False)
+    gain = lqr.discrete_lqr(batch.task, params, np.zeros(8), np.zeros(2), np.zeros(0))[0] * feedback
+    gain = torch.from_numpy(gain)
+    x0 = torch.tensor([-1.0, 0.5, 0.1, -0.1, 0.2, 0.5, 0.0, 0.1], dtype=torch.float64)
+    forces = torch.from_numpy(np.random.default_rng(0).normal(0, 2, (steps, 2)))
+
+    leaf = forces.clone().requires_grad_()
+    cost = rollout_cost(batch, x0, gain, leaf[:, None])
+    (gradient,) = torch.autograd.grad(cost.sum(), leaf)
+
+    # central differences in all 2n forces at once, each pair of perturbed rollouts in one batch
+    count, eps = 2 * steps, 1e-3
+    nudges = eps * torch.eye(count, dtype=torch.float64).reshape(count, steps, 2).transpose(0, 1)
+    wide = BallbotBatch("stabilize", 2 * count, dtype=torch.float64, compile=False)
+    with torch.no_grad():
+        costs = rollout_cost(wide, x0, gain, forces[:, None] + torch.cat([nudges, -nudges], dim=1))
+    differences = ((costs[:count] - costs[count:]) / (2 * eps)).reshape(steps, 2)
+
+    scale = gradient.abs().max()
+    assert (gradient - differences).abs().max() < 1e-4 * scale
+    assert (gradient - differences).norm() < 1e-4 * differences.norm()
+    exact = casadi_gradient(batch.task, params, x0, gain, forces)
+    np.testing.assert_allclose(gradient, exact, rtol=1e-8, atol=1e-9 * scale.item())
+
+
+def test_gradient_ends_with_the_episode():
+    batch = BallbotBatch("stabilize", 2, dtype=torch.float64, compile=False, duration=0.04)
+    batch.reset(seed=0)
+    action = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
+    batch.step(action)
+    within = batch.step(torch.zeros(2, 2)).reward.sum()
+    beyond = batch.step(torch.zeros(2, 2)).reward.sum()
+    assert torch.autograd.grad(within, action, retain_graph=True)[0].abs().min() > 0
+    assert (torch.autograd.grad(beyond, action, allow_unused=True)[0] == 0).all()
+
+
+def test_detach_cuts_the_gradient():
+    batch = BallbotBatch("stabilize", 2, compile=False)
+    batch.reset(seed=0)
+    batch.step(torch.zeros(2, 2, requires_grad=True))
+    assert batch.state.x.requires_grad
+    batch.detach()
+    assert not batch.state.x.requires_grad
+
+
+# --- compiled ---
+
+
+@pytest.mark.skipif(not vector._has_compiler(torch.device("cpu")), reason="no C++ compiler")
+def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wherever_an_env_stands():
+    """37 envs fill vector registers and leave a remainder, and turning the order round moves each to another place."""
+    actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    with torch.no_grad():
+        compiled = BallbotBatch("stabilize", 37, compile=True, duration=0.2)
+        results = play(compiled, actions, range(37))
+        assert compiled.compiled
+        turned = play(compiled, actions.flip(1), range(36, -1, -1))
+        eager = play(BallbotBatch("stabilize", 37, compile=False, duration=0.2), actions)
+    for a, b in zip(turned, results, strict=True):
+        assert torch.equal(a.flip(1), b)
+    for a, b in zip(results, eager, strict=True):
+        # 10 steps to an end, over which rounding grows by e^(7.8 · 0.2)
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monkeypatch, caplog):
+    def broken(*args, **kwargs):
+        def run(*args):
+            raise RuntimeError("no such compiler")
+
+        return run
+
+    monkeypatch.setattr(torch, "compile", broken)
+    monkeypatch.setattr(vector, "COMPILE_FROM", 4)
+    monkeypatch.setattr(vector, "_has_compiler", lambda device: True)
+    with caplog.at_level(logging.WARNING):
+        batch = BallbotBatch("stabilize", 4)
+        batch.reset(seed=0)
+        batch.step(torch.zeros(4, 2))
+        batch.step(torch.zeros(4, 2))
+    assert [record.name for record in caplog.records] == ["ballbot_gym.vector"]
+    assert "no such compiler" in caplog.text
+    assert not batch.compiled
+    must = BallbotBatch("stabilize", 4, compile=True)
+    must.reset(seed=0)
+    with pytest.raises(RuntimeError, match="no such compiler"):
+        must.step(torch.zeros(4, 2))
+
+
+def test_small_batches_are_not_compiled_by_themselves():
+    assert not BallbotBatch("stabilize", 16).compiled
+
+
+def test_single_env_and_batch_are_of_one_task_object(make_vec):
+    task = TASKS["turn"](duration=1.0)
+    vec = make_vec(1, task)
+    env = BallbotEnv(task, physics="rk4")
+    assert vec.task is env.task
+    env.close()
