@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.controller import Controller, rollout
 from ballbot_baselines.optimum import PlanError
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv
+from ballbot_train.controllers import make_controller
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class Row:
 
 
 def evaluate_episodes(task: str, controller: str, physics: str, episodes: Iterable[int]) -> list[Result]:
-    """Runs certified episodes, by index, under a registered controller."""
+    """Runs certified episodes, by index, under a controller by name; see `make_controller`."""
     env = BallbotEnv(task, physics=physics)
-    results = run_episodes(env, CONTROLLERS[controller](env.task, env.params), controller, task, episodes)
+    results = run_episodes(env, make_controller(controller, env.task, env.params), controller, task, episodes)
     env.close()
     return results
 

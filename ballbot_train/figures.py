@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ballbot_gym import files
+from ballbot_gym.simulator import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluate import Result
 
@@ -42,6 +43,11 @@ class Circle:
     radius: float
     filled: bool = True
     color: tuple[float, ...] | str = "0.75"
+
+
+def marker_circles(markers: Sequence[Marker]) -> list[Circle]:
+    """What a task draws besides the robot, seen from above."""
+    return [Circle(*marker.position, marker.radius, not marker.ring, marker.color[:3]) for marker in markers]
 
 
 def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Circle] = ()) -> Figure:
