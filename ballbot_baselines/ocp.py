@@ -16,11 +16,15 @@ from dataclasses import dataclass
 
 import casadi
 import numpy as np
+import scipy.linalg
+import scipy.sparse
 
 from ballbot_baselines.compiled import compiled
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
+
+_DAMPING = 1e-8  # of the Newton step toward consistency, where constraints repeat each other or have nothing to move
 
 
 @dataclass(frozen=True)
@@ -87,9 +91,14 @@ class OcpSolution:
 
 
 class _Stage:
-    """A vector function of z and p with its Jacobian's and its Lagrangian Hessian's nonzeros, compiled."""
+    """A vector function of z and p with its Jacobian's and its Lagrangian Hessian's nonzeros, compiled.
+
+    Where it does not depend on p it takes none of it: so problems whose parameters differ share their compiled dynamics.
+    """
 
     def __init__(self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, compile: bool):
+        p = p if casadi.depends_on(out, p) else casadi.SX.sym("p", 0)
+        self.params = p.shape[0]
         multipliers = casadi.SX.sym("l", out.shape[0])
         jacobian = casadi.jacobian(out, z)
         hessian, gradient = casadi.hessian(casadi.dot(multipliers, out), z)
@@ -174,7 +183,7 @@ class OcpSolver:
                 "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations},
             }
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
-        self._g = functions["cache"]["nlp_g"]
+        self._g, self._jac_g = functions["cache"]["nlp_g"], functions["cache"]["nlp_jac_g"]
 
     def solve(self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | tuple = ()) -> OcpSolution:
         """Solves from a guess.
@@ -208,20 +217,51 @@ class OcpSolver:
             np.max(np.maximum(self._g_lower - g, g - self._g_upper), initial=0.0),
             np.max(np.maximum(lower - z, z - upper), initial=0.0),
         )
-        ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
-        stages = z[: self.intervals * width].reshape(self.intervals, width)
+        states, inputs = self._divide(z)
         return OcpSolution(
             success=bool(stats["success"]) and np.isfinite(z).all(),
             status=_status(self.solver, stats),
             cost=float(result["f"]),
-            states=np.vstack([stages[:, :ns], z[self.intervals * width :]]),
-            inputs=stages[:, ns:].copy(),
+            states=states,
+            inputs=inputs,
             violation=float(violation),
             iterations=int(stats["iter_count"]),
             seconds=seconds,
             solver=self.solver,
             costates=self._costates(np.array(result["lam_g"]).ravel()),
         )
+
+    def toward_consistency(
+        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | tuple = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A guess moved by the shortest Newton step toward all equality constraints, the dynamics first of all.
+
+        For guesses that are consistent with nothing, as a straight line between two states: the step bends them into about
+        the nearest motion. Guesses that obey the constraints stay where they are. The step takes about as long as one or two
+        iterations.
+
+        Args:
+            states, inputs, p: as `solve` takes them.
+            bounds: variables whose bounds are equal do not move from them; the others end within theirs.
+
+        Returns:
+            states (N+1, ns) and inputs (N, nw).
+        """
+        lower = _interleave(bounds.state_lower, bounds.input_lower)
+        upper = _interleave(bounds.state_upper, bounds.input_upper)
+        z = np.clip(_interleave(states, inputs), lower, upper)
+        g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
+        matrix, equal = jacobian.sparse(), self._g_upper == 0
+        matrix.data *= np.repeat(lower < upper, np.diff(matrix.indptr))
+        step = _least_norm(matrix.tocsr()[equal], -np.array(g).ravel()[equal])
+        if np.isfinite(step).all():
+            z = np.clip(z + step, lower, upper)
+        return self._divide(z)
+
+    def _divide(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
+        stages = z[: self.intervals * width].reshape(self.intervals, width)
+        return np.vstack([stages[:, :ns], z[self.intervals * width :]]), stages[:, ns:].copy()
 
     def _costates(self, multipliers: np.ndarray) -> np.ndarray:
         # Constraints are s_{k+1} − next_k = 0: raising their right-hand side moves s_{k+1}, and costs minus the multiplier.
@@ -247,15 +287,17 @@ def _nlp_functions(ocp: Ocp, n: int, dynamics: _Stage, running: _Stage, final: _
     next_states = casadi.horzcat(stages[:ns, 1:], last)
     p_all = casadi.repmat(p, 1, n)
 
-    value_c, value_f = running.value.map(n)(stages, p_all), final.value(last, p)
+    value_c = running.value.map(n)(stages, p_all[: running.params, :])
+    value_f = final.value(last, p[: final.params])
     f = casadi.sum2(value_c[0, :]) + value_f[0]
-    gaps = next_states - dynamics.value.map(n)(stages, p_all)
+    gaps = next_states - dynamics.value.map(n)(stages, p_all[: dynamics.params, :])
     stage_g = casadi.vertcat(gaps, value_c[1:, :])
     initial_g = casadi.mtimes(casadi.DM(initial), stages[:ns, 0])
     g = casadi.vertcat(stage_g[:, 0], initial_g, casadi.vec(stage_g[:, 1:]), value_f[1:, :])
 
-    jac_d, jac_c = dynamics.jacobian.map(n)(stages, p_all)[1], running.jacobian.map(n)(stages, p_all)[1]
-    jac_f = final.jacobian(last, p)[1]
+    jac_d = dynamics.jacobian.map(n)(stages, p_all[: dynamics.params, :])[1]
+    jac_c = running.jacobian.map(n)(stages, p_all[: running.params, :])[1]
+    jac_f = final.jacobian(last, p[: final.params])[1]
     k = np.arange(n)[:, None]
     first_row = k * rows + len(initial) * (k > 0)
     final_row = n * rows + len(initial)
@@ -300,11 +342,11 @@ def _nlp_functions(ocp: Ocp, n: int, dynamics: _Stage, running: _Stage, final: _
     lam_initial = lam_g[rows : rows + len(initial)]
     lam_stages = casadi.reshape(casadi.vertcat(lam_g[:rows], lam_g[rows + len(initial) : final_row]), rows, n)
     lam_next = lam_stages[:ns, :]
-    grad_d, hess_d = dynamics.hessian.map(n)(stages, p_all, -lam_next)
+    grad_d, hess_d = dynamics.hessian.map(n)(stages, p_all[: dynamics.params, :], -lam_next)
     grad_c, hess_c = running.hessian.map(n)(
-        stages, p_all, casadi.vertcat(casadi.repmat(lam_f, 1, n), lam_stages[ns:, :])
+        stages, p_all[: running.params, :], casadi.vertcat(casadi.repmat(lam_f, 1, n), lam_stages[ns:, :])
     )
-    grad_f, hess_f = final.hessian(last, p, casadi.vertcat(lam_f, lam_g[final_row:]))
+    grad_f, hess_f = final.hessian(last, p[: final.params], casadi.vertcat(lam_f, lam_g[final_row:]))
     of_initial = casadi.mtimes(casadi.DM(initial.T), lam_initial)
     shifted = casadi.vertcat(casadi.horzcat(of_initial, lam_next[:, :-1]), casadi.MX.zeros(ocp.inputs, n))
     grad_lagrangian = casadi.vertcat(casadi.vec(grad_d + grad_c + shifted), grad_f + lam_next[:, -1])
@@ -385,6 +427,17 @@ def _nonzeros(matrix: casadi.SX) -> casadi.SX:
 def _triplets(matrix: casadi.SX) -> tuple[np.ndarray, np.ndarray]:
     rows, cols = matrix.sparsity().get_triplet()
     return np.array(rows, int), np.array(cols, int)
+
+
+def _least_norm(matrix: scipy.sparse.csr_array, right: np.ndarray) -> np.ndarray:
+    """The shortest v with matrix v = right, but for `_DAMPING`; stage-wise rows make matrix·matrixᵀ a band."""
+    normal = (matrix @ matrix.T).tocoo()
+    below = normal.row >= normal.col
+    row, col, values = normal.row[below], normal.col[below], normal.data[below]
+    band = np.zeros((1 + np.max(row - col, initial=0), len(right)))
+    band[row - col, col] = values
+    band[0] += _DAMPING
+    return matrix.T @ scipy.linalg.solveh_banded(band, right, lower=True)
 
 
 def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:

@@ -166,20 +166,22 @@ def check_equal_optima(rows: list[Timing]) -> None:
 
 
 def ratios(rows: list[Timing]) -> list[str]:
-    """How many times faster, per problem, from each guess and with the best guess of each program."""
-    lines, best, cold = [], [], {(row.problem, row.guess, row.program): row.cold_s for row in rows}
+    """How many times faster, per problem, from each guess and with the best guess of each program; geometric means."""
+    lines, found, cold = [], [], {(row.problem, row.guess, row.program): row.cold_s for row in rows}
     for problem in dict.fromkeys(row.problem for row in rows):
         mine = {g: s for (p, g, program), s in cold.items() if p == problem and program.startswith("ballbot")}
         drake = {g: s for (p, g, program), s in cold.items() if p == problem and program.startswith("Drake")}
-        each = ", ".join(f"{drake[guess] / mine[guess]:.0f} from the {guess}" for guess in drake)
+        same = {guess: drake[guess] / mine[guess] for guess in drake}
+        each = ", ".join(f"{ratio:.0f} from the {guess}" for guess, ratio in same.items())
         paper = drake["straight line"] / np.nanmin(list(mine.values()))
         fastest = np.nanmin(list(drake.values())) / np.nanmin(list(mine.values()))
-        best.append((paper, fastest))
+        found.append((*same.values(), paper, fastest))
         lines.append(
             f"{problem}: Drake's time / ours: {each}; its straight line / our best {paper:.0f}; best / best {fastest:.0f}"
         )
-    means = np.exp(np.nanmean(np.log(best), axis=0))
-    return [*lines, f"geometric means: straight line / our best {means[0]:.0f}; best / best {means[1]:.0f}"]
+    means = np.exp(np.mean(np.log(found), axis=0))  # NaN where a program found no optimum
+    each = ", ".join(f"{mean:.0f} from the {guess}" for mean, guess in zip(means, same, strict=False))
+    return [*lines, f"geometric means: {each}; straight line / our best {means[-2]:.0f}; best / best {means[-1]:.0f}"]
 
 
 def _straight(problem: Problem, like: Guess) -> Guess:

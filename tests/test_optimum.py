@@ -305,6 +305,63 @@ def test_infeasible_bounds_are_reported_not_hidden():
         assert solution.status
 
 
+def double_integrator(params=0):
+    """Linear dynamics without parameters, cost and limits with as many as there are."""
+    return Ocp(
+        name=f"integrator-{params}",
+        states=2,
+        inputs=1,
+        params=params,
+        next=lambda s, w, p: casadi.vertcat(s[0] + 0.1 * s[1], s[1] + 0.1 * w[0]),
+        cost=lambda s, w, p: (1 + casadi.sumsqr(p)) * (casadi.sumsqr(s) + w[0] ** 2),
+    )
+
+
+def from_rest_to_rest(ocp):
+    bounds = Bounds.free(ocp, N)
+    bounds.state_lower[[0, -1]] = bounds.state_upper[[0, -1]] = [[0, 0], [1, 0]]
+    return bounds
+
+
+def test_straight_line_is_bent_into_the_nearest_motion(rng):
+    # of linear dynamics: no other motion between the ends is nearer, and motions stay as they are (but for the damping)
+    ocp = double_integrator()
+    solver, bounds = OcpSolver(ocp, N), from_rest_to_rest(ocp)
+    line, still = np.linspace([0, 0], [1, 0], N + 1), np.zeros((N, 1))
+    states, inputs = solver.toward_consistency(line, still, bounds)
+    np.testing.assert_array_equal(states[[0, -1]], line[[0, -1]])
+    np.testing.assert_allclose(states[1:, 0], states[:-1, 0] + 0.1 * states[:-1, 1], atol=1e-5)
+    np.testing.assert_allclose(states[1:, 1], states[:-1, 1] + 0.1 * inputs[:, 0], atol=1e-5)
+    again = solver.toward_consistency(states, inputs, bounds)
+    np.testing.assert_allclose(again[0], states, atol=1e-4)
+
+    def distance(x, a):
+        return np.sum((x - line) ** 2) + np.sum((a - still) ** 2)
+
+    for _ in range(20):
+        other = solver.toward_consistency(
+            states + 0.1 * rng.normal(size=states.shape), inputs + rng.normal(size=inputs.shape), bounds
+        )
+        assert distance(*other) > distance(states, inputs)
+
+
+def test_step_toward_consistency_brings_a_rough_guess_nearer_and_respects_bounds(rng):
+    ocp = toy()
+    solver, bounds = OcpSolver(ocp, N), toy_bounds(ocp)
+    states, inputs = np.tile([0.4, -0.3, 0.2], (N + 1, 1)), np.zeros((N, 2))
+    for _ in range(4):
+        states, inputs = solver.toward_consistency(states, inputs, bounds, [0.4])
+        assert (states >= bounds.state_lower).all()
+        assert (states <= bounds.state_upper).all()
+        assert (inputs >= bounds.input_lower).all()
+        assert (inputs <= bounds.input_upper).all()
+    # Newton's: four are enough from here, with the parameter, path, initial and final equalities all met
+    after = [np.array(ocp.next(*(casadi.DM(v) for v in (states[k], inputs[k])), 0.4)).ravel() for k in range(N)]
+    np.testing.assert_allclose(states[1:], after, atol=1e-6)
+    assert states[0] @ ocp.initial_matrix[0] == pytest.approx(0, abs=1e-6)
+    assert states[-1, 2] ** 2 + states[-1, 2] == pytest.approx(0.2, abs=1e-6)
+
+
 # --- compiled derivatives ---
 
 
@@ -339,6 +396,18 @@ def test_functions_are_compiled_once_and_then_read_from_the_cache(monkeypatch, t
     monkeypatch.setattr(subprocess, "run", refuse)
     again = compiled.compiled("powers", square())
     assert [float(f(3.0)) for f in again] == [9.0, 27.0]
+
+
+@needs_compiler
+def test_problems_with_different_parameters_share_their_compiled_dynamics(monkeypatch, tmp_path):
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
+    for params in (0, 1, 3):
+        ocp = double_integrator(params)
+        solution = OcpSolver(ocp, N).solve(
+            np.zeros((N + 1, 2)), np.zeros((N, 1)), from_rest_to_rest(ocp), np.ones(params)
+        )
+        assert is_feasible(solution)
+    assert sum(library.name.startswith("dynamics-") for library in tmp_path.iterdir()) == 1
 
 
 @needs_compiler

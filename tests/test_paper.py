@@ -136,17 +136,27 @@ def test_cost_is_the_papers_sum_over_knots(plan_of):
     assert plan.cost == pytest.approx(knots.sum(), rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "x0", "x1", "seconds"),
-    [
-        ("stabilize-1", state(x=-1.0, vy=1.0), state(), 2.0),
-        ("stabilize-5", state(x=-1.0, vy=5.0), state(), 3.0),
-        ("turn-3", state(y=-1.0, vy=3.0), state(x=1.0, vx=3.0), 2.0),
-    ],
-)
+LINES = {"stabilize-1": 2.0, "stabilize-5": 3.0, "turn-3": 2.0, "turn-10": 6.0}  # s
+
+
+def line_of(name, params, seconds):
+    problem = PAPER_PROBLEMS[name].problem
+    return straight_guess(problem.initial[0], problem.final[0], seconds)(params)
+
+
+@pytest.mark.parametrize("name", LINES)
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_papers_straight_line_guess_leads_to_the_same_optimum(plan_of, params, name, x0, x1, seconds, solver):
-    plan = solve(PAPER_PROBLEMS[name].problem, params, straight_guess(x0, x1, seconds)(params), solver)
+def test_papers_straight_line_guess_leads_to_the_same_optimum(plan_of, params, name, solver):
+    plan = solve(PAPER_PROBLEMS[name].problem, params, line_of(name, params, LINES[name]), solver)
+    assert plan.cost == pytest.approx(plan_of(name).cost, rel=1e-7)
+    # measured: 8, 10, 8 and 29 or 43; from the unbent line up to 121, and none for the last
+    assert plan.iterations <= 60
+
+
+@pytest.mark.parametrize("share", [0.5, 1.5])
+@pytest.mark.parametrize("name", ["stabilize-1", "stabilize-5", "turn-3"])
+def test_straight_line_may_take_half_as_long_again_or_half_as_long(plan_of, params, name, share):
+    plan = solve(PAPER_PROBLEMS[name].problem, params, line_of(name, params, share * LINES[name]), "fatrop")
     assert plan.cost == pytest.approx(plan_of(name).cost, rel=1e-7)
 
 
@@ -180,7 +190,7 @@ def test_collocation_error_is_the_integral_of_the_residual(params):
 def test_problem_without_a_solution_raises_with_status_and_violation(params, solver):
     x0 = state(x=-1.0, vy=5.0)
     hurried = replace(between_states("hurried", x0, state()), step=(0.005, 0.01))  # 0.4 s to stop from 5 m/s
-    with pytest.raises(PlanError, match=rf"hurried: {solver} found no plan: \w+.*violated by \d\.\de-\d\d"):
+    with pytest.raises(PlanError, match=rf"hurried: {solver} found no plan: \w+.*violated by \d\.\de[+-]\d\d"):
         solve(hurried, params, straight_guess(x0, state(), 0.4)(params), solver, max_iterations=60)
 
 
