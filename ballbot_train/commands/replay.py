@@ -1,52 +1,95 @@
-"""`ballbot replay`: a certified episode, rendered."""
+"""`ballbot replay`: an episode or trajectory files, drawn."""
 
 import math
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.controller import rollout
-from ballbot_gym import certified
-from ballbot_gym.env import BallbotEnv
 from ballbot_gym.tasks import TASKS
-from ballbot_train import evaluate, figures
-from ballbot_train.console import console
+from ballbot_train import evaluate
+from ballbot_train.console import console, progress_bar
+from ballbot_train.replay import Format, Replay, certified_replay, file_replay, film_times, with_ghosts, write_film
+from ballbot_train.replay import write_strip as _write_strip
+
+_WIDTHS = {"mp4": 1280, "gif": 640}  # px
 
 
 def replay(
-    task: str,
+    source: tuple[str, ...],
     /,
-    controller: str = "trajopt",
+    controllers: tuple[str, ...] = ("trajopt",),
     episode: int = 0,
     physics: Literal["bullet", "rk4"] = "bullet",
-    frames: int = 5,
+    format: Format = "png",
     seconds: float | None = None,
+    frames: int = 5,
+    fps: int = 25,
+    speed: float = 1.0,
+    width: int | None = None,
+    ghost_at: float | None = None,
+    ghost_by: str = "trajopt",
     out: Path = Path("runs/replay"),
 ) -> None:
-    """Draws a certified episode under a controller: a strip of rendered frames.
+    """Draws a certified episode under controllers, or trajectory files: a strip of pictures, or a film.
 
     Args:
-        task: name of a task.
-        controller: name of a controller.
+        source: name of a task, or trajectory files (.npz).
+        controllers: names of controllers or policy files; several are shown side by side.
         episode: index of the certified episode.
         physics: "bullet" or "rk4".
-        frames: how many, at equal times.
+        format: png, a strip of frames; mp4 or gif, a film with tilts, forces and paths.
         seconds: of the last frame; default the end of the episode.
-        out: folder of TASK-CONTROLLER-EPISODE.png.
+        frames: of a strip, at equal times.
+        fps: frames per second of a film.
+        speed: of a film; 0.5 is half as fast as life.
+        width: of a film, px; default 1280 for mp4, 640 for gif.
+        ghost_at: shows as a ghost what an expert would do from this time on, s.
+        ghost_by: name of that expert.
+        out: folder of the file, which is named after task, controllers and episode.
     """
+    _check(fps >= 1, f"fps must be at least 1, not {fps}")
+    _check(frames >= 1, f"frames must be at least 1, not {frames}")
+    _check(0 < speed < math.inf, f"speed must be positive, not {speed}")
+    _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
+    _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
+    shown, name = _read(source, controllers, episode, physics, ghost_at, ghost_by)
+    end = min(shown.duration if seconds is None else seconds, shown.duration)
+    path = out / f"{name}.{format}"
+    if format == "png":
+        console.print(f"picture: {_write_strip(shown, path, frames, end)}")
+        return
+    with progress_bar() as progress:
+        bar = progress.add_task("frames", total=len(film_times(end, fps, speed)))
+        write_film(shown, path, end, fps, speed, width or _WIDTHS[format], on_frame=lambda: progress.advance(bar))
+    console.print(f"film: {path}, {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _read(
+    source: tuple[str, ...],
+    controllers: tuple[str, ...],
+    episode: int,
+    physics: str,
+    ghost_at: float | None,
+    ghost_by: str,
+) -> tuple[Replay, str]:
+    """What is to be shown, and the name of its file."""
+    if all(Path(entry).suffix == ".npz" for entry in source):
+        _check(bool(source), "give the name of a task, or trajectory files")
+        _check(ghost_at is None, "a trajectory file does not say which task it is of, so it has no ghost")
+        paths = [Path(entry) for entry in source]
+        return file_replay(paths), "-".join(path.stem for path in paths)
+    _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
+    task = source[0]
     evaluate.check_names("task", [task], TASKS)
-    evaluate.check_names("controller", [controller], CONTROLLERS)
-    env = BallbotEnv(task, physics=physics, render_mode="rgb_array")
-    episode_set = certified.load(env.task)
-    if not 0 <= episode < len(episode_set):
-        raise ValueError(f"episode must be 0 to {len(episode_set) - 1}, not {episode}")
-    run = rollout(env, CONTROLLERS[controller](env.task, env.params), options=episode_set.options(episode))
-    end = min(seconds or math.inf, run.trajectory.duration)
-    steps = np.linspace(0, end / env.task.control_dt, frames).round().astype(int)
-    pictures = [env.render_state(run.trajectory.x[k]) for k in steps]
-    env.close()
-    titles = [f"{k * env.task.control_dt:.2f} s, {math.degrees(run.trajectory.tilt[k]):.0f}°" for k in steps]
-    path = figures.save(figures.strip_figure(pictures, titles), out / f"{task}-{controller}-{episode}.png")
-    console.print(f"picture: {path}")
+    evaluate.check_names("expert", [ghost_by], CONTROLLERS)
+    _check(bool(controllers), "give at least one controller")
+    shown = certified_replay(task, controllers, episode, physics)
+    name = f"{task}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
+    if ghost_at is None:
+        return shown, name
+    return with_ghosts(shown, task, episode, ghost_at, ghost_by, physics), f"{name}-ghost"
+
+
+def _check(right: bool, message: str) -> None:
+    if not right:
+        raise ValueError(message)

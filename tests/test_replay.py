@@ -1,0 +1,178 @@
+"""Strips and films of episodes, and ghosts in them."""
+
+import math
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from ballbot_baselines.optimum import PlanError
+from ballbot_gym import certified
+from ballbot_gym.env import make_task
+from ballbot_gym.simulator import Marker
+from ballbot_gym.trajectory import Trajectory, TrajectoryError
+from ballbot_train.commands.replay import replay
+from ballbot_train.replay import Replay, Take, certified_replay, file_replay, film_frames, film_times, with_ghosts
+from ballbot_train.replay import write_film as write
+from ballbot_train.sketch import Camera, body_axis
+
+FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
+
+
+def lean(to, seconds=1.0, steps=50):
+    """A body that leans along x while the ball rolls along y."""
+    x = np.zeros((steps + 1, 8))
+    x[:, 2] = np.linspace(0, to, steps + 1)
+    x[:, 1] = np.linspace(0, 2, steps + 1)
+    return Trajectory(np.linspace(0, seconds, steps + 1), x, np.full((steps, 2), 100.0))
+
+
+@pytest.fixture
+def two_takes():
+    takes = (Take("still", lean(0.0), "#c0392b"), Take("leaning", lean(0.8, seconds=0.6), "#1f6fb2", "note"))
+    return Replay("a title", takes, (Marker((1.0, 0.0), 0.3, 0.25, (0.8, 0.1, 0.1, 1.0)),))
+
+
+def test_body_axis_tilts_as_the_urdf_does():
+    x = np.array([0, 0, 0.3, -0.4, 0, 0, 0, 0])
+    axis = body_axis(x)
+    assert np.linalg.norm(axis) == pytest.approx(1)
+    assert math.acos(axis[2]) == pytest.approx(math.acos(math.cos(0.3) * math.cos(0.4)))
+    assert axis[0] > 0 > axis[1]
+
+
+def test_camera_looks_at_its_target_and_sees_up_as_up_and_far_as_small():
+    camera = Camera(np.array([3.0, -1.0, 0.5]))
+    (middle, above, farther), depth = camera.project(
+        np.array([[3.0, -1.0, 0.5], [3.0, -1.0, 1.5], 2 * np.array([3.0, -1.0, 0.5]) - camera.eye])
+    )
+    assert middle == pytest.approx([0, 0], abs=1e-12)
+    assert above[0] == pytest.approx(0, abs=1e-12)
+    assert above[1] > 0.2
+    assert farther == pytest.approx([0, 0], abs=1e-12)
+    assert depth[2] == pytest.approx(2 * depth[0])
+
+
+def test_a_film_moves_and_ends_when_the_longest_take_does(two_takes):
+    times = film_times(two_takes.duration, fps=10, speed=0.5)
+    assert times[-1] == two_takes.duration == 1.0
+    assert len(times) == 21
+    first, last = film_frames(two_takes, [0.0, 1.0], width=640)
+    assert first.shape == last.shape == (360, 640, 3)
+    assert first.dtype == np.uint8
+    changed = (first.astype(int) - last).any(axis=2)
+    assert changed[:, :320].any()
+    assert changed[:, 320:].any()
+
+
+def test_a_film_is_drawn_the_same_whatever_came_before(two_takes):
+    forwards = list(film_frames(two_takes, [0.1, 0.5, 0.9], width=320))
+    backwards = list(film_frames(two_takes, [0.9, 0.5, 0.1], width=320))
+    np.testing.assert_array_equal(forwards, backwards[::-1])
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif"])
+def test_a_film_is_read_back_with_its_frames_and_duration(two_takes, tmp_path, ending):
+    path = write(two_takes, tmp_path / f"film.{ending}", seconds=1.0, fps=10, width=320)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    with imageio.get_reader(path) as reader:
+        frames = list(reader.iter_data())
+        assert len(frames) == 11
+        assert frames[0].shape[:2] == (180, 320)
+        data = reader.get_meta_data()
+    assert data["fps"] == 10 if ending == "mp4" else data["duration"] == 100
+
+
+def test_a_film_that_is_interrupted_leaves_nothing(two_takes, tmp_path):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write(two_takes, tmp_path / "film.mp4", seconds=1.0, width=320, on_frame=interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_episode_starts_alike_under_every_controller():
+    shown = certified_replay("turn", ["lqr", "trajopt"], 2, physics="rk4")
+    start = certified.load(make_task("turn")).states[2]
+    for take in shown.takes:
+        np.testing.assert_array_equal(take.trajectory.x[0], start)
+    assert [take.label for take in shown.takes] == ["LQR", "trajectory optimization + TVLQR"]
+    assert len(shown.markers) == 2  # the gate's posts
+
+
+def test_where_lqr_falls_the_ghost_goes_on_from_its_state_to_the_goal():
+    shown = certified_replay("stabilize", ["lqr"], FALLING)
+    (take,) = shown.takes
+    assert take.note == "fails at 0.40 s"
+    (take,) = with_ghosts(shown, "stabilize", FALLING, at=0.1, expert="trajopt", physics="bullet").takes
+    np.testing.assert_array_equal(take.ghost.x[0], take.trajectory.state(0.1))
+    np.testing.assert_array_equal(take.ghost_state(0.1), take.ghost.x[0])
+    assert take.ghost_state(0.08) is None
+    assert take.note.endswith("ghost from 0.10 s: at the goal")
+    assert np.hypot(*take.ghost.x[-1, :2]) < 0.1
+    assert Replay("", (take,)).duration == pytest.approx(8.1)  # the ghost is watched to its end
+    seen, hidden = film_frames(shown, [0.4], width=320), film_frames(Replay("", (take,), shown.markers), [0.4], 320)
+    assert (next(seen) != next(hidden)).any()
+
+
+def test_where_the_expert_is_too_late_the_replay_says_so():
+    shown = certified_replay("stabilize", ["lqr", "trajopt"], FALLING, physics="rk4")
+    late, early = with_ghosts(shown, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4").takes
+    assert late.ghost is None
+    assert late.note.endswith("trajopt finds no way on from 0.36 s")
+    assert early.ghost is not None
+    alone = Replay("", shown.takes[:1])
+    with pytest.raises(PlanError, match=r"finds no way on from 0\.36 s under LQR"):
+        with_ghosts(alone, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4")
+
+
+def test_files_called_the_same_are_told_apart_by_their_folders(tmp_path):
+    paths = [lean(to).save(tmp_path / name / "trajectory.npz") for name, to in (("a", 0.1), ("b", 0.2))]
+    assert [take.label for take in file_replay(paths).takes] == ["a/trajectory", "b/trajectory"]
+    with pytest.raises(TrajectoryError, match="nowhere"):
+        file_replay([tmp_path / "nowhere.npz"])
+
+
+def test_the_command_draws_a_strip_named_after_the_episode(tmp_path):
+    replay(("stabilize",), controllers=("lqr",), episode=1, frames=3, seconds=0.4, physics="rk4", out=tmp_path)
+    (picture,) = tmp_path.iterdir()
+    assert picture.name == "stabilize-lqr-1.png"
+    assert imageio.imread(picture).std() > 5
+
+
+def test_the_command_films_a_trajectory_file(tmp_path):
+    lean(0.5).save(tmp_path / "mine.npz")
+    replay((str(tmp_path / "mine.npz"),), format="gif", seconds=0.2, fps=10, width=160, out=tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine.gif"]
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        (("dance",), {}, "unknown task dance"),
+        (("stabilize", "turn"), {}, "give one task"),
+        ((), {}, "give the name of a task"),
+        (("stabilize",), {"controllers": ()}, "at least one controller"),
+        (("stabilize",), {"controllers": ("nobody",)}, "unknown controller 'nobody'"),
+        (("stabilize",), {"episode": 200}, "episode must be 0 to 199"),
+        (("stabilize",), {"seconds": -1.0}, "seconds must be positive"),
+        (("stabilize",), {"seconds": math.nan}, "seconds must be positive"),
+        (("stabilize",), {"fps": 0}, "fps must be at least 1"),
+        (("stabilize",), {"frames": 0}, "frames must be at least 1"),
+        (("stabilize",), {"speed": 0.0}, "speed must be positive"),
+        (("stabilize",), {"width": 9}, "width must be 64"),
+        (("stabilize",), {"ghost_by": "nobody", "ghost_at": 0.1}, "unknown expert nobody"),
+        (("nowhere.npz",), {}, "not a trajectory file"),
+        (("nowhere.npz",), {"ghost_at": 1.0}, "has no ghost"),
+        (
+            ("stabilize",),
+            {"controllers": ("lqr",), "episode": FALLING, "ghost_at": 0.5},
+            "LQR ends at 0.40 s: no ghost can start at 0.5 s",
+        ),
+    ],
+)
+def test_wrong_arguments_are_refused_and_write_nothing(source, options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        replay(source, out=tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,271 @@
+"""The report page, as text and in a browser."""
+
+import re
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from ballbot_gym.simulator import Marker
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train import figures
+from ballbot_train.replay import Replay, Take
+from ballbot_train.report import (
+    Line,
+    Panel,
+    Section,
+    curves_section,
+    folder_section,
+    pictures_section,
+    replay_section,
+    table_section,
+    write_report,
+)
+from ballbot_train.sections import learning_section
+
+webdriver = pytest.importorskip("selenium.webdriver")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+DRIVER = shutil.which("chromedriver")
+FLAGS = (
+    "headless",
+    "no-sandbox",
+    "disable-quic",
+    "no-first-run",
+    "disable-background-networking",
+    "disable-component-update",
+    "disable-sync",
+    "disable-dev-shm-usage",
+    "enable-unsafe-swiftshader",  # WebGL without a GPU
+    "window-size=1280,1600",
+)
+LARGEST = 15e6  # bytes
+
+HEADER = ["task", "controller", "regret", "falls"]
+ROWS = [
+    ["stabilize", "lqr", "38.02%", "64/200"],
+    ["stabilize", "nmpc", "-0.08%", "0/200"],
+    ["turn", "lqr", "–", "200/200"],
+    ["turn", "nmpc", "9.5%", "9/200"],
+]
+
+
+def leaning(to, seconds):
+    steps = round(seconds / 0.02)
+    x = np.zeros((steps + 1, 8))
+    x[:, 0], x[:, 2] = np.linspace(-1, 1, steps + 1), np.linspace(0, to, steps + 1)
+    return Trajectory(0.02 * np.arange(steps + 1), x, np.full((steps, 2), 50.0))
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A page with every kind of section."""
+    folder = tmp_path_factory.mktemp("report")
+    markers = (Marker((1.0, 0.5), 0.3, 0.25, (0.7, 0.1, 0.1, 1.0)), Marker((0, 0), 1.0, 0.03, (0.8, 0.1, 0.1, 1), True))
+    takes = (Take("LQR", leaning(1.0, 0.6), "#c0392b", "fails"), Take("NMPC", leaning(0.3, 1.0), "#e08a00"))
+    replays = [Replay("first", takes, markers), Replay("second", takes[1:])]
+    curve = figures.Curve("a", leaning(0.3, 1.0), "#1f6fb2")
+    picture = figures.save(figures.trajectory_figure("a figure", [curve]), folder / "pictures" / "some-figure.png")
+    x = np.linspace(1, 10, 20)
+    panel = Panel("a panel", "x", "y", [Line("a", x, x**2, "#1f6fb2", x**2 - 1, x**2 + 1)], log_x=True)
+    sections = [
+        table_section("Leaderboard", HEADER, ROWS),
+        replay_section("Watch", replays),
+        curves_section("Curves", [panel, panel]),
+        folder_section("Pictures", picture.parent),
+        folder_section("Nothing", folder / "nowhere"),
+    ]
+    return write_report("A <title>", sections, {"commit": "abc"}, folder / "report.html")
+
+
+def test_the_page_holds_everything_it_shows(page):
+    text = page.read_text()
+    markup = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    sources = re.findall(r'(?:src|href)="([^"]{0,40})', markup)
+    assert sources
+    assert [source for source in sources if not source.startswith(("data:", "#"))] == []
+    assert text.count("plotly.js v") == 1
+    assert page.stat().st_size < LARGEST
+
+
+def test_what_has_no_data_has_no_section(page, tmp_path):
+    assert "Nothing" not in page.read_text()
+    assert pictures_section("a", []) is curves_section("b", []) is replay_section("c", []) is None
+    assert learning_section(tmp_path) is None
+
+
+def test_a_page_without_figures_carries_no_plotly(tmp_path):
+    path = write_report("t", [table_section("Leaderboard", HEADER, ROWS)], {}, tmp_path / "report.html")
+    assert path.stat().st_size < 20e3
+
+
+def test_words_are_text_and_not_markup(tmp_path):
+    sections = [
+        table_section("<b>", ["<i>"], [["<u>"]]),
+        Section("plain", "<em>kept</em>", lead="<s>"),
+        replay_section("r", [Replay("</script>", (Take("<q>", leaning(0.1, 0.1), "red"),))]),
+    ]
+    text = write_report("<h9>", sections, {"<p9>": "<p8>"}, tmp_path / "report.html").read_text()
+    text = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)  # less the page's own scripts
+    assert not re.search("<(b|i|u|s|q|h9|p9|p8)>", text)
+    assert "<em>kept</em>" in text
+    assert '"title":"\\u003c/script>"' in text
+
+
+def test_learning_curves_come_from_what_training_wrote(tmp_path):
+    (tmp_path / "shac").mkdir()
+    (tmp_path / "shac" / "config.json").write_text('{"task": "stabilize", "learner": "shac"}')
+    (tmp_path / "shac" / "evaluations.csv").write_text(
+        "iteration,seconds,regret_mean\n0,1.0,nan\n1,2.0,0.5\n2,4.0,0.25\n"
+    )
+    (tmp_path / "no run").mkdir()
+    (tmp_path / "no run" / "evaluations.csv").write_text("something,else\n1,2\n")
+    section = learning_section(tmp_path)
+    assert '"x":[2.0,4.0],"y":[50.0,25.0]' in section.body
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    if not (CHROMIUM and DRIVER):
+        pytest.skip("no chromium and chromedriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in FLAGS:
+        options.add_argument(f"--{flag}")
+    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('chromium')}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def opened(chromium, page):
+    """The page, just opened, in a wide window; afterwards its console held no error."""
+    chromium.get(page.as_uri())
+    wait_for(chromium, "return document.querySelector('.replay').dataset.ready === 'true'")
+    yield chromium
+    assert [entry["message"] for entry in chromium.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def wait_for(browser, condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not browser.execute_script(condition):
+        assert time.monotonic() < end, condition
+        time.sleep(0.05)
+
+
+def column(browser, i):
+    return browser.execute_script(
+        "return [...document.querySelectorAll('tbody tr')].filter(row => !row.hidden)"
+        f".map(row => row.cells[{i}].textContent)"
+    )
+
+
+def press(browser, text):
+    browser.execute_script(
+        "[...document.querySelectorAll('button')].find(button => button.textContent === arguments[0]).click()", text
+    )
+
+
+def scrub(browser, t):
+    browser.execute_script(
+        "const bar = document.querySelector('.scrub'); bar.value = arguments[0]; bar.dispatchEvent(new Event('input'))",
+        t,
+    )
+
+
+def tilts(browser):
+    return browser.execute_script("return [...document.querySelectorAll('.tilt')].map(e => e.textContent)")
+
+
+TOPS = "return [...document.querySelectorAll('.view')].map(view => Math.max(...view.data[0].z))"
+
+
+def test_the_table_sorts_by_numbers_and_keeps_what_is_missing_last(opened):
+    press(opened, "regret")
+    assert column(opened, 2) == ["-0.08%", "9.5%", "38.02%", "–"]
+    press(opened, "regret")
+    assert column(opened, 2) == ["38.02%", "9.5%", "-0.08%", "–"]
+    press(opened, "controller")
+    assert column(opened, 1) == ["lqr", "lqr", "nmpc", "nmpc"]
+    heads = "return [...document.querySelectorAll('th')].map(head => head.getAttribute('aria-sort'))"
+    assert opened.execute_script(heads) == [None, "ascending", None, None]
+
+
+def test_the_table_filters_by_task(opened):
+    press(opened, "turn")
+    assert column(opened, 0) == ["turn", "turn"]
+    press(opened, "all")
+    assert len(column(opened, 0)) == 4
+
+
+def test_scrubbing_moves_every_robot_and_the_cursors_of_its_traces(opened):
+    assert tilts(opened) == ["0°", "0°"]
+    upright = opened.execute_script(TOPS)
+    assert upright == pytest.approx([1.2, 1.2])  # m: ball's centre at 0.1, body up to 1.1 above it
+    scrub(opened, 0.8)
+    wait_for(opened, "return document.querySelector('.forces').layout.shapes[0].x0 === 0.8")
+    assert tilts(opened) == ["57°", "14°"]  # the first has ended, at 1 rad
+    fallen, leaned = opened.execute_script(TOPS)
+    assert fallen == pytest.approx(0.1 + 1.1 * np.cos(1.0) + 0.1 * np.sin(1.0), abs=0.01)
+    assert fallen < leaned < 1.2
+    assert opened.execute_script("return document.querySelector('.tilts').layout.shapes[0].x1") == 0.8
+
+
+def test_playing_moves_until_the_end_and_pauses_where_it_is_told(opened):
+    opened.execute_script("document.querySelector('.speed').value = '0.25'")
+    press(opened, "Play")
+    wait_for(opened, "return parseFloat(document.querySelector('.clock').textContent) > 0.05")
+    press(opened, "Pause")
+    time.sleep(0.3)
+    held = opened.execute_script("return document.querySelector('.clock').textContent")
+    assert 0 < float(held.split()[0]) < 1
+    time.sleep(0.3)
+    assert opened.execute_script("return document.querySelector('.clock').textContent") == held
+    opened.execute_script("document.querySelector('.speed').value = '2'")
+    press(opened, "Play")
+    wait_for(opened, "return document.querySelector('.clock').textContent === '1.00 s'")
+    wait_for(opened, "return document.querySelector('.play').textContent === 'Play'")
+
+
+def test_linked_cameras_turn_together_and_others_do_not(opened):
+    turn = """
+        const [eye, done] = arguments;
+        const [first, second] = document.querySelectorAll(".view");
+        const turned = Plotly.relayout(first, { "scene.camera": { eye } });
+        turned.then(() => setTimeout(() => done(second.layout.scene.camera.eye), 500));
+    """
+    eye = {"x": 1.5, "y": 0.5, "z": 0.5}
+    assert opened.execute_async_script(turn, eye) == eye
+    opened.execute_script("document.querySelector('.link').click()")
+    assert opened.execute_async_script(turn, {"x": -1, "y": 1, "z": 1}) == eye
+
+
+def test_another_episode_has_its_own_scenes(opened):
+    press(opened, "second")
+    wait_for(opened, "return document.querySelectorAll('.view').length === 1")
+    wait_for(opened, "return document.querySelector('.tilts').data.length === 1")
+    assert tilts(opened) == ["0°"]
+
+
+def test_a_scene_shows_robot_floor_and_obstacles(opened):
+    kinds = "return document.querySelector('.view').data.map(trace => trace.type)"
+    assert opened.execute_script(kinds).count("mesh3d") == 3  # robot, floor, obstacle
+    picture = opened.execute_async_script(
+        "const done = arguments[0];"
+        "Plotly.toImage(document.querySelector('.view'), {format: 'png', width: 200, height: 200}).then(done)"
+    )
+    assert len(picture) > 5000  # a blank one has less than 1 kB
+
+
+@pytest.mark.parametrize("width", [360, 800, 1600])
+def test_the_page_fits_its_window(chromium, page, width):
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    chromium.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    chromium.get(page.as_uri())
+    wait_for(chromium, "return document.querySelector('.replay').dataset.ready === 'true'")
+    needed, inner = chromium.execute_script("return [document.documentElement.scrollWidth, innerWidth]")
+    assert needed <= inner == width  # less where there is a scroll bar
+    chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
