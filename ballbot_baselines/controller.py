@@ -11,6 +11,7 @@ import numpy as np
 
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.trajectory import Trajectory
 
@@ -83,7 +84,7 @@ def rollout(
 
     Args:
         env: a BallbotEnv, wrapped or not; its wrappers are bypassed.
-        controller: gets the true state, as every expert does.
+        controller: gets the state as the env's sensors report it: the true one, unless its randomization has noise.
         seed, options: as for `env.reset`.
 
     Raises:
@@ -93,17 +94,19 @@ def rollout(
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     _, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]
+    seen = _sensed(ballbot, x)
     start = time.perf_counter()
-    controller.reset(0.0, x, c)
+    controller.reset(0.0, seen, c)
     reset_seconds = time.perf_counter() - start
     states, forces, act_seconds, settled = [x], [], [], [task.is_goal(tuple(x), tuple(c))]
     cost, done = 0.0, False
     while not done:
         start = time.perf_counter()
-        u = controller.act(len(forces) * dt, x)
+        u = controller.act(len(forces) * dt, seen)
         act_seconds.append(time.perf_counter() - start)
         _, reward, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
         x, done = info["state"], terminated or truncated
+        seen = _sensed(ballbot, x)
         cost -= reward
         states.append(x)
         forces.append(info["force"])
@@ -119,6 +122,14 @@ def rollout(
         reset_seconds=reset_seconds,
         act_seconds=float(np.median(act_seconds)),
     )
+
+
+def _sensed(env: BallbotEnv, x: np.ndarray) -> np.ndarray:
+    """State x (8,) with the noise of the env's sensors, drawn from the env's generator, anew at each call."""
+    if not env.randomization.is_noisy:
+        return x
+    z = tuple(env.np_random.random(Randomization.NOISE_DRAWS).tolist())
+    return np.array(env.randomization.sensed(tuple(x.tolist()), z))
 
 
 def simulate(

@@ -2,6 +2,7 @@
 
 import io
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +13,15 @@ matplotlib.use("Agg")  # files only: no display needed
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from ballbot_gym import files
 from ballbot_gym.simulator import Marker
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.basins import AXES, BasinMap
 from ballbot_train.evaluate import Result
+from ballbot_train.robustness import NONE, STRESSES, StressRow, curve_of
 
 COLORS = {"lqr": "#c0392b", "trajopt": "#1f6fb2", "nmpc": "#e08a00"}
 _OTHER_COLORS = ("#2e8b57", "#8e44ad", "#b9770e", "#34495e")
@@ -106,14 +110,85 @@ def regret_figure(results: Sequence[Result]) -> Figure:
             # success, not only standing: an episode that misses its goal has no regret worth the name
             regrets = np.sort([max(100 * result.regret, 0.01) for result in group if result.success])
             share = 100 * np.arange(1, len(regrets) + 1) / len(group)
-            axis.step(
-                regrets, share, where="post", lw=2, color=color(controller, i), label=LABELS.get(controller, controller)
-            )
+            axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=_label(controller))
         axis.set(xscale="log", xlim=(0.01, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %")
         axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("episodes that succeed, %")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    return figure
+
+
+def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
+    """Success and regret of every controller on a task against the severity of every disturbance.
+
+    Regret, with its 95 % interval, is drawn where at least half of the episodes did not fail.
+    """
+    stresses = list(dict.fromkeys(row.stress for row in rows if row.stress != NONE))
+    controllers = list(dict.fromkeys(row.controller for row in rows if row.task == task))
+    figure, axes = plt.subplots(
+        2,
+        len(stresses),
+        figsize=(2.9 * len(stresses), 5.6),
+        layout="constrained",
+        squeeze=False,
+        sharey="row",
+        sharex="col",
+    )
+    figure.suptitle(f"{task}: success and regret under disturbances", fontsize=13)
+    for i, stress in enumerate(stresses):
+        above, below = axes[:, i]
+        for k, controller in enumerate(controllers):
+            points = curve_of(rows, task, controller, stress)
+            levels, shade, width = [row.level for row in points], color(controller, k), max(1.5, 3.5 - k)
+            success = [100 * row.success for row in points]
+            above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=_label(controller))
+            standing = [row for row in points if 2 * row.falls <= row.episodes and math.isfinite(row.regret_mean)]
+            levels = [row.level for row in standing]
+            below.plot(levels, [100 * row.regret_mean for row in standing], "o-", ms=4, lw=width, color=shade)
+            low, high = ([100 * getattr(row, f"regret_{end}") for row in standing] for end in ("low", "high"))
+            below.fill_between(levels, low, high, color=shade, alpha=0.15, lw=0)
+        above.set(ylim=(-4, 104), title=stress)
+        below.set_yscale("symlog", linthresh=1)
+        below.set_xlabel(_folded(STRESSES[stress].label), fontsize=9)
+        for axis in (above, below):
+            axis.grid(alpha=0.3)
+    axes[0][0].set_ylabel("success, %")
+    axes[1][0].set_ylabel("regret, %")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    return figure
+
+
+def basin_figure(maps: Sequence[BasinMap]) -> Figure:
+    """From where each controller recovers, coloured; from where anything could, grey, with its boundary on top."""
+    controllers = list(maps[0].recovered)
+    figure, axes = plt.subplots(
+        len(maps),
+        len(controllers),
+        figsize=(max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps)),
+        layout="constrained",
+        squeeze=False,
+        sharex=True,
+        sharey="row",
+    )
+    figure.suptitle("Stabilize: initial states from which the robot comes to rest at the origin", fontsize=13)
+    for basin, line in zip(maps, axes, strict=True):
+        for k, (controller, axis) in enumerate(zip(controllers, line, strict=True)):
+            cells = np.where(basin.recovered[controller], 2.0, np.where(basin.recoverable, 1.0, 0.0))
+            colors = ListedColormap(["white", "0.88", color(controller, k)])
+            axis.pcolormesh(
+                basin.leans, basin.values, cells, cmap=colors, vmin=0, vmax=2, shading="nearest", alpha=0.85
+            )
+            axis.fill(*basin.boundary.T, fill=False, ec="k", lw=1.6)
+            axis.set_title(f"{_label(controller)}: {basin.fraction(controller):.0%}", fontsize=10)
+            axis.axhline(0, color="0.5", lw=0.5)
+            axis.axvline(0, color="0.5", lw=0.5)
+            axis.set_xlim(-81, 81)
+        line[0].set_ylabel(AXES[basin.axis].label)
+    for axis in axes[-1]:
+        axis.set_xlabel("lean γ, degrees")
+    figure.supxlabel("black: the boundary of what 350 N can recover; per cent: share of it recovered", fontsize=9)
     return figure
 
 
@@ -129,6 +204,16 @@ def strip_figure(pictures: Sequence[np.ndarray], titles: Sequence[str]) -> Figur
     return figure
 
 
+def add_circles(axis: plt.Axes, circles: Sequence[Circle]) -> None:
+    """Draws circles on a ground path, below everything else."""
+    for circle in circles:
+        line = "-" if circle.filled else "--"
+        shape = plt.Circle(
+            (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
+        )
+        axis.add_patch(shape).set_zorder(0)
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Writes a PNG and closes the figure."""
     buffer = io.BytesIO()
@@ -140,6 +225,16 @@ def save(figure: Figure, path: Path) -> Path:
 def color(controller: str, i: int) -> str:
     """A controller's colour, the same in every figure."""
     return COLORS.get(controller, _OTHER_COLORS[i % len(_OTHER_COLORS)])
+
+
+def _label(controller: str) -> str:
+    """What a controller is called in figures; a policy file goes by its name."""
+    stem = Path(controller).stem
+    return LABELS.get(stem, stem)
+
+
+def _folded(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, 28))
 
 
 def _component_style(curve: Curve, i: int) -> str:
@@ -161,12 +256,7 @@ def _plot_forces(axis: plt.Axes, curve: Curve) -> None:
 
 
 def _finish_path(axis: plt.Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
-    for circle in circles:
-        line = "-" if circle.filled else "--"
-        shape = plt.Circle(
-            (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
-        )
-        axis.add_patch(shape).set_zorder(0)
+    add_circles(axis, circles)
     start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
     axis.plot(*start[:2], "o", color="k", ms=5)
     axis.plot(*end[:2], "s", color="k", ms=5)

@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train import evaluate
+from ballbot_train.commands import COMMANDS
+from ballbot_train.commands.compare import compare
+from ballbot_train.evaluate import Result
 
 
 def ballbot(*arguments, cwd):
@@ -37,7 +41,37 @@ def test_benchmark_prints_a_leaderboard_and_writes_table_figures_and_report(tmp_
     assert rows["trajopt"]["cost_mean"] < rows["lqr"]["cost_mean"]
     assert {path.name for path in (out / "figures").iterdir()} == {"regret.png", "stabilize.png"}
     assert "data:image/png;base64" in (out / "report.html").read_text()
-    assert not (out / "episodes").exists()  # chunks only serve an interrupted run
+    assert not (out / "unfinished").exists()  # it only serves an interrupted run
+
+
+def test_robustness_writes_tables_and_curves(tmp_path):
+    arguments = ("--tasks", "turn", "--controllers", "lqr", "--episodes", 2, "--workers", 1)
+    run = ballbot("robustness", *arguments, "--stresses", "delay", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "0 · 20 · 40 · 60" in run.stdout
+    out = tmp_path / "runs" / "robustness"
+    assert {path.name for path in out.iterdir()} == {
+        "episodes.csv",
+        "figures",
+        "robustness.csv",
+        "robustness.json",
+        "robustness.md",
+    }
+
+
+def test_compare_says_whether_b_is_better(tmp_path, capsys):
+    for name, cost in (("a", 12.0), ("b", 11.0)):
+        results = [Result("turn", "lqr", i, "rk4", cost, 10.0, True, False, 30, 2, 2, 0, 0) for i in range(20)]
+        evaluate.write_leaderboard(evaluate.leaderboard(results), results, {"commit": name}, tmp_path / name)
+    compare(tmp_path / "a", tmp_path / "b", out=tmp_path / "compared.json")
+    assert "better" in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "compared.json").read_text())["rows"]
+    assert (row["verdict"], row["regret"]) == ("better", pytest.approx(-0.1))
+
+
+def test_compare_refuses_what_is_no_benchmark(tmp_path):
+    with pytest.raises(ValueError, match="holds no episodes of a benchmark"):
+        compare(tmp_path, tmp_path)
 
 
 def test_a_folder_with_another_unfinished_run_is_refused(tmp_path):
@@ -81,3 +115,19 @@ def test_a_wrong_argument_ends_with_one_line_that_says_so(arguments, message, tm
     assert run.returncode == 1
     assert message in " ".join(run.stderr.split())
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        ("benchmark", {"controllers": ("pid",)}, "unknown controller pid"),
+        ("benchmark", {"controllers": ("mine.json",)}, "mine.json is not a policy"),
+        ("robustness", {"stresses": ("wind",)}, "unknown stress wind"),
+        ("basins", {"points": 4}, "points must be odd"),
+    ],
+)
+def test_a_wrong_name_is_refused_before_anything_is_written(command, arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        COMMANDS[command](**arguments)
+    assert not any(tmp_path.iterdir())

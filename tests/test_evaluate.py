@@ -1,14 +1,21 @@
 import csv
 import json
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import stable_baselines3
 
-from ballbot_baselines.controller import FunctionController
-from ballbot_gym.env import BallbotEnv
+from ballbot_baselines import CONTROLLERS
+from ballbot_baselines.controller import FunctionController, rollout
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.evaluate import Result
+from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy, shipped_policies
 
 
 def result(**changes):
@@ -58,18 +65,27 @@ def test_the_episodes_of_every_controller_are_the_certified_ones():
 
 
 def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path, monkeypatch):
-    arguments = (["stabilize"], ["lqr"], 4, "rk4", tmp_path, 1)
-    monkeypatch.setattr(evaluate, "_CHUNK", 2)
-    first = evaluate.benchmark(*arguments, on_progress=lambda task, count: None)
-    (tmp_path / "episodes" / "stabilize-lqr-rk4-002-004.json").unlink()  # as if killed after the first chunk
-    untouched = tmp_path / "episodes" / "stabilize-lqr-rk4-000-002.json"
-    kept = json.loads(untouched.read_text())
-    kept[0]["cost"] = 123.0  # would be overwritten if the episode ran again
-    untouched.write_text(json.dumps(kept))
-    again = evaluate.benchmark(*arguments, on_progress=lambda task, count: None)
+    def run():
+        return evaluate.benchmark({"stabilize": ["lqr"]}, 4, "rk4", tmp_path, 1, lambda task, count: None)
+
+    first = run()
+    (path,) = tmp_path.rglob("*.jsonl")
+    lines = path.read_text().splitlines(keepends=True)
+    kept = json.loads(lines[0])
+    kept["entry"]["cost"] = 123.0  # would be overwritten if the episode ran again
+    path.write_text(json.dumps(kept) + "\n" + lines[1])  # as if killed after the second episode
+    again = run()
     assert [r.episode for r in again] == [0, 1, 2, 3]
     assert again[0].cost == 123.0
     assert [r.cost for r in again[1:]] == [r.cost for r in first[1:]]
+
+
+def test_a_rerun_in_other_processes_gives_the_same_but_for_times(tmp_path):
+    def rows(out, workers):
+        results = evaluate.benchmark({"stabilize": ["lqr"]}, 7, "rk4", out, workers, lambda task, count: None)
+        return [replace(row, plan_ms_median=0, step_us_median=0) for row in evaluate.leaderboard(results)]
+
+    assert rows(tmp_path / "a", 1) == rows(tmp_path / "b", 2)
 
 
 def test_the_leaderboard_files_hold_what_was_measured(tmp_path):
@@ -83,6 +99,104 @@ def test_the_leaderboard_files_hold_what_was_measured(tmp_path):
     document = json.loads((tmp_path / "leaderboard.json").read_text())
     assert document["rows"][1]["settle_time_median"] is None  # NaN is no JSON
     assert document["about"] == {"commit": "none"}
+
+
+@pytest.mark.parametrize("name", ["", "leaderboard.json", "episodes.csv"])
+def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
+    results = [result(effort=20.0, note="no plan"), result(controller="trajopt", settle_time=math.nan, success=False)]
+    evaluate.write_leaderboard(evaluate.leaderboard(results), results, {"commit": "none"}, tmp_path)
+    about, read = evaluate.read_results(tmp_path / name)
+    assert repr(read) == repr(results)  # NaN is not equal to itself
+    assert about == ({} if name.endswith(".csv") else {"commit": "none"})
+
+
+def test_a_file_without_episodes_is_refused(tmp_path):
+    (tmp_path / "leaderboard.json").write_text('{"rows": []}')
+    with pytest.raises(ValueError, match="holds no episodes"):
+        evaluate.read_results(tmp_path)
+
+
+class Standing:
+    """Upright by feedback, in every form that `evaluate` takes."""
+
+    gain = np.array([[0.5, 0, 1.3, 0, 0.75, 0, 1.33, 0], [0, 0.5, 0, 1.3, 0, 0.75, 0, 1.33]])
+
+    def __call__(self, observation):
+        return self.gain @ observation
+
+    def as_model(self):
+        return SimpleNamespace(predict=lambda o, state, episode_start, deterministic: (self(o), state))
+
+    def as_controller(self, env):
+        limit = env.params.force_limit
+        return FunctionController(lambda t, x: limit * self(np.array(env.task.observe(tuple(x), ()), np.float32)))
+
+
+def test_a_function_a_model_and_a_controller_that_do_the_same_cost_the_same(make_env):
+    standing = Standing()
+    policies = (standing, standing.as_model(), standing.as_controller(make_env(physics="rk4")))
+    rows = [evaluate.evaluate(policy, "stabilize", 3, "rk4", name="mine") for policy in policies]
+    assert rows[0].episodes == 3
+    assert rows[0].success > 0
+    for row in rows[1:]:
+        assert replace(row, plan_ms_median=0, step_us_median=0) == replace(rows[0], plan_ms_median=0, step_us_median=0)
+
+
+def test_a_model_sees_observations_normalized_as_in_its_training():
+    standing = Standing()
+    model = SimpleNamespace(
+        predict=lambda o, state, episode_start, deterministic: (standing(o / 3), state),
+        get_vec_normalize_env=lambda: SimpleNamespace(normalize_obs=lambda o: 3 * o),
+    )
+    plain, normalized = (
+        evaluate.evaluate(p, "stabilize", 2, "rk4", name="mine").cost_mean for p in (standing.as_model(), model)
+    )
+    assert normalized == pytest.approx(plain, rel=1e-3)
+
+
+def test_a_stable_baselines_model_is_evaluated_as_it_is():
+    model = stable_baselines3.PPO("MlpPolicy", BallbotEnv("turn", physics="rk4"), n_steps=8, batch_size=8, device="cpu")
+    row = evaluate.evaluate(model, "turn", 2, "rk4")
+    assert (row.controller, row.episodes, row.falls) == ("ppo", 2, 2)  # untrained
+
+
+def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
+    task = make_task("stabilize")
+    path = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, hidden=(8,))), {})
+    assert evaluate.evaluate(path, "stabilize", 1, "rk4").controller == str(path)
+    assert evaluate.evaluate("lqr", "stabilize", 1, "rk4").success == 1
+
+
+def test_what_cannot_act_is_refused():
+    with pytest.raises(TypeError, match="is no policy"):
+        evaluate.evaluate(3, "stabilize", 1, "rk4")
+
+
+def test_noise_reaches_the_controller_and_only_it():
+    seen = []
+    idle = FunctionController(lambda t, x: seen.append(x) or np.zeros(2))
+    env = BallbotEnv("stabilize", physics="rk4", randomization=Randomization(position_noise=0.1))
+    run = rollout(env, idle, seed=0)
+    noise = np.array(seen) - run.trajectory.x[:-1]
+    assert 0.05 < noise[:, :2].std() < 0.2
+    assert not noise[:, 2:].any()
+    calm = rollout(BallbotEnv("stabilize", physics="rk4"), idle, seed=0)
+    np.testing.assert_array_equal(calm.trajectory.x, run.trajectory.x)  # what it does not react to, changes nothing
+
+
+def test_a_policy_is_benchmarked_on_the_task_it_was_made_for(tmp_path):
+    path = str(save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {}))
+    chosen = evaluate.controllers_of(["stabilize", "turn"], ["lqr", path])
+    assert chosen == {"stabilize": ["lqr"], "turn": ["lqr", path]}
+    assert evaluate.controllers_of(["stabilize", "turn"], [path]) == {"turn": [path]}
+    assert set(evaluate.policy_digests(chosen)) == {f"turn/{path}"}
+    with pytest.raises(ValueError, match="which is none of stabilize"):
+        evaluate.controllers_of(["stabilize"], [path])
+
+
+def test_without_names_every_expert_and_shipped_policy_is_benchmarked():
+    for task, names in evaluate.controllers_of(list(TASKS)).items():
+        assert names == [*CONTROLLERS, *shipped_policies(make_task(task))]
 
 
 def test_an_unknown_controller_is_an_error_that_names_the_known_ones():

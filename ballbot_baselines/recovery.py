@@ -1,0 +1,97 @@
+"""What no controller can exceed: the states from which some force within the limit still brings the robot to rest.
+
+For one given component of the initial state (its speed, say) and all others zero but the lean γ, the largest recoverable
+lean is itself an optimal-control problem:
+
+    maximize    γ_0        over γ_0 and forces u_k, |u_k| ≤ limit, held for control_dt
+    subject to  x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k) ≥ 0,   goal(x_n) ≤ 0 at the end of the episode
+
+Turning the world by 180° turns the largest lean into the smallest, so both sides of the boundary come from one search.
+"""
+
+from dataclasses import replace
+
+import casadi
+import numpy as np
+
+from ballbot_baselines import guess
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.optimum import shooting_ocp
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+_LEAN = 2  # index of γ in a state
+_REGULARIZATION = (
+    0.02  # rad; of squared actions, leans and lean rates: makes the optimum unique, and moves it by half a degree
+)
+_TOLERANCE = 1e-6
+_FEASIBLE = 1e-4  # SI units: at the boundary the robot hovers where rounding grows by e^7.8 a second
+_ITERATIONS = 300
+_PATIENCE = 3  # values in a row without a recoverable lean, after which it is sought no farther
+
+
+def largest_leans(task: Task, params: BallbotParams, component: int, values: np.ndarray) -> np.ndarray:
+    """For each value of one component of the initial state, the largest lean γ from which the goal can be reached.
+
+    Args:
+        task: without constants and with a goal at its end, as Stabilize.
+        params: the robot.
+        component: index of a state component other than γ.
+        values: (n,) ascending, in the component's SI unit.
+
+    Returns:
+        (n,) rad; NaN where none was found, as where no lean at all is recoverable. Each search starts from its neighbour's
+        solution, from the value nearest 0 outward, and if that fails from standing.
+    """
+    solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
+    leans = np.full(len(values), np.nan)
+    middle = int(np.argmin(np.abs(values)))
+    standing = _standing(task, params)
+    for order in (range(middle, len(values)), range(middle, -1, -1)):
+        start, failures = standing, 0
+        for i in order:
+            for x, a in (start, standing):
+                solution = _solve(solver, x, a, component, float(values[i]))
+                if found := solution.violation <= _FEASIBLE:
+                    leans[i] = solution.states[0, _LEAN]
+                    start = solution.states, solution.inputs
+                    break
+            failures = 0 if found else failures + 1
+            if failures == _PATIENCE:
+                break
+    return leans
+
+
+def _solve(solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, value: float) -> OcpSolution:
+    bounds = Bounds.free(solver.ocp, len(a))
+    known = [i for i in range(8) if i != _LEAN]
+    bounds.state_lower[0, known] = bounds.state_upper[0, known] = np.where(np.array(known) == component, value, 0.0)
+    bounds.input_lower[:], bounds.input_upper[:] = -1.0, 1.0
+    return solver.solve(x, a, bounds, [0.0, 0.0])
+
+
+def _standing(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+    path = np.zeros((task.steps + 1, 2))
+    x, u = guess.along_path(params, path, task.control_dt)
+    return np.column_stack([x, np.zeros(len(x))]), u
+
+
+def _largest_lean_ocp(task: Task, params: BallbotParams) -> Ocp:
+    """The task's problem with its initial lean free; a ninth state remembers it until the end, where it is the reward."""
+    fixed = shooting_ocp(task, params)
+    price = _REGULARIZATION * task.control_dt
+    same = np.zeros((1, 9))
+    same[0, _LEAN], same[0, 8] = 1.0, -1.0
+    return replace(
+        fixed,
+        name=f"{task.id}-recovery",
+        states=9,
+        next=lambda s, a, p: casadi.vertcat(fixed.next(s[:8], a, p), s[8]),
+        cost=lambda s, a, p: price * (casadi.sumsqr(a) + casadi.sumsqr(s[2:4]) + 0.1 * casadi.sumsqr(s[6:8])),
+        inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
+        final_cost=lambda s, p: -s[8],
+        final_inequalities=lambda s, p: casadi.vertcat(
+            fixed.final_inequalities(s[:8], p), *(-excess for excess in task.goal(s[:8], p[:0]))
+        ),
+        initial_matrix=same,
+    )

@@ -1,0 +1,27 @@
+"""Your own policy against LQR and trajectory optimization, by regret on the certified episodes.
+
+A policy is a function from observation to action, a Stable-Baselines3 model, a Controller or a policy file.
+"""
+
+import numpy as np
+import tyro
+
+from ballbot_train.console import print_table
+from ballbot_train.evaluate import HEADER, cells, evaluate
+
+GAIN = np.array([[0.3, 0, 1.3, 0, 0.7, 0, 1.3, 0], [0, 0.3, 0, 1.3, 0, 0.7, 0, 1.3]])
+
+
+def mine(observation: np.ndarray) -> np.ndarray:
+    """Action in [−1, 1]², of 350 N, for Stabilize's observation: position, lean, velocity and lean rate, scaled."""
+    return np.clip(GAIN @ observation, -1, 1)
+
+
+def main(task: str = "stabilize", episodes: int = 20) -> None:
+    """Prints one leaderboard row each."""
+    rows = [evaluate(policy, task, episodes) for policy in (mine, "lqr", "trajopt")]
+    print_table(f"{episodes} certified episodes of {task}", HEADER, [cells(row) for row in rows])
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,83 @@
+import math
+
+import numpy as np
+import pytest
+
+from ballbot_baselines.controller import FunctionController, rollout
+from ballbot_baselines.recovery import largest_leans
+from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_train import basins, figures
+
+LEAN_RATE = 6  # its index in a state
+
+
+@pytest.fixture(scope="module")
+def limits(params):
+    """Largest recoverable leans, degrees: standing, and at 0, 1 and 2 rad/s."""
+    return np.degrees(largest_leans(Stabilize(), params, LEAN_RATE, np.array([0.0, 1.0, 2.0])))
+
+
+def test_the_largest_recoverable_lean_is_the_one_that_the_force_limit_holds(limits, params):
+    held = math.degrees(math.atan(params.force_limit / (params.total_mass * params.gravity)))
+    assert held - 2 < limits[0] < held
+
+
+def test_the_faster_it_falls_the_less_lean_is_recoverable(limits):
+    assert limits[0] > limits[1] + 5 > limits[2] + 10
+
+
+def test_the_full_force_rights_what_is_within_the_boundary_and_not_what_is_beyond(limits, params, make_env):
+    env = make_env(physics="rk4")
+    full = FunctionController(lambda t, x: np.array([params.force_limit, 0.0]))
+    for lean, righted in ((limits[0] - 1, True), (limits[0] + 3, False)):
+        x = np.zeros(8)
+        x[2] = math.radians(lean)
+        leans = rollout(env, full, options={"state": x}).trajectory.x[:, 2]
+        assert (leans.min() < 0) == righted
+
+
+@pytest.fixture
+def bounds():
+    """40° either way at every value."""
+    values = np.array([-15.0, 0.0, 15.0])
+    right = np.column_stack([np.full(3, 40.0), values])
+    return {name: np.concatenate([right, -right]) for name in basins.AXES}
+
+
+def entry(i, j, recovered, axis="speed"):
+    return {"axis": axis, "controller": "lqr", "i": i, "j": j, "recovered": recovered}
+
+
+def test_only_states_that_may_be_recoverable_are_run_and_only_half_of_them(bounds):
+    work = basins.cell_jobs(bounds, ["lqr"], 5, "rk4")
+    cells = {cell for job in work for cell in job.items if job.arguments[0] == "speed"}
+    assert cells == {(i, j) for i in (2, 3, 4) for j in (1, 2, 3)}  # leans −75, −37.5, 0, 37.5, 75
+
+
+def test_a_state_from_which_a_controller_recovers_is_recoverable(bounds):
+    found = [entry(2, 2, True), entry(3, 4, True), entry(4, 3, False)]
+    basin = basins.maps_of(bounds, found, ["lqr"], 5)[0]
+    assert basin.recovered["lqr"].sum() == 3
+    assert basin.recovered["lqr"][3, 4]
+    assert basin.recovered["lqr"][1, 0]  # the same, turned by 180°
+    assert basin.recoverable.sum() == 15 + 2
+    assert basin.fraction("lqr") == pytest.approx(3 / 17)
+
+
+def test_lqr_recovers_upright_and_slow_but_not_fast(bounds, tmp_path):
+    work = [job for job in basins.cell_jobs(bounds, ["lqr"], 3, "rk4") if job.arguments[0] == "speed"]
+    done = basins.jobs.run(work, tmp_path, 1, lambda name, count: None)
+    recovered = {(e["i"], e["j"]): e["recovered"] for entries in done for e in entries}
+    assert recovered == {(1, 1): True, (2, 1): False}  # 0 and 15 m/s
+
+
+def test_maps_are_read_back_as_they_were_written_and_drawn(bounds, tmp_path):
+    maps = basins.maps_of(bounds, [entry(2, 2, True), entry(2, 1, True, "lean rate")], ["lqr"], 5)
+    basins.write(maps, {"commit": "none"}, tmp_path)
+    for wrote, read in zip(maps, basins.read(tmp_path), strict=True):
+        np.testing.assert_array_equal(wrote.recovered["lqr"], read.recovered["lqr"])
+        np.testing.assert_array_equal(wrote.boundary, read.boundary)
+    assert basins.recovered_fractions(tmp_path) == {("stabilize", "lqr"): pytest.approx(3 / 30)}
+    assert basins.recovered_fractions(tmp_path / "nowhere") == {}
+    assert len((tmp_path / "basins.csv").read_text().splitlines()) == 1 + 2 * 25
+    assert figures.save(figures.basin_figure(maps), tmp_path / "basins.png").exists()

@@ -1,0 +1,25 @@
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_policy_in_ten_lines_is_compared_with_lqr_and_trajectory_optimization(capsys):
+    load("compare_your_policy").main(episodes=2)
+    printed = capsys.readouterr().out
+    for name in ("mine", "lqr", "trajopt", "regret"):
+        assert name in printed
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_every_example_says_what_it_is(path):
+    assert load(path.stem).__doc__
