@@ -6,6 +6,9 @@ Components come first: a batch of B states is a tensor (8, B), so that every ope
 Random numbers are a hash of (the env's seed, the episode's number, the step, an index). So the same seed and actions give
 the same results in every batch, wherever the env stands in it, and ended episodes are drawn anew without a loop. They are
 not the numbers that `BallbotEnv` draws from NumPy's generator for the same seed.
+
+"The same" means bit by bit among eager batches, and among compiled ones of two or more envs; eager, compiled, and a compiled
+batch of one, whose sine is another library's, agree to rounding.
 """
 
 import logging
@@ -33,6 +36,9 @@ _log = logging.getLogger(__name__)
 
 COMPILE_FROM = 1024
 """Batch size from which compile="auto" compiles: below, compiling for half a minute seldom pays."""
+
+_FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
+"""The fields of `BatchStep` that are bools."""
 
 _WORD = 0xFFFFFFFF  # hashes are 32-bit words kept in int64, whose products then never overflow
 
@@ -79,8 +85,10 @@ class BatchStep(NamedTuple):
     """(2, B) N, what the actuator applied."""
     clipped: torch.Tensor
     """(B,) bool: the action was outside [−1, 1]."""
-    tilt: torch.Tensor
+    final_tilt: torch.Tensor
     """(B,) rad, of `final_x`; carries no gradient."""
+    tilt: torch.Tensor
+    """(B,) rad, of the states that follow: `final_x`, or where an episode ended the next one's start; no gradient."""
 
 
 class _Robot(NamedTuple):
@@ -152,7 +160,7 @@ class BallbotBatch:
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._compile = compile
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
-        self._run = _compiled(self.transition) if wanted else self.transition
+        self._run = _compiled(self._compilable) if wanted else self.transition
         self._proven = not wanted
 
     @property
@@ -201,11 +209,11 @@ class BallbotBatch:
             given = torch.tensor([-1 if s is None else s for s in _seeds(seed, self.num_envs)], device=self.device)
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c)
-        return new if old is None else _select(mask, new, old)
+        return self._stacked(new if old is None else _select(mask, new, _rows(old)))
 
     def observe(self, state: BatchState) -> torch.Tensor:
         """(B, no) observations of a state: a pure function, the sensors' noise included."""
-        return self._observe(state.x.unbind(0), state.c.unbind(0), state)
+        return self._observe(_rows(state))
 
     def step(self, actions: torch.Tensor) -> BatchStep:
         """Holds forces for one control step; see `transition`. Call `reset` first."""
@@ -221,7 +229,7 @@ class BallbotBatch:
             self._run = self.transition
             self.state, result = self._run(self.state, actions)
         self._proven = True
-        return result
+        return result._replace(**{name: getattr(result, name).bool() for name in _FLAGS}) if self.compiled else result
 
     def detach(self) -> None:
         """Cuts the gradient: later steps do not reach back behind this point."""
@@ -236,16 +244,18 @@ class BallbotBatch:
             actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1]. They are taken to be finite.
         """
         task, noise = self.task, self.randomization
-        x, c = state.x.unbind(0), state.c.unbind(0)
-        command = (actions.to(self.dtype).clamp(-1.0, 1.0) * self.params.force_limit).unbind(-1)
-        force, actuator = self._actuate(state, command)
+        now = _rows(state)
+        x, c = now.x, now.c
+        asked = actions.to(self.dtype).unbind(-1)
+        command = tuple(part.clamp(-1.0, 1.0) * self.params.force_limit for part in asked)
+        force, actuator = self._actuate(now, command)
         total = force
         if noise.pushes:
             z = _uniforms(_key(state.seed, state.episode, state.steps + 1), Randomization.PUSH_DRAWS, self.dtype)
             total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
         robot = self.params
         if noise.varies_robot:
-            robot = _Robot.of(noise.robot(self.params, state.drawn[:4].unbind(0)))
+            robot = _Robot.of(noise.robot(self.params, now.drawn[:4]))
 
         rate = task.cost(x, force, c)
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
@@ -259,22 +269,29 @@ class BallbotBatch:
         done = terminated | truncated
         cost = rate * task.control_dt + task.failure_cost * failure
 
-        after = state._replace(x=torch.stack(end), steps=steps, actuator=actuator)
+        after = now._replace(x=end, steps=steps, actuator=actuator)
         new = _select(done, self._start(state.seed, state.episode + 1), after)
         result = BatchStep(
-            observation=self._observe(new.x.unbind(0), new.c.unbind(0), new),
+            observation=self._observe(new),
             reward=-cost,
             terminated=terminated,
             truncated=truncated,
-            final_observation=self._observe(end, c, after),
-            final_x=after.x,
+            final_observation=self._observe(after),
+            final_x=torch.stack(end),
             success=success,
             failure=failure,
             force=torch.stack(force),
-            clipped=(actions.abs() > 1.0).any(-1),
-            tilt=_tilt(after.x),
+            clipped=_any(part.abs() > 1.0 for part in asked),
+            final_tilt=_tilt(end),
+            tilt=_tilt(new.x),
         )
-        return new, result
+        return self._stacked(new), result
+
+    def _compilable(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
+        """`transition` with its flags as numbers 0 and 1: torch's CPU code generator stores bools one by one."""
+        state, result = self.transition(state, actions)
+        numbers = {name: torch.where(getattr(result, name), 1.0, 0.0) for name in _FLAGS}
+        return state, result._replace(**numbers)
 
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""
@@ -287,44 +304,45 @@ class BallbotBatch:
     def _start(
         self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
     ) -> BatchState:
-        """The beginnings of episodes; x and c are drawn where they are not given."""
+        """The beginnings of episodes, in rows; x and c are drawn where they are not given."""
         task, noise = self.task, self.randomization
         key = _key(seed, episode, 0 * episode)
         varied = noise.varies_robot or noise.varies_actuator
         count = task.constant_draws + task.state_draws + Randomization.EPISODE_DRAWS * varied
-        z = _uniforms(key, count, self.dtype) if count else ()
+        z = _uniforms(key, count, self.dtype)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
-        none = torch.zeros(0, *seed.shape, dtype=self.dtype, device=seed.device)
-        if c is None:
-            constants = task.draw_constants(z_constants, self.params)
-            c = torch.stack(constants) if constants else none
-        if x is None:
-            x = torch.stack(task.draw_state(z[: task.state_draws], c.unbind(0), self.params))
+        constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
+        state = task.draw_state(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
         zero = torch.zeros_like(episode)
-        drawn = actuator = none
-        if varied:
-            drawn = torch.stack(noise.draw(z[task.state_draws :], task.control_dt))
-        if noise.varies_actuator:
-            actuator = x.new_zeros(2 + 2 * self._past_steps, *seed.shape)
-        return BatchState(x, c, zero, episode, seed, drawn, actuator)
+        drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
+        still = torch.zeros_like(seed, dtype=self.dtype)
+        actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
+        return BatchState(state, constants, zero, episode, seed, drawn, actuator)
 
-    def _actuate(self, state: BatchState, command: tuple) -> tuple[tuple, torch.Tensor]:
-        """Force (2) applied, and the actuator's new memory."""
+    def _actuate(self, now: BatchState, command: tuple) -> tuple[tuple, tuple]:
+        """Force (2) applied, and the actuator's new memory, of a state in rows."""
         if not self.randomization.varies_actuator:
-            return command, state.actuator
-        memory = state.actuator.unbind(0)
-        pairs = tuple(zip(memory[::2], memory[1::2], strict=True))
-        force = actuate(command, pairs[1:], pairs[0], state.drawn[4], state.drawn[5])
+            return command, now.actuator
+        pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
+        force = actuate(command, pairs[1:], pairs[0], now.drawn[4], now.drawn[5])
         kept = (command, *pairs[1:])[: self._past_steps]
-        return force, torch.stack([part for pair in (force, *kept) for part in pair])
+        return force, tuple(part for pair in (force, *kept) for part in pair)
 
-    def _observe(self, x: tuple, c: tuple, state: BatchState) -> torch.Tensor:
-        """(B, no) of states x with the sensors' noise, which is drawn for the episode's steps so far."""
+    def _observe(self, now: BatchState) -> torch.Tensor:
+        """(B, no) of a state in rows with the sensors' noise, which is drawn for the episode's steps so far."""
+        x = now.x
         if self.randomization.is_noisy:
-            key = _key(state.seed, state.episode, state.steps + 1)
+            key = _key(now.seed, now.episode, now.steps + 1)
             z = _uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
             x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :])
-        return torch.stack(self.task.observe(x, c), dim=-1)
+        return torch.stack(self.task.observe(x, now.c)).T
+
+    def _stacked(self, rows: BatchState) -> BatchState:
+        """A state in rows as tensors."""
+        none = torch.zeros(0, *rows.seed.shape, dtype=self.dtype, device=rows.seed.device)
+        return BatchState(
+            *(part if isinstance(part, torch.Tensor) else torch.stack(part) if part else none for part in rows)
+        )
 
 
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
@@ -334,7 +352,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     otherwise. Episodes restart within the step in which they end (`AutoresetMode.SAME_STEP`): then `infos` has, under
     `final_obs` and `final_info`, what that step showed before the restart. In `final_info`, only the envs that the masks
     `_…` mark are meant. Arrays returned are never written to again; `state` and `constants` in `infos` are the batch's
-    own memory, and read-only.
+    own memory, and read-only. Observations and states lie in memory component by component (Fortran order), as those of
+    Gymnasium's own batched CartPole; give actions in that order too and they are not copied.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -409,7 +428,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             observation = self.batch.observe(state)
         size = self.num_envs
         infos = self._info(
-            state, np.zeros(size), self._array(_tilt(state.x)), np.zeros((size, 2)), *np.zeros((3, size), bool)
+            state,
+            np.zeros(size),
+            self._array(_tilt(state.x.unbind(0))),
+            np.zeros((size, 2)),
+            *np.zeros((3, size), bool),
         )
         return self._array(observation, np.float32), _masked(infos, mask)
 
@@ -425,7 +448,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
-        actions = np.asarray(actions, self._dtype)
+        actions = np.asarray(actions, self._dtype, order="F")  # components contiguous, as everything in the batch
         if actions.shape != (self.num_envs, 2):
             raise ValueError(f"actions must have shape ({self.num_envs}, 2), not {actions.shape}")
         if not np.isfinite(actions).all():
@@ -437,21 +460,23 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         reward = self._array(result.reward, np.float64)
         terminated, truncated = self._array(result.terminated), self._array(result.truncated)
         done = terminated | truncated
+        ended = np.flatnonzero(done)
         cost, tilt = -reward, self._array(result.tilt)
-        force, clipped = self._array(result.force.T), self._array(result.clipped)
+        force, clipped = self._array(result.force), self._array(result.clipped)
         infos: dict[str, Any] = {}
-        if done.any():
+        if ended.size:
             success, failure = self._array(result.success), self._array(result.failure)
-            ended = before._replace(x=result.final_x)
-            infos["final_info"] = _masked(self._info(ended, cost, tilt, force, success, failure, clipped), done)
-            infos["final_obs"] = _rows(self._array(result.final_observation, np.float32), done)
+            final = before._replace(x=result.final_x)
+            final_tilt = self._array(result.final_tilt)
+            final_info = self._info(final, cost, final_tilt, force.T, success, failure, clipped)
+            infos["final_info"] = _masked(final_info, done)
+            infos["final_obs"] = _some_rows(self._array(result.final_observation, np.float32), ended)
             infos["_final_info"] = infos["_final_obs"] = done
             # What follows is of the next episodes where one ended, and they begin as after `reset`.
-            cost, force, clipped = np.where(done, 0.0, cost), np.where(done[:, None], 0, force), clipped & ~done
-            tilt = tilt.copy()
-            tilt[done] = self._array(_tilt(self.batch.state.x[:, torch.from_numpy(done)]))
+            cost, force, clipped = cost.copy(), force.copy(), clipped.copy()
+            cost[ended], force[:, ended], clipped[ended] = 0.0, 0.0, False
         never = np.zeros_like(done)
-        info = self._info(self.batch.state, cost, tilt, force, never, never.copy(), clipped)
+        info = self._info(self.batch.state, cost, tilt, force.T, never, never.copy(), clipped)
         infos |= _masked(info, np.ones_like(done))
         return self._array(result.observation, np.float32), reward, terminated, truncated, infos
 
@@ -583,12 +608,25 @@ def _compiled(transition: Any) -> Any:
     """
     function = transition.__func__
     own = types.FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
-    return torch.compile(types.MethodType(own, transition.__self__), fullgraph=True, dynamic=False)
+    # By default no loop takes more than 64 operations, and what crosses from one loop to the next goes through memory.
+    options = {"max_fusion_size": 1000}
+    return torch.compile(types.MethodType(own, transition.__self__), fullgraph=True, dynamic=False, options=options)
+
+
+def _rows(state: BatchState) -> BatchState:
+    """The state with each of its matrices as a tuple of rows (B,), the form in which everything is computed."""
+    return BatchState(*(part.unbind(0) if part.ndim == 2 else part for part in state))
 
 
 def _select(mask: torch.Tensor, new: BatchState, old: BatchState) -> BatchState:
-    """The new state where the mask (B,) holds, else the old."""
-    return BatchState(*(torch.where(mask, a, b) if a.numel() else a for a, b in zip(new, old, strict=True)))
+    """The new state where the mask (B,) holds, else the old, both in rows."""
+
+    def chosen(a: Any, b: Any) -> Any:
+        if isinstance(a, tuple):
+            return tuple(map(chosen, a, b))
+        return a if a is b else torch.where(mask, a, b)
+
+    return BatchState(*map(chosen, new, old))
 
 
 def _all(conditions: Any) -> torch.Tensor:
@@ -599,10 +637,18 @@ def _all(conditions: Any) -> torch.Tensor:
     return first
 
 
-def _tilt(x: torch.Tensor) -> torch.Tensor:
-    """(B,) rad of states (8, B), without gradient, which is infinite at upright."""
+def _any(conditions: Any) -> torch.Tensor:
+    """Elementwise or."""
+    first, *others = conditions
+    for condition in others:
+        first = first | condition
+    return first
+
+
+def _tilt(x: tuple) -> torch.Tensor:
+    """(B,) rad of states of 8 rows, without gradient, which is infinite at upright."""
     # float rounding can leave a cosine a hair above 1
-    return torch.acos(dynamics.cos_tilt(x.detach().unbind(0)).clamp(max=1.0))
+    return torch.acos(dynamics.cos_tilt(tuple(part.detach() for part in x)).clamp(max=1.0))
 
 
 def _mix(word: torch.Tensor) -> torch.Tensor:
@@ -619,8 +665,8 @@ def _key(seed: torch.Tensor, episode: torch.Tensor, step: torch.Tensor) -> torch
 
 def _uniforms(key: torch.Tensor, count: int, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
     """`count` tensors (B,) of uniform numbers in [0, 1), multiples of 2⁻²⁴ and so the same in both dtypes."""
-    index = torch.arange(1, count + 1, device=key.device).unsqueeze(1) * 0x9E3779B9
-    return ((_mix((key + index) & _WORD) >> 8).to(dtype) * 2.0**-24).unbind(0)
+    words = (_mix((key + 0x9E3779B9 * i) & _WORD) for i in range(1, count + 1))
+    return tuple((word >> 8).to(dtype) * 2.0**-24 for word in words)
 
 
 def _seeds(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
@@ -664,8 +710,8 @@ def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     return {key: part for name, value in info.items() for key, part in ((name, value), (f"_{name}", mask))}
 
 
-def _rows(array: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Gymnasium's layout of `final_obs`: (B,) objects, a row where the mask holds, else None."""
-    rows = np.full(len(array), None, dtype=object)
-    rows[mask] = np.fromiter(array[mask], dtype=object, count=np.count_nonzero(mask))
-    return rows
+def _some_rows(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Gymnasium's layout of `final_obs`: (B,) objects, a row of the array where an index is given, else None."""
+    objects = np.empty(len(array), dtype=object)  # full of None
+    objects[rows] = np.fromiter(array[rows], dtype=object, count=len(rows))
+    return objects

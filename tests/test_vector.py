@@ -128,6 +128,16 @@ def test_state_that_is_not_finite_fails_and_its_neighbours_go_on():
     assert torch.isfinite(batch.state.x).all()
 
 
+def test_tilt_is_of_the_state_that_follows_and_final_tilt_of_the_one_before_the_restart():
+    batch = BallbotBatch("stabilize", 64, dtype=torch.float64, compile=False, duration=0.1)
+    batch.reset(seed=0)
+    for _ in range(7):
+        result = batch.step(torch.zeros(64, 2))
+        for tilt, x in ((result.tilt, batch.state.x), (result.final_tilt, result.final_x)):
+            np.testing.assert_allclose(np.cos(tilt), np.cos(x[2]) * np.cos(x[3]), rtol=1e-12)
+        assert (result.final_tilt != result.tilt).tolist() == (result.terminated | result.truncated).tolist()
+
+
 def test_batch_agrees_with_pybullet_to_its_integrators_error(params):
     """Bullet is of first order, so its distance from the RK4 model falls to a quarter with a quarter of its step."""
     x0, action = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0), (60 / 350, -40 / 350)
@@ -480,19 +490,26 @@ def test_detach_cuts_the_gradient():
 
 @pytest.mark.skipif(not vector._has_compiler(torch.device("cpu")), reason="no C++ compiler")
 def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wherever_an_env_stands():
-    """37 envs fill vector registers and leave a remainder, and turning the order round moves each to another place."""
+    """37 envs fill vector registers and leave a remainder, 5 fill none, and turning the order round moves each elsewhere."""
     actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
     with torch.no_grad():
         compiled = BallbotBatch("stabilize", 37, compile=True, duration=0.2)
         results = play(compiled, actions, range(37))
         assert compiled.compiled
         turned = play(compiled, actions.flip(1), range(36, -1, -1))
-        eager = play(BallbotBatch("stabilize", 37, compile=False, duration=0.2), actions)
-    for a, b in zip(turned, results, strict=True):
+        few = play(BallbotBatch("stabilize", 5, compile=True, duration=0.2), actions[:, 7:12], range(7, 12))
+        uncompiled = BallbotBatch("stabilize", 37, compile=False, duration=0.2)
+        eager = play(uncompiled, actions)
+        last, last_eager = compiled.step(actions[0]), uncompiled.step(actions[0])
+    for a, b, c in zip(turned, results, few, strict=True):
         assert torch.equal(a.flip(1), b)
+        assert torch.equal(c, b[:, 7:12])
     for a, b in zip(results, eager, strict=True):
         # 10 steps to an end, over which rounding grows by e^(7.8 · 0.2)
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+    for name in last._fields:
+        a, b = getattr(last, name), getattr(last_eager, name)
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), name
 
 
 def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monkeypatch, caplog):
