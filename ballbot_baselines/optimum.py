@@ -170,7 +170,7 @@ def _goal_room(task: Task, x: casadi.SX, p: casadi.SX, nc: int) -> casadi.SX:
     return (1 - p[nc + 1]) ** 2 - 1 - casadi.vertcat(*task.goal(x, p[:nc]))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _solver(task: Task, params: BallbotParams, steps: int, solver: str, coarseness: int = 1) -> OcpSolver:
     return OcpSolver(shooting_ocp(task, params, coarseness), steps, solver)
 

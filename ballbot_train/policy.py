@@ -47,6 +47,8 @@ class PolicySpec:
     """After each hidden layer."""
     linear: bool = True
     """Whether a linear part is added to the network's output."""
+    odd: bool = False
+    """Whether opposite observations get opposite actions, exactly: no biases. Needs an odd activation."""
     squash: Literal["tanh", "clip"] = "tanh"
     """How the sum is brought into [−1, 1]."""
     observation_version: int = OBSERVATION_VERSION
@@ -66,15 +68,15 @@ class PolicyNetwork(torch.nn.Module):
     def __init__(self, spec: PolicySpec):
         super().__init__()
         self.spec = spec
-        self.linear = torch.nn.Linear(spec.observations, 2) if spec.linear else None
+        self.linear = torch.nn.Linear(spec.observations, 2, bias=not spec.odd) if spec.linear else None
         widths = (spec.observations, *spec.hidden)
         layers: list[torch.nn.Module] = []
         for inputs, outputs in itertools.pairwise(widths):
-            layers += [torch.nn.Linear(inputs, outputs), _ACTIVATIONS[spec.activation]()]
-        last = torch.nn.Linear(widths[-1], 2)
+            layers += [torch.nn.Linear(inputs, outputs, bias=not spec.odd), _ACTIVATIONS[spec.activation]()]
+        last = torch.nn.Linear(widths[-1], 2, bias=not spec.odd)
         if spec.linear:  # so that the policy starts as its linear part
-            torch.nn.init.zeros_(last.weight)
-            torch.nn.init.zeros_(last.bias)
+            for part in last.parameters():
+                torch.nn.init.zeros_(part)
         self.mlp = torch.nn.Sequential(*layers, last)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,175 @@
+"""Demonstrations: what a dataset promises, and that a kill neither loses nor doubles an episode."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import minari
+import numpy as np
+import pytest
+
+from ballbot_baselines.optimum import PlanError
+from ballbot_baselines.trajopt import EXECUTED
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_train.demos import DemoConfig, Expert, load_demos, record, write_demos
+
+
+def make(out, **changes):
+    fields = {"task": "stabilize", "expert": "lqr", "episodes": 3, "physics": "rk4"} | changes
+    return write_demos(DemoConfig(**fields), out, workers=1, on_progress=lambda count: None)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make(tmp_path_factory.mktemp("demos") / "tiny-v0", expert="trajopt")
+
+
+def content(folder):
+    """All that a dataset holds, comparable."""
+    data = minari.MinariDataset(folder / "data")
+    episodes = [
+        (e.observations.tolist(), e.actions.tolist(), e.rewards.tolist(), e.infos["expert_action"].tolist())
+        for e in data
+    ]
+    return episodes, [str(sorted(m.items())) for m in data.storage.get_episode_metadata(data.episode_indices)]
+
+
+def test_a_dataset_loads_by_its_id_and_recovers_its_environment(dataset, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(dataset.parent))
+    data = minari.load_dataset(dataset.name)
+    assert data.total_episodes == 3
+    env = data.recover_environment()
+    assert env.spec.id == "BallbotStabilize-v0"
+    assert env.unwrapped.physics == "rk4"
+    assert list(minari.list_local_datasets()) == [dataset.name]
+    env.close()
+
+
+def test_seeds_and_actions_replay_the_episodes(dataset):
+    data = minari.MinariDataset(dataset / "data")
+    env = data.recover_environment()
+    for episode, metadata in zip(data, data.storage.get_episode_metadata(data.episode_indices), strict=True):
+        observation, _ = env.reset(seed=metadata["seed"])
+        assert np.array_equal(observation, episode.observations[0])
+        for action, after, reward in zip(episode.actions, episode.observations[1:], episode.rewards, strict=True):
+            observation, again, *_ = env.step(action)
+            assert np.array_equal(observation, after)
+            assert again == reward
+    env.close()
+
+
+def test_every_episode_says_who_showed_it_and_how_good_that_is(dataset):
+    data = minari.MinariDataset(dataset / "data")
+    for metadata in data.storage.get_episode_metadata(data.episode_indices):
+        assert metadata["expert"] == "trajopt"
+        assert metadata["solver_status"] == "fatrop: Solve_Succeeded"
+        assert metadata["cost"] > 0.999 * metadata["optimum"]  # the horizon ends a little before rest
+        assert metadata["plans"] >= 1
+
+
+def test_labels_are_the_experts_and_not_what_was_executed(dataset):
+    demos = load_demos(dataset, make_task("stabilize"))
+    noise = demos.executed - demos.actions
+    assert 0 < np.median(np.abs(noise)) < 0.05
+    assert np.abs(noise).max() > 0.3  # a push
+    assert np.abs(demos.actions).max() <= 1
+
+
+def test_loaded_steps_follow_each_other(dataset):
+    demos = load_demos(dataset, make_task("stabilize"))
+    assert len(demos) == 3 * 400
+    assert demos.observations.dtype == demos.actions.dtype == demos.rewards.dtype == np.float32
+    inside = ~(demos.terminations | demos.truncations)[:-1]
+    assert np.array_equal(demos.next_observations[:-1][inside], demos.observations[1:][inside])
+    assert (demos.terminations | demos.truncations).sum() == 3
+
+
+def test_a_dataset_of_another_task_is_refused(dataset, tmp_path):
+    with pytest.raises(ValueError, match=r"holds demonstrations of Stabilize.*not of Turn"):
+        load_demos(dataset, make_task("turn"))
+    with pytest.raises(ValueError, match="not of Stabilize"):
+        load_demos(dataset, make_task("stabilize", duration=4.0))
+    with pytest.raises(ValueError, match="no dataset"):
+        load_demos(tmp_path, make_task("stabilize"))
+
+
+def test_a_finished_dataset_is_kept_and_another_never_overwrites_it(tmp_path):
+    folder = make(tmp_path / "kept-v0")
+    before = content(folder)
+    assert content(make(tmp_path / "kept-v0")) == before
+    with pytest.raises(ValueError, match="another dataset"):
+        make(tmp_path / "kept-v0", seed=1)
+    with pytest.raises(ValueError, match="NAME-vNUMBER"):
+        make(tmp_path / "unversioned")
+    assert [path.name for path in tmp_path.iterdir()] == ["kept-v0"]
+
+
+@pytest.mark.parametrize("wrong", [{"task": "hop"}, {"expert": "me"}, {"episodes": 0}, {"noise": -1.0}])
+def test_settings_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"hop|me|0|noise"):
+        DemoConfig(**wrong)
+
+
+def test_the_expert_recovers_from_pushes():
+    """With a push every half second NMPC's own plan from where it was pushed keeps what LQR's region cannot."""
+    env = BallbotEnv("stabilize", physics="rk4")
+    expert = Expert("nmpc", env.task, env.params, EXECUTED)
+    start = {"state": [1, 0, 0, 0, 0, 3, 0, 0]}
+    recording, info = record(env, expert, np.random.default_rng(1), noise=0.02, pushes=2.0, options=start)
+    assert expert.plans > 5
+    assert not info["failure"]
+    assert len(recording.actions) == env.task.steps
+    env.close()
+
+
+def test_an_expert_without_a_plan_keeps_its_last_one():
+    env = BallbotEnv("stabilize", physics="rk4")
+    expert = Expert("trajopt", env.task, env.params)
+    x = np.array([1.0, 0, 0, 0, 0, 1, 0, 0])
+    expert.reset(0.0, x, np.zeros(0))
+    before = expert.label(0.0, x)
+    expert.replan(0.0, np.array([0, 0, 1.39, 0, 0, 0, 9.0, 0]))  # falling: no force could help
+    assert expert.plans_failed == 1
+    assert np.array_equal(expert.label(0.0, x), before)
+    with pytest.raises(PlanError):
+        expert.reset(0.0, np.array([0, 0, 1.39, 0, 0, 0, 9.0, 0]), np.zeros(0))
+    env.close()
+
+
+def test_killed_at_any_time_it_resumes_to_the_identical_dataset(tmp_path):
+    """SIGKILL while episodes are being recorded in two processes, twice, then to the end."""
+    options = ["--expert", "lqr", "--physics", "rk4", "--episodes", "20", "--workers", "2"]
+
+    def start(out):
+        command = [sys.executable, "-m", "ballbot_train.cli", "demos", *options, "--out", str(out)]
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+
+    killed, whole = tmp_path / "killed-v0", tmp_path / "whole-v0"
+    assert start(whole).wait() == 0
+    lines = tmp_path / ".killed-v0.unfinished" / "unfinished"
+    for _ in range(2):
+        process = start(killed)
+        seen = sum(path.read_text().count("\n") for path in lines.glob("*.jsonl")) if lines.exists() else 0
+        while process.poll() is None:
+            now = sum(path.read_text().count("\n") for path in lines.glob("*.jsonl")) if lines.exists() else 0
+            if now > seen:
+                break
+            time.sleep(0.01)
+        time.sleep(random.uniform(0, 0.3))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert start(killed).wait() == 0
+    assert content(killed) == content(whole)
+    seeds = [json.loads(str(m["seed"])) for m in _metadata(killed)]
+    assert seeds == [1_000_000 + i for i in range(20)]
+    assert not lines.parent.exists()
+
+
+def _metadata(folder):
+    data = minari.MinariDataset(folder / "data")
+    return data.storage.get_episode_metadata(data.episode_indices)

@@ -1,0 +1,161 @@
+"""Behaviour cloning and DAgger: they fit, and go on from a state as if never stopped."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ballbot_baselines.optimum import Backoff, find_optimum
+from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_train import training
+from ballbot_train.demos import DemoConfig, load_demos, write_demos
+from ballbot_train.learners import bc, dagger
+
+TINY_BC = bc.BcConfig(iterations=4, steps=20, batch=128, hidden=(16,))
+TINY_DAGGER = dagger.DaggerConfig(
+    iterations=4,
+    gathering=2,
+    episodes=1,
+    candidates=2,
+    drives=1,
+    longest=0.2,
+    steps=5,
+    batch=64,
+    hidden=(8,),
+    guesses=1,
+)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    config = DemoConfig("stabilize", "lqr", episodes=4, physics="rk4")
+    return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1, lambda count: None)
+
+
+def parameters(learner):
+    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
+
+
+def stopped_and_whole(make):
+    """The same learner run through, and stopped in the middle, saved, and continued by another."""
+    whole = make()
+    for _ in range(whole.iterations):
+        whole.iterate()
+    first = make()
+    for _ in range(first.iterations // 2):
+        first.iterate()
+    second = make()
+    torch.manual_seed(99)  # nothing depends on what else is drawn
+    second.load_state_dict(first.state_dict())
+    while second.iteration < second.iterations:
+        second.iterate()
+    return whole, second
+
+
+def test_cloning_lowers_the_loss_and_comes_near_its_expert(demos):
+    learner = bc.make(make_task("stabilize"), default_params(), TINY_BC, 0, demos)
+    losses = [learner.iterate()["loss/imitation"] for _ in range(learner.iterations)]
+    assert losses[-1] < losses[0]
+    data = load_demos(demos, make_task("stabilize"))
+    with torch.no_grad():
+        error = learner.network(torch.as_tensor(data.observations)).numpy() - data.actions
+    assert np.square(error).mean() < 0.1 * np.square(data.actions).mean()
+
+
+def test_cloning_without_demonstrations_says_what_it_needs():
+    with pytest.raises(ValueError, match="ballbot demos"):
+        bc.make(make_task("stabilize"), default_params(), TINY_BC, 0, None)
+
+
+@pytest.mark.parametrize("learner", [bc, dagger])
+def test_demonstrations_of_another_task_are_refused(learner, demos):
+    with pytest.raises(ValueError, match="not of Orbit"):
+        learner.make(make_task("orbit"), default_params(), learner.TUNED["orbit"], 0, demos)
+
+
+def test_cloning_goes_on_from_its_state_as_if_never_stopped(demos):
+    task, params = make_task("stabilize"), default_params()
+    whole, continued = stopped_and_whole(lambda: bc.make(task, params, TINY_BC, 0, demos))
+    assert torch.equal(parameters(whole), parameters(continued))
+
+
+@pytest.mark.parametrize("demonstrated", [False, True])
+def test_dagger_goes_on_from_its_state_as_if_never_stopped(demos, demonstrated):
+    task, params = make_task("stabilize"), default_params()
+    given = demos if demonstrated else None
+    whole, continued = stopped_and_whole(lambda: dagger.make(task, params, TINY_DAGGER, 0, given))
+    assert torch.equal(parameters(whole), parameters(continued))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_dagger_labels_what_it_meets_on_every_task(name):
+    task = TASKS[name]()
+    settings = (
+        "iterations",
+        "gathering",
+        "episodes",
+        "candidates",
+        "drives",
+        "longest",
+        "steps",
+        "batch",
+        "hidden",
+        "guesses",
+    )
+    config = replace(dagger.TUNED[name], **{field: getattr(TINY_DAGGER, field) for field in settings})
+    learner = dagger.Dagger(task, default_params(), config)
+    figures = learner.iterate()
+    assert figures["train/samples"] > 0
+    state = learner.state_dict()
+    observations, actions, _ = state["samples"]
+    assert observations.shape[1] == len(task.observation_scale)
+    assert torch.isfinite(observations).all()
+    assert actions.abs().max() <= 1
+
+
+def feedback_errors(task, plan, c, backoff, gains, scale):
+    """What the optimum's force changes by in disturbed states, and by how much each of several gains misses that, N."""
+    params, rng = default_params(), np.random.default_rng(3)
+    changes, errors = [], []
+    for k in (3, 10, 20):
+        off = scale * np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3]) * rng.standard_normal(8)
+        path = plan.trajectory.x[k:, :2]
+        again = find_optimum(task, params, plan.trajectory.x[k] + off, c, backoff, paths=[path])
+        changes.append(again.trajectory.u[0] - plan.trajectory.u[k])
+        errors.append([np.abs(changes[-1] + gain[k] @ off).mean() for gain in gains])
+    return np.abs(changes).mean(), np.mean(errors, axis=0)
+
+
+def test_the_tube_gives_the_forces_that_the_optimum_from_there_would():
+    task, c = make_task("stabilize"), np.zeros(0)
+    plan = find_optimum(task, default_params(), np.array([1.0, 0, 0, 0, 0, 3, 0, 0]), c)
+    change, (error,) = feedback_errors(
+        task, plan, c, Backoff(), [dagger.tube_gains(task, default_params(), plan, c)], 0.5
+    )
+    assert error < 0.15 * change
+
+
+def test_where_the_goal_ends_the_episode_the_tube_leaves_the_freedom_that_the_optimum_has():
+    """Tracking wants to arrive in the goal's middle at the planned time, which a short turn does not need."""
+    task, params, c, backoff = make_task("turn"), default_params(), np.array([2.3]), Backoff(goal=0.3, force=0.02)
+    plan = find_optimum(task, params, np.array([0, -1, 0, 0, 0, 2.3, 0, 0]), c, backoff)
+    tracking = TvlqrController.for_task(task, params, plan.trajectory, c).gains.k
+    _, errors = feedback_errors(task, plan, c, backoff, [dagger.tube_gains(task, params, plan, c), tracking], 0.3)
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_dagger_falls_far_less_than_lqr_after_two_rounds():
+    """LQR, within the limits of tanh, is where it starts; eight planned episodes and their surroundings halve its falls."""
+    task, params = make_task("stabilize"), default_params()
+    small = {"iterations": 4, "gathering": 2, "episodes": 4, "candidates": 0, "batch": 256, "hidden": (64,)}
+    learner = dagger.Dagger(task, params, replace(dagger.TUNED["stabilize"], **small))
+    before = training.score(learner.network, task)
+    for _ in range(small["iterations"]):
+        learner.iterate()
+    after = training.score(learner.network, task)
+    assert after.failures < 0.6 * before.failures
+    assert after.cost_ratio < 0.6 * before.cost_ratio

@@ -1,0 +1,160 @@
+"""PPO and SAC, with and without demonstrations: they run, and go on from a state as if never stopped."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
+from ballbot_train.demos import DemoConfig, Demos, load_demos, write_demos
+from ballbot_train.learners import LEARNERS, ppo, sac
+from ballbot_train.learners.model_free import OwnRandomness, TrainingEnv
+from ballbot_train.policy import load_network, save_policy
+
+IMITATING = {"clone_iterations": 2, "clone_steps": 5, "clone_batch": 32, "critic_iterations": 1}
+TINY = {
+    "ppo": ppo.PpoConfig(iterations=3, envs=4, steps=16, episode=0.4, hidden=(16, 8), batch=32, epochs=2, **IMITATING),
+    "sac": sac.SacConfig(
+        iterations=3, envs=4, steps=8, gradient_steps=2, episode=0.2, hidden=(16, 8), batch=16, **IMITATING
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    config = DemoConfig("stabilize", "lqr", episodes=4, physics="rk4")
+    return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1, lambda count: None)
+
+
+@pytest.fixture(params=["ppo", "sac"])
+def name(request):
+    return request.param
+
+
+def make(name, demos=None, seed=0):
+    return LEARNERS[name].make(make_task("stabilize"), default_params(), TINY[name], seed, demos)
+
+
+def run(learner, iterations=None):
+    for _ in range(learner.iterations - learner.iteration if iterations is None else iterations):
+        figures = learner.iterate()
+    assert all(np.isfinite(float(value)) for value in figures.values())
+    return learner
+
+
+def parameters(learner):
+    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
+
+
+def through_a_file(state):
+    """As a checkpoint does: tensors and plain values only."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
+
+
+@pytest.mark.parametrize("demonstrated", [False, True])
+def test_a_learner_goes_on_from_its_state_as_if_never_stopped(name, demonstrated, demos):
+    demos = demos if demonstrated else None
+    whole = make(name, demos)
+    start = parameters(whole)
+    run(whole)
+    for stop in (0, whole.iterations // 2, whole.iterations - 1):
+        first = run(make(name, demos), stop) if stop else make(name, demos)
+        state = through_a_file(first.state_dict())
+        second = make(name, demos, seed=1)
+        second.load_state_dict(state)
+        torch.manual_seed(99)  # nothing depends on what else is drawn
+        np.random.seed(99)
+        assert torch.equal(parameters(run(second)), parameters(whole))
+    assert not torch.equal(parameters(whole), start)
+    assert not torch.equal(parameters(run(make(name, demos, seed=1))), parameters(whole))
+
+
+def test_the_policy_acts_as_the_actor_does(name, tmp_path):
+    task, learner = make_task("stabilize"), make(name)
+    run(learner, 1)
+    observation = np.random.default_rng(0).normal(size=(100, 8)).astype(np.float32)
+    save_policy(tmp_path / "policy", learner.network, {})
+    with torch.no_grad():
+        actions = load_network(tmp_path / "policy", task)(torch.as_tensor(observation))
+    expected, _ = learner._model.predict(observation, deterministic=True)
+    np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
+
+
+def test_demonstrations_of_another_task_are_refused(name, demos):
+    with pytest.raises(ValueError, match="not of Orbit"):
+        LEARNERS[name].make(make_task("orbit"), default_params(), TINY[name], 0, demos)
+
+
+def test_every_task_has_settings_of_ppo_and_sac(task, name):
+    key = type(task).__name__.lower()
+    settings = LEARNERS[name].tuned[key]
+    TrainingEnv(task, default_params(), 2, settings.episode, settings.fall_price, settings.reward_scale)
+
+
+def test_with_demonstrations_it_first_imitates_and_then_teaches_its_critic_alone(name, demos):
+    learner = make(name, demos)
+    cloned = parameters(run(learner, TINY[name].clone_iterations))
+    assert learner._model.num_timesteps == 0
+    assert torch.equal(parameters(run(learner, TINY[name].critic_iterations)), cloned)
+    assert learner._model.num_timesteps > 0
+    assert not torch.equal(parameters(run(learner, 1)), cloned)
+
+
+def test_cloning_comes_near_the_expert(name, demos):
+    learner = LEARNERS[name].make(
+        make_task("stabilize"), default_params(), replace(TINY[name], clone_steps=200), 0, demos
+    )
+    run(learner, TINY[name].clone_iterations)
+    data = load_demos(demos, make_task("stabilize"))
+    with torch.no_grad():
+        error = learner.network(torch.as_tensor(data.observations)).numpy() - data.actions
+    assert np.square(error).mean() < 0.3 * np.square(data.actions).mean()
+
+
+def test_half_of_what_sac_learns_from_is_demonstrated(demos):
+    learner = run(make("sac", demos))
+    demonstrated = load_demos(demos, make_task("stabilize")).observations
+    sample = learner._model.replay_buffer.sample(16).observations.numpy()
+    shown = [(row == demonstrated).all(1).any() for row in sample]
+    assert shown == [False] * 8 + [True] * 8
+
+
+def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
+    one = np.ones((1, 8), np.float32)
+    action, flag = np.zeros((1, 2), np.float32), np.ones(1, bool)
+    shown = Demos(one, action, np.array([-3.0], np.float32), one, ~flag, flag, action + 0.5)
+    learner = sac.Sac(make_task("stabilize"), default_params(), TINY["sac"], 0, shown)
+    run(learner, TINY["sac"].clone_iterations + 1)
+    sample = learner._model.replay_buffer.sample(2)
+    assert float(sample.rewards[1]) == pytest.approx(-3 * TINY["sac"].reward_scale)
+    assert float(sample.dones[1]) == 0
+    assert sample.actions[1].tolist() == [0.5, 0.5]
+
+
+def test_training_envs_never_end_together():
+    env = TrainingEnv(make_task("stabilize", max_tilt=1.5), default_params(), 5, 0.4, 300.0, 0.1)
+    env.reset()
+    ends = [env.step(np.zeros((5, 2)))[2].sum() for _ in range(20)]
+    assert max(ends) == 1
+    assert sum(ends) == 5
+
+
+def test_a_learners_random_numbers_are_its_own():
+    own = OwnRandomness()
+    with own:
+        first = torch.rand(3), np.random.rand(3)
+    state = own.state_dict()
+    with own:
+        expected = torch.rand(3), np.random.rand(3)
+    own.load_state_dict(state)
+    torch.rand(5)
+    with own:
+        again = torch.rand(3), np.random.rand(3)
+    assert torch.equal(again[0], expected[0])
+    assert np.array_equal(again[1], expected[1])
+    assert not torch.equal(first[0], expected[0])

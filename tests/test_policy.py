@@ -1,0 +1,92 @@
+"""Policy files: what was saved comes back, and nothing else is accepted."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from ballbot_baselines.controller import rollout
+from ballbot_gym.env import BallbotEnv
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_train.controllers import make_controller, names
+from ballbot_train.policy import PolicyController, PolicyError, PolicyNetwork, PolicySpec, load_policy, save_policy
+
+
+def network_of(task, **fields):
+    torch.manual_seed(0)
+    network = PolicyNetwork(PolicySpec.of(task, hidden=(8,), **fields))
+    torch.nn.init.normal_(network.mlp[-1].weight)
+    return network
+
+
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("squash", ["tanh", "clip"])
+def test_a_saved_policy_acts_as_before(name, squash, tmp_path):
+    task = TASKS[name]()
+    network = network_of(task, squash=squash, linear=squash == "tanh", activation="relu")
+    path = save_policy(tmp_path / "mine", network, {"measured": {"regret_mean": 0.1}})
+    loaded = load_policy(path, task)
+    observations = np.random.default_rng(0).normal(size=(5, len(task.observation_scale))).astype(np.float32)
+    with torch.no_grad():
+        expected = network(torch.tensor(observations)).numpy()
+    np.testing.assert_array_equal(loaded.predict(observations)[0], expected)
+    assert np.abs(expected).max() <= 1
+    assert json.loads(path.read_text())["measured"]["regret_mean"] == 0.1
+
+
+def test_forces_are_what_the_env_would_apply_for_the_predicted_actions(tmp_path):
+    env = BallbotEnv("orbit", physics="rk4", duration=0.2)
+    policy = PolicyController(env.task, env.params, network_of(env.task))
+    episode = rollout(env, policy, seed=3)
+    observation, _ = env.reset(seed=3)
+    for force in episode.trajectory.u:
+        action, state = policy.predict(observation)
+        assert state is None
+        observation, *_, info = env.step(action)
+        np.testing.assert_allclose(info["force"], force, rtol=1e-6)
+
+
+def test_wrong_files_are_refused_with_the_reason(tmp_path):
+    task = TASKS["stabilize"]()
+    path = save_policy(tmp_path / "mine", network_of(task), {})
+    with pytest.raises(PolicyError, match=r"trained on Stabilize.*not on Turn"):
+        load_policy(path, "turn")
+    with pytest.raises(PolicyError, match=r"trained on Stabilize.*duration=4.0"):
+        load_policy(path, TASKS["stabilize"](duration=4.0))
+    with pytest.raises(PolicyError, match="nowhere"):
+        load_policy(tmp_path / "nowhere.json", task)
+    content = json.loads(path.read_text())
+
+    def altered(**spec):
+        path.write_text(json.dumps(content | {"spec": content["spec"] | spec}))
+
+    altered(observation_version=0)
+    with pytest.raises(PolicyError, match="observation version 0"):
+        load_policy(path, task)
+    altered(hidden=[9])
+    with pytest.raises(PolicyError, match="do not fit"):
+        load_policy(path, task)
+    altered(activation="exec")
+    with pytest.raises(PolicyError, match="do not fit"):
+        load_policy(path, task)
+    altered(observations=9)
+    with pytest.raises(PolicyError, match="takes 9 observations"):
+        load_policy(path, task)
+    path.write_text("{")
+    with pytest.raises(PolicyError, match="not a policy"):
+        load_policy(path, task)
+    path.write_text(json.dumps(content))
+    (tmp_path / "mine.safetensors").write_bytes(b"\x80\x04pickled")
+    with pytest.raises(PolicyError, match="not a policy"):
+        load_policy(path, task)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_named_controller_can_be_made(name):
+    task = TASKS[name]()
+    for controller in names(task):
+        assert hasattr(make_controller(controller, task, default_params()), "act")
+    with pytest.raises(ValueError, match="unknown controller 'lqrr'"):
+        make_controller("lqrr", task, default_params())

@@ -1,0 +1,98 @@
+"""Training runs: they learn, are written as promised, and go on after an interruption as if there had been none."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_train import training
+from ballbot_train.learners import LEARNERS, shac
+
+SETTINGS = ["iterations", "6", "evaluations", "3", "envs", "4", "window", "3", "hidden", "8", "compile", "false"]
+
+
+def parameters(learner):
+    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
+
+
+def run(*arguments, **keywords):
+    command = [sys.executable, "-m", "ballbot_train.cli", "train", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **keywords)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
+    task, params = TASKS[name](), default_params()
+    config = replace(shac.TUNED[name], iterations=4, envs=4, window=3, hidden=(8,), compile=False)
+    whole = shac.Shac(task, params, config)
+    for _ in range(4):
+        whole.iterate()
+    first = shac.Shac(task, params, config)
+    for _ in range(2):
+        first.iterate()
+    second = shac.Shac(task, params, config, seed=5)
+    second.load_state_dict(first.state_dict())
+    for _ in range(2):
+        second.iterate()
+    assert torch.equal(parameters(whole), parameters(second))
+    assert not torch.equal(parameters(whole), parameters(shac.Shac(task, params, config)))
+
+
+def test_shac_starts_at_lqr_and_lowers_the_cost():
+    """From LQR's start a few iterations of small envs already save cost on the certified episodes."""
+    task, params = TASKS["stabilize"](), default_params()
+    config = replace(shac.TUNED["stabilize"], iterations=30, envs=64, window=25, hidden=(32,), compile=False)
+    learner = shac.Shac(task, params, config)
+    before = training.score(learner.network, task)
+    assert before.success > 0.5  # LQR within the limits of tanh
+    for _ in range(config.iterations):
+        learner.iterate()
+    assert training.score(learner.network, task).cost_ratio < 0.7 * before.cost_ratio
+
+
+def test_a_killed_run_resumes_to_the_same_result(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    common = ["shac", "--threads", 1, "--set", *SETTINGS]
+    assert run(*common, "--out", whole).wait() == 0
+    process = run(*common, "--out", killed, env=os.environ | {"BALLBOT_CHECKPOINT_SECONDS": "0"})
+    while not (killed / "checkpoint.pt").exists() and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    refused = run(*common, "--out", killed)
+    assert refused.wait() == 1
+    assert "--resume" in refused.stdout.read()
+    assert run(*common, "--out", killed, "--resume").wait() == 0
+    assert (killed / "policy.safetensors").read_bytes() == (whole / "policy.safetensors").read_bytes()
+    measured = [json.loads((out / "policy.json").read_text())["measured"] for out in (whole, killed)]
+    assert measured[0] == measured[1]
+    assert measured[0]["physics"] == "bullet"
+    different = run(*common, "--seed", 1, "--out", killed, "--resume")
+    assert different.wait() == 1
+    assert "another seed" in " ".join(different.stdout.read().split())
+
+
+def test_bad_settings_are_named(tmp_path):
+    for arguments, message in (
+        (["shac", "--set", "wings", "2"], "unknown setting wings"),
+        (["shac", "--set", "envs", "many"], "setting envs cannot be 'many'"),
+        (["sorcery"], "unknown learner sorcery"),
+        (["shac", "--demos", tmp_path], "shac uses no demonstrations"),
+    ):
+        process = run(*arguments, "--out", tmp_path / "run")
+        assert process.wait() == 1
+        assert message in " ".join(process.stdout.read().split())
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_every_learner_has_settings_for_every_task(learner):
+    assert set(LEARNERS[learner].tuned) == set(TASKS)
