@@ -1,4 +1,4 @@
-# make demo   install into .venv and run the benchmark on a quarter of the episodes: LQR, trajectory optimization, NMPC
+# make demo   install into .venv and run the benchmark on an eighth of the episodes: LQR, trajectory optimization, NMPC
 # make test   install into .venv, then lint and test
 PYTHON ?= python3.11
 VENV := .venv
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test test-slow bench certify clean
 
 demo: $(VENV)/installed
-	$(BIN)/ballbot benchmark --episodes 50 --out runs/demo
+	$(BIN)/ballbot benchmark --episodes 25 --out runs/demo
 
 test: $(VENV)/installed
 	$(BIN)/ruff check .
