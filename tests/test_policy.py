@@ -11,7 +11,17 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.controllers import make_controller, names
-from ballbot_train.policy import PolicyController, PolicyError, PolicyNetwork, PolicySpec, load_policy, save_policy
+from ballbot_train.evaluate import evaluate
+from ballbot_train.policy import (
+    PolicyController,
+    PolicyError,
+    PolicyNetwork,
+    PolicySpec,
+    load_policy,
+    read_about,
+    save_policy,
+    shipped_policies,
+)
 
 
 def network_of(task, **fields):
@@ -90,3 +100,20 @@ def test_every_named_controller_can_be_made(name):
         assert hasattr(make_controller(controller, task, default_params()), "act")
     with pytest.raises(ValueError, match="unknown controller 'lqrr'"):
         make_controller("lqrr", task, default_params())
+
+
+SHIPPED = [(name, learner) for name in TASKS for learner in shipped_policies(TASKS[name]())]
+
+
+@pytest.mark.parametrize(("name", "learner"), SHIPPED)
+def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, learner):
+    """On the first certified episodes they succeed, at a regret of the order that they claim."""
+    task = TASKS[name]()
+    about = read_about(shipped_policies(task)[learner])
+    assert about["training"]["command"].startswith("ballbot ")
+    measured = about["measured"]
+    assert measured["physics"] == "bullet"
+    assert measured["episodes"] == 200
+    row = evaluate(learner, name, episodes=10)
+    assert row.success >= measured["success"] - 0.2
+    assert row.regret_median < 3 * max(measured["regret_median"], 0.01)

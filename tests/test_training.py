@@ -8,13 +8,16 @@ import sys
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from ballbot_baselines.lqr import discrete_lqr
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train import training
 from ballbot_train.learners import LEARNERS, shac
+from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 SETTINGS = ["iterations", "6", "evaluations", "3", "envs", "4", "window", "3", "hidden", "8", "compile", "false"]
 
@@ -56,6 +59,38 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     for _ in range(config.iterations):
         learner.iterate()
     assert training.score(learner.network, task).cost_ratio < 0.7 * before.cost_ratio
+
+
+def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
+    task, params = TASKS["turn"](), default_params()
+    config = shac.ShacConfig(iterations=2, envs=4, window=3, hidden=(8,), critic_first=1, compile=False)
+    donor, learner = (shac.Shac(task, params, config, seed) for seed in (1, 2))
+    learner.begin(donor.network)
+    assert torch.equal(parameters(learner), parameters(donor))
+    learner.iterate()  # only the critic learns
+    assert torch.equal(parameters(learner), parameters(donor))
+    learner.iterate()
+    assert not torch.equal(parameters(learner), parameters(donor))
+    with pytest.raises(ValueError, match="cannot start"):
+        shac.Shac(task, params, replace(config, hidden=(9,))).begin(donor.network)
+
+
+def test_a_critic_that_does_not_learn_stays_lqr_s_cost():
+    task, params = TASKS["stabilize"](), default_params()
+    learner = shac.Shac(task, params, shac.ShacConfig(envs=4, window=3, hidden=(8,), critic_steps=0, compile=False))
+    learner.iterate()
+    x = 0.01 * torch.arange(8.0)
+    _, p = discrete_lqr(task, params, np.zeros(8), np.zeros(2), np.zeros(0))
+    observation = torch.as_tensor(task.observe(x.numpy(), ()), dtype=torch.float32)
+    expected = x.double().numpy() @ p @ x.double().numpy()
+    assert float(learner.critic(observation).detach()) == pytest.approx(expected, rel=0.05)
+
+
+def test_odd_policies_are_odd():
+    task = TASKS["stabilize"]()
+    network = PolicyNetwork(PolicySpec.of(task, hidden=(8,), odd=True))
+    observation = torch.randn(5, 8)
+    assert torch.equal(network(-observation), -network(observation))
 
 
 def test_a_killed_run_resumes_to_the_same_result(tmp_path):

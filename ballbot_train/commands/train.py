@@ -15,6 +15,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate, training
 from ballbot_train.console import console
 from ballbot_train.learners import LEARNERS
+from ballbot_train.policy import load_network, read_about
 
 
 def train(
@@ -22,6 +23,7 @@ def train(
     /,
     task: str = "stabilize",
     demos: Path | None = None,
+    start: Path | None = None,
     seed: int = 0,
     set: dict[str, str] = {},  # noqa: B006 (the option's name; tyro's default, never changed)
     threads: int | None = None,
@@ -34,6 +36,7 @@ def train(
         learner: name of a learner: bc, dagger, ppo, sac or shac.
         task: name of a task.
         demos: folder of a demonstration dataset, of `ballbot demos`.
+        start: policy file to start from, for shac.
         seed: of everything drawn.
         set: settings by name that replace the tuned ones, e.g. --set iterations 100 hidden 64,64.
         threads: of torch; default, its own choice. Another number gives other last digits.
@@ -49,15 +52,23 @@ def train(
     if threads is not None:
         torch.set_num_threads(threads)
     out = Path("runs") / "train" / f"{task}-{learner}" if out is None else out
+    command = shlex.join(["ballbot", *[word for word in sys.argv[1:] if word != "--resume"]])
+    if start is not None:  # what made that policy belongs to what makes this one
+        command = f"{read_about(start)['training']['command']} && {command}"
     config = {
         "learner": learner,
         "task": task,
         "seed": seed,
         "demos": None if demos is None else str(demos),
         "settings": asdict(settings),
-        "command": shlex.join(["ballbot", *[word for word in sys.argv[1:] if word != "--resume"]]),
+        "start": None if start is None else str(start),
+        "command": command,
     }
     made = algorithm.make(problem, default_params(), settings, seed, demos)
+    if start is not None:
+        if not hasattr(made, "begin"):
+            raise ValueError(f"{learner} cannot start from a policy")
+        made.begin(load_network(start, problem))
     row = training.train(made, problem, config, out, resume)
     console.print(
         f"in PyBullet: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "

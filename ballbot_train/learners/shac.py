@@ -41,13 +41,17 @@ class ShacConfig:
     """Whether opposite observations get opposite actions, as is right where the goal is the origin and nothing in the way."""
     learning_rate: float = 3e-3
     """Of policy and critic at the start; falls along a half cosine to `final_rate` of it."""
+    start_rate: float = 5e-4
+    """In place of `learning_rate` where there is a policy to start from."""
+    critic_first: int = 40
+    """Iterations for which only the critic learns where there is a policy to start from."""
     final_rate: float = 0.01
     least_cost: float = 0.5
     """An episode counts as if it cost at least this much."""
     discount: float = 1.0
     """Per control step; below 1 where the cost never ends."""
     critic_steps: int = 4
-    """Gradient steps of the critic per iteration."""
+    """Gradient steps of the critic per iteration; with 0 it stays what it begins as, at an equilibrium task LQR's cost."""
     critic_stride: int = 4
     """Of a window's steps, the critic learns from one in so many."""
     critic_follow: float = 0.2
@@ -64,6 +68,7 @@ class ShacConfig:
     """Whether a control step is compiled, which takes half a minute once."""
 
 
+_SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
 _ENDLESS = 10**6  # control steps: longer than any episode in training
 
 TUNED: dict[str, ShacConfig] = {
@@ -98,7 +103,10 @@ class Critic(torch.nn.Module):
         for width in hidden:
             layers += [torch.nn.Linear(size, width), torch.nn.Tanh()]
             size = width
-        self.mlp = torch.nn.Sequential(*layers, torch.nn.Linear(size, 1))
+        last = torch.nn.Linear(size, 1)
+        torch.nn.init.zeros_(last.weight)
+        torch.nn.init.zeros_(last.bias)
+        self.mlp = torch.nn.Sequential(*layers, last)
         gain = equilibrium_gain(task, params)
         self.register_buffer("p", None if gain is None else torch.tensor(gain[1], dtype=torch.float32))
 
@@ -107,7 +115,7 @@ class Critic(torch.nn.Module):
         if self.p is not None:
             error = observation[..., :8]
             scale = ((error @ self.p) * error).sum(-1) + 1e-3
-        return torch.nn.functional.softplus(self.mlp(observation)[..., 0] + 0.5) * scale
+        return torch.nn.functional.softplus(self.mlp(observation)[..., 0] + _SOFTPLUS_ONE) * scale
 
 
 def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:
@@ -127,13 +135,10 @@ def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.
 class Shac:
     """The learner; see `training.Learner`."""
 
-    def __init__(
-        self, task: Task, params: BallbotParams, config: ShacConfig, seed: int = 0, start: PolicyNetwork | None = None
-    ):
-        """Args: start: a policy to begin with instead of LQR or nothing."""
+    def __init__(self, task: Task, params: BallbotParams, config: ShacConfig, seed: int = 0):
         torch.manual_seed(seed)  # for the networks' first weights
         self._random = torch.Generator().manual_seed(seed)
-        self.config, self.iteration = config, 0
+        self.config, self.iteration, self._started = config, 0, False
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # windows end episodes, the task does not
         self._network = PolicyNetwork(PolicySpec.of(task, hidden=config.hidden, odd=config.odd))
@@ -142,8 +147,6 @@ class Shac:
         if (gain := equilibrium_gain(task, params)) is not None:
             with torch.no_grad():
                 self._network.linear.weight[:, :8] = torch.tensor(gain[0])
-        if start is not None:
-            self._network = start
         self.critic = Critic(task, params, config.hidden)
         self.target = Critic(task, params, config.hidden)
         self.target.load_state_dict(self.critic.state_dict())
@@ -158,11 +161,24 @@ class Shac:
     def network(self) -> PolicyNetwork:
         return self._network
 
+    def begin(self, network: PolicyNetwork) -> None:
+        """Takes a policy's weights to start from, in place of LQR's or none.
+
+        Raises:
+            ValueError: its network is built otherwise.
+        """
+        if network.spec != self._network.spec:
+            raise ValueError(
+                f"a policy of {network.spec} cannot start one of {self._network.spec}; --set hidden or odd"
+            )
+        self._network.load_state_dict(network.state_dict())
+        self._started = True
+
     def iterate(self) -> dict[str, float]:
         config = self.config
-        rate = config.learning_rate * self._annealed()
-        for optimizer in (self._policy_optimizer, self._critic_optimizer):
-            optimizer.param_groups[0]["lr"] = rate
+        rate = (config.start_rate if self._started else config.learning_rate) * self._annealed()
+        self._policy_optimizer.param_groups[0]["lr"] = rate
+        self._critic_optimizer.param_groups[0]["lr"] = config.learning_rate * self._annealed()
         with torch.no_grad():
             weight = 1 / self.target(self._start).clamp(min=config.least_cost)
         state = BatchState(*(part.detach() for part in self._batch.state))
@@ -177,7 +193,7 @@ class Shac:
         self._policy_optimizer.zero_grad()
         loss.mean().backward()
         norm = torch.nn.utils.clip_grad_norm_(self._network.parameters(), config.max_gradient)
-        if torch.isfinite(norm):
+        if torch.isfinite(norm) and not (self._started and self.iteration < config.critic_first):
             self._policy_optimizer.step()
         critic_loss = self._learn_values(log, last.detach())
         self._batch.state = BatchState(*(part.detach() for part in state))
@@ -267,7 +283,8 @@ class Shac:
             wanted = torch.cat(wanted[::-1][chosen])
             observations = torch.cat([record.observation for record in log[chosen]])
         total = 0.0
-        for part in torch.randperm(len(wanted), generator=self._random).chunk(config.critic_steps):
+        order = torch.randperm(len(wanted), generator=self._random)
+        for part in order.chunk(config.critic_steps) if config.critic_steps else ():
             value = self.critic(observations[part])
             # relative errors: what costs little must be known as well as what costs much
             loss = torch.nn.functional.smooth_l1_loss(value.clamp(min=1e-6).log(), wanted[part].clamp(min=1e-6).log())
@@ -278,7 +295,7 @@ class Shac:
         with torch.no_grad():
             for kept, learnt in zip(self.target.parameters(), self.critic.parameters(), strict=True):
                 kept.lerp_(learnt, config.critic_follow)
-        return total / config.critic_steps
+        return total / max(1, config.critic_steps)
 
 
 def make(task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: Path | None) -> Shac:
