@@ -31,6 +31,12 @@ def run(*arguments, **keywords):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **keywords)
 
 
+def finishes(*arguments):
+    process = run(*arguments)
+    printed, _ = process.communicate()
+    assert process.returncode == 0, printed
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
     task, params = TASKS[name](), default_params()
@@ -96,7 +102,7 @@ def test_odd_policies_are_odd():
 def test_a_killed_run_resumes_to_the_same_result(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     common = ["shac", "--threads", 1, "--set", *SETTINGS]
-    assert run(*common, "--out", whole).wait() == 0
+    finishes(*common, "--out", whole)
     process = run(*common, "--out", killed, env=os.environ | {"BALLBOT_CHECKPOINT_SECONDS": "0"})
     while not (killed / "checkpoint.pt").exists() and process.poll() is None:
         time.sleep(0.01)
@@ -105,7 +111,7 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path):
     refused = run(*common, "--out", killed)
     assert refused.wait() == 1
     assert "--resume" in refused.stdout.read()
-    assert run(*common, "--out", killed, "--resume").wait() == 0
+    finishes(*common, "--out", killed, "--resume")
     assert (killed / "policy.safetensors").read_bytes() == (whole / "policy.safetensors").read_bytes()
     measured = [json.loads((out / "policy.json").read_text())["measured"] for out in (whole, killed)]
     assert measured[0] == measured[1]

@@ -48,19 +48,21 @@ class PpoConfig:
     """> 0 divides every advantage by the size of the value there plus this (both in scaled rewards): regret is relative."""
     hidden: tuple[int, ...] = (128, 128)
     """Of actor and of critic."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     """At the start; falls linearly to `final_rate` of it."""
+    demo_rate: float = 1e-4
+    """In place of `learning_rate` where there are demonstrations."""
     final_rate: float = 0.02
     epochs: int = 5
     batch: int = 2048
     clip: float = 0.2
     max_gradient: float = 0.5
-    deviation: float = 0.3
+    deviation: float = 0.2
     """Standard deviation of the actions at the start, falling geometrically to `final_deviation`."""
     final_deviation: float = 0.03
     demo_deviation: float = 0.05
     """In place of `deviation` where there are demonstrations."""
-    clone_iterations: int = 30
+    clone_iterations: int = 20
     """Iterations of behaviour cloning before PPO's, of `clone_steps` gradient steps each."""
     clone_steps: int = 300
     clone_batch: int = 1024
@@ -70,8 +72,6 @@ class PpoConfig:
     """How many of PPO's iterations teach the critic alone."""
     imitation: float = 0.3
     """Weight of the imitation loss, minus the mean log-probability of the expert's actions, at the start of PPO."""
-    imitation_end: float = 0.5
-    """Share of the iterations after which it is 0."""
 
 
 TUNED: dict[str, PpoConfig] = {
@@ -104,6 +104,7 @@ class Ppo:
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._critic_iterations = 0 if demos is None else config.critic_iterations
         self._deviation = config.deviation if demos is None else config.demo_deviation
+        self._rate = config.learning_rate if demos is None else config.demo_rate
         self.iterations, self.evaluations = config.iterations + self._clone_iterations, config.evaluations
         self._env = TrainingEnv(task, params, config.envs, config.episode, config.fall_price, config.reward_scale)
         self._model = PPO(
@@ -175,7 +176,7 @@ class Ppo:
         return (self.iteration - self._clone_iterations) / self.config.iterations
 
     def _learning_rate(self) -> float:
-        return self.config.learning_rate * (1 - (1 - self.config.final_rate) * self._progress)
+        return self._rate * (1 - (1 - self.config.final_rate) * self._progress)
 
     def _clone(self) -> dict[str, float]:
         """One iteration of behaviour cloning."""
@@ -198,8 +199,8 @@ class Ppo:
 
     def _add_imitation(self, *_: object) -> None:
         """Adds the imitation loss's gradient to that of a step of PPO."""
-        weight = self.config.imitation * (1 - self._progress / self.config.imitation_end)
-        if self._imitation is not None and weight > 0 and not self._critic_only:
+        weight = self.config.imitation * (1 - self._progress)
+        if self._imitation is not None and not self._critic_only:
             variance = float(self._model.policy.log_std.detach().exp()[0]) ** 2
             (weight / variance * self._imitation.loss()).backward()
 

@@ -54,13 +54,13 @@ class SacConfig:
     batch: int = 256
     follow: float = 0.005
     """Share by which the target critics move to the critics at each gradient step."""
-    entropy: float = -4.0
+    entropy: float = -5.0
     """Of the actions that the actor keeps, nats."""
     temperature: float = 0.01
     """Price of entropy at the start, in scaled rewards."""
     deviation: float = 0.5
     """Standard deviation of the actions at the start, before they are squashed."""
-    demo_deviation: float = 0.1
+    demo_deviation: float = 0.05
     """In place of `deviation` where there are demonstrations."""
     clone_iterations: int = 15
     """Iterations of behaviour cloning before SAC's, of `clone_steps` gradient steps each."""
@@ -70,10 +70,8 @@ class SacConfig:
     """Learning rate at the start, falling linearly to 0."""
     critic_iterations: int = 10
     """How many of SAC's iterations teach the critics alone."""
-    imitation: float = 10.0
+    imitation: float = 300.0
     """Weight of the imitation loss, the mean squared difference of the actions, at the start of SAC."""
-    imitation_end: float = 1.0
-    """Share of the iterations after which it is 0."""
 
 
 TUNED: dict[str, SacConfig] = {
@@ -149,7 +147,11 @@ class Sac:
             replay_buffer_kwargs={"demos": demos, "reward_scale": config.reward_scale},
             ent_coef=f"auto_{config.temperature}",
             target_entropy=config.entropy,
-            policy_kwargs={"net_arch": list(config.hidden), "n_critics": config.critics},
+            policy_kwargs={
+                "net_arch": list(config.hidden),
+                "n_critics": config.critics,
+                "activation_fn": torch.nn.SiLU,
+            },
             seed=seed,
             device="cpu",
         )
@@ -167,7 +169,7 @@ class Sac:
 
     @property
     def network(self) -> PolicyNetwork:
-        return as_policy(self._mean, self._task, activation="relu", squash="tanh")
+        return as_policy(self._mean, self._task, activation="silu", squash="tanh")
 
     def iterate(self) -> dict[str, float]:
         with self._random:
@@ -236,8 +238,8 @@ class Sac:
 
     def _add_imitation(self, *_: object) -> None:
         """Adds the imitation loss's gradient to that of a step of the actor."""
-        weight = self.config.imitation * (1 - self._progress / self.config.imitation_end)
-        if self._imitation is not None and weight > 0 and not self._critic_only:
+        weight = self.config.imitation * (1 - self._progress)
+        if self._imitation is not None and not self._critic_only:
             (weight * self._imitation.loss()).backward()
 
 

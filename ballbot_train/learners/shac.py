@@ -277,9 +277,8 @@ class Shac:
             for record in reversed(log):
                 ahead = record.cost + config.discount * torch.where(record.exited | record.failed, 0.0, ahead)
                 wanted.append(ahead)
-            chosen = slice(
-                int(torch.randint(config.critic_stride, (), generator=self._random)), None, config.critic_stride
-            )
+            stride = min(config.critic_stride, len(log))
+            chosen = slice(int(torch.randint(stride, (), generator=self._random)), None, stride)
             wanted = torch.cat(wanted[::-1][chosen])
             observations = torch.cat([record.observation for record in log[chosen]])
         total = 0.0
