@@ -192,18 +192,6 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
     return figure
 
 
-def strip_figure(pictures: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
-    """Rendered frames (h, w, 3) side by side, with a title each."""
-    figure, axes = plt.subplots(
-        1, len(pictures), figsize=(2.6 * len(pictures), 2.25), layout="constrained", squeeze=False
-    )
-    for axis, picture, title in zip(axes[0], pictures, titles, strict=True):
-        axis.imshow(picture)
-        axis.set_title(title, fontsize=9)
-        axis.axis("off")
-    return figure
-
-
 def add_circles(axis: plt.Axes, circles: Sequence[Circle]) -> None:
     """Draws circles on a ground path, below everything else."""
     for circle in circles:

