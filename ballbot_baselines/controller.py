@@ -85,10 +85,11 @@ def rollout(
     Args:
         env: a BallbotEnv, wrapped or not; its wrappers are bypassed.
         controller: gets the state as the env's sensors report it: the true one, unless its randomization has noise.
-        seed, options: as for `env.reset`.
+        seed: as for `env.reset`.
+        options: as for `env.reset`.
 
     Raises:
-        Whatever the controller's `reset` raises, as a PlanError where no plan exists.
+        Exception: whatever the controller's `reset` raises, as a PlanError where no plan exists.
     """
     ballbot: BallbotEnv = env.unwrapped
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit

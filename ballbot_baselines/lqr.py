@@ -64,9 +64,11 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final:
     """Time-varying LQR, backwards from the final cost-to-go.
 
     Args:
-        a, b: (n, 8, 8), (n, 8, 2) linear step models.
-        q, r: (n, 8, 8), (n, 2, 2) cost of each step.
-        p_final: (8, 8).
+        a: (n, 8, 8) linear step models: of the state,
+        b: (n, 8, 2) and of the input.
+        q: (n, 8, 8) cost of each step: of the state,
+        r: (n, 2, 2) and of the input.
+        p_final: (8, 8) cost-to-go at the end.
     """
     k, p = np.zeros((len(a), 2, 8)), np.zeros((len(a), 8, 8))
     after = p_final

@@ -193,7 +193,9 @@ class HorizonQp:
         Args:
             q: (N, 8, 8) Hessians of the intervals' costs with respect to states.
             r: (N, 2, 2) the same with respect to inputs.
-            p, slope, target: V(x) = slopeᵀ(x − target) + (x − target)ᵀ p (x − target).
+            p: (8, 8) of V(x) = slopeᵀ(x − target) + (x − target)ᵀ p (x − target).
+            slope: (8,) of V at the target.
+            target: (8,) state.
         """
         r = r + _LEAST_CURVATURE * np.eye(2)
         self._h0[:] = r[0].ravel()

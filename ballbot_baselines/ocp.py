@@ -241,7 +241,9 @@ class OcpSolver:
         iterations.
 
         Args:
-            states, inputs, p: as `solve` takes them.
+            states: as `solve` takes them.
+            inputs: as `solve` takes them.
+            p: as `solve` takes them.
             bounds: variables whose bounds are equal do not move from them; the others end within theirs.
 
         Returns:

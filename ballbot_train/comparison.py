@@ -67,7 +67,8 @@ def compare(
     """Compares controllers of the same name on every task that both runs have.
 
     Args:
-        a, b: two runs.
+        a: a run.
+        b: another.
         match: a controller of A and one of B to compare instead; where each has but one, they are compared anyway.
         margin: of success and regret.
         training_margin: the same between policies with different weights.

@@ -193,8 +193,10 @@ def record(
         env: what to run in.
         expert: who is asked in every step.
         rng: of the exploration.
-        noise, pushes: as in `DemoConfig`; this episode's standard deviation is drawn.
-        seed, options: as for `env.reset`.
+        noise: as in `DemoConfig`; this episode's standard deviation is drawn.
+        pushes: as in `DemoConfig`.
+        seed: as for `env.reset`.
+        options: as for `env.reset`.
 
     Returns:
         The recording and the last step's info.
