@@ -179,7 +179,9 @@ def load_network(path: str | Path, task: Task) -> PolicyNetwork:
     return network
 
 
-def load_policy(path: str | Path, task: str | Task | None = None, params: BallbotParams | None = None) -> PolicyController:
+def load_policy(
+    path: str | Path, task: str | Task | None = None, params: BallbotParams | None = None
+) -> PolicyController:
     """The policy of a file as a Controller with SB3's `predict`.
 
     Args:
