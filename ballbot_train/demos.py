@@ -20,6 +20,7 @@ import importlib.metadata
 import json
 import math
 import os
+import shlex
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -323,6 +324,22 @@ def load_demos(path: Path, task: Task) -> Demos:
         terminations=joined(np.bool_, lambda e: e.terminations),
         truncations=joined(np.bool_, lambda e: e.truncations),
         executed=joined(np.float32, lambda e: e.actions),
+    )
+
+
+def command_of(path: Path) -> str:
+    """The command that writes a dataset of ours anew.
+
+    Raises:
+        ValueError: it is none.
+    """
+    options = {"out": str(path)}
+    for name, value in _metadata(path)["demos"].items():
+        options |= (
+            {f"{name}.{part}": each for part, each in value.items()} if isinstance(value, dict) else {name: value}
+        )
+    return shlex.join(
+        ["ballbot", "demos", *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
     )
 
 

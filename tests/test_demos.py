@@ -3,10 +3,12 @@
 import json
 import os
 import random
+import shlex
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import minari
 import numpy as np
@@ -15,7 +17,8 @@ import pytest
 from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_train.demos import DemoConfig, Expert, load_demos, record, write_demos
+from ballbot_train.cli import main
+from ballbot_train.demos import DemoConfig, Expert, command_of, load_demos, record, write_demos
 
 
 def make(out, **changes):
@@ -112,6 +115,17 @@ def test_a_finished_dataset_is_kept_and_another_never_overwrites_it(tmp_path):
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=r"hop|me|0|noise"):
         DemoConfig(**wrong)
+
+
+def test_its_command_makes_it_anew(dataset, tmp_path, monkeypatch):
+    words = shlex.split(command_of(dataset))
+    assert words[:2] == ["ballbot", "demos"]
+    made = Path(words[words.index("--out") + 1])
+    assert made == dataset
+    words[words.index("--out") + 1] = str(tmp_path / "again-v0")
+    monkeypatch.setattr(sys, "argv", words)
+    main()
+    assert content(tmp_path / "again-v0") == content(dataset)
 
 
 def test_the_expert_recovers_from_pushes():

@@ -14,6 +14,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate, training
 from ballbot_train.console import console
+from ballbot_train.demos import command_of
 from ballbot_train.learners import LEARNERS
 from ballbot_train.policy import load_network, read_about
 
@@ -53,7 +54,10 @@ def train(
         torch.set_num_threads(threads)
     out = Path("runs") / "train" / f"{task}-{learner}" if out is None else out
     command = shlex.join(["ballbot", *[word for word in sys.argv[1:] if word != "--resume"]])
-    if start is not None:  # what made that policy belongs to what makes this one
+    # what made the demonstrations, or the policy to start from, belongs to what makes this one
+    if demos is not None:
+        command = f"{command_of(demos)} && {command}"
+    if start is not None:
         command = f"{read_about(start)['training']['command']} && {command}"
     config = {
         "learner": learner,
