@@ -7,8 +7,9 @@ plans, later mostly at the beginnings of the episodes (Ross et al., "A reduction
 prediction to no-regret online learning", 2011, with the mixture β of expert and learner drawn per episode).
 
 An optimum labels more than its first state: all its states are samples, and around each of them `tube` draws others, which
-TVLQR labels, the derivative of the optimum's forces with respect to the state. Errors count relative to what the episode
-costs, as regret does.
+TVLQR labels, the derivative of the optimum's forces with respect to the state. TVLQR also labels, for the price of a product,
+the states of `followers`, learners that drive an episode from its beginning to its end, wherever they are `near` its plan.
+Errors count relative to what the episode costs, as regret does.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Backoff, Optimum, PlanError, find_optimum
@@ -61,6 +63,10 @@ class DaggerConfig:
     """Disturbs where drives start, in units of the tube's spread."""
     tube: int = 1
     """States drawn around each state of an optimum."""
+    followers: int = 0
+    """Learners that drive each episode drawn to its end, labelled by TVLQR about its plan."""
+    near: float = 2.0
+    """How far from the plan, in units of the tube's spread, such a state may be."""
     kept: float = 4.0
     """s of an optimum that are labels: what follows is rest."""
     backoff: Backoff = Backoff()
@@ -134,9 +140,11 @@ class Dagger:
         plans = self._planned(rng)
         for plan, c in plans:
             self._samples.add(self._labelled(plan, c, plan.cost, rng))
+        if self.config.followers and plans:
+            self._follow(plans, rng)
         drives = [episode for episode in plans for _ in range(self.config.drives)]
         labelled = 0
-        for (plan, c), (x, elapsed) in zip(drives, self._drive(drives, rng), strict=True):
+        for (plan, c), (x, elapsed) in zip(drives, self._drive(drives, rng) if drives else (), strict=True):
             found = self._optimum(x, c, plan.trajectory.x[elapsed:, :2])
             if found is not None:
                 labelled += 1
@@ -159,6 +167,23 @@ class Dagger:
                 with suppress(PlanError):
                     plans.append((find_optimum(self._task, self._params, x, c, config.backoff, config.guesses), c))
         return plans
+
+    def _follow(self, plans: Sequence[tuple[Optimum, np.ndarray]], rng: np.random.Generator) -> None:
+        """Lets followers drive, and labels each of their states by TVLQR at the point of the plan nearest to it."""
+        config = self.config
+        followed = [episode for episode in plans for _ in range(config.followers)]
+        x = np.array([plan.trajectory.x[0] for plan, _ in followed])
+        x += config.scatter * _SPREAD * rng.standard_normal(x.shape)
+        steps = min(max(len(plan.trajectory.u) for plan, _ in plans), round(config.kept / self._task.control_dt))
+        history, over, _ = self._roll(x, np.array([c for _, c in followed]), steps)
+        gains = [tube_gains(self._task, self._params, plan, c) for plan, c in plans]
+        for i, (plan, c) in enumerate(followed):
+            met = history[:, i][~over[:, i]]
+            distance, nearest = KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD)
+            met, nearest = met[distance < config.near], nearest[distance < config.near]
+            off = met - plan.trajectory.x[nearest]
+            forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", gains[i // config.followers][nearest], off)
+            self._samples.add(self._samples_of(met, forces, c, plan.cost))
 
     def _optimum(self, x: np.ndarray, c: np.ndarray, path: np.ndarray) -> Optimum | None:
         """From state x (8,), beginning with a ground path (n, 2), or with the task's where it has come to its end."""
@@ -223,18 +248,22 @@ class Dagger:
 
     def _labelled(self, plan: Optimum, c: np.ndarray, cost: float, rng: np.random.Generator) -> Samples:
         """The states of an optimum, and those drawn around them, in an episode whose own optimum costs `cost`."""
-        config, task, limit = self.config, self._task, self._params.force_limit
+        config, task = self.config, self._task
         n = min(len(plan.trajectory.u), round(config.kept / task.control_dt))
         x, u = plan.trajectory.x[:n], plan.trajectory.u[:n]
         if config.tube:
             gains = tube_gains(task, self._params, plan, c)[:n]
             off = _SPREAD * rng.standard_normal((config.tube, n, 8)) * rng.random((config.tube, n, 1))
             change = -np.einsum("kij,tkj->tki", gains, off)
-            small = np.abs(change).max(-1) < _SMALL * limit  # beyond, a derivative says too little
+            small = np.abs(change).max(-1) < _SMALL * self._params.force_limit  # beyond, a derivative says too little
             x, u = np.concatenate([x, (x + off)[small]]), np.concatenate([u, (u + change)[small]])
-        observations = np.asarray(task.observe(x, np.broadcast_to(c, (len(x), len(c)))))
-        weights = np.full(len(x), 1 / max(cost, config.least_cost))
-        return Samples.of(observations, np.clip(u / limit, -1, 1), weights)
+        return self._samples_of(x, u, c, cost)
+
+    def _samples_of(self, x: np.ndarray, u: np.ndarray, c: np.ndarray, cost: float) -> Samples:
+        """States (n, 8) labelled by forces (n, 2), in an episode whose optimum costs `cost`."""
+        observations = np.asarray(self._task.observe(x, np.broadcast_to(c, (len(x), len(c)))))
+        weights = np.full(len(x), 1 / max(cost, self.config.least_cost))
+        return Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights)
 
 
 def tube_gains(task: Task, params: BallbotParams, plan: Optimum, c: np.ndarray) -> np.ndarray:

@@ -1,10 +1,7 @@
 """Soft actor-critic, of Stable-Baselines3, from scratch or from demonstrations.
 
 With demonstrations half of every batch is drawn from them and half from what the actor did itself (Ball et al., Efficient
-Online Reinforcement Learning with Offline Data, 2023). And as with PPO the actor begins by imitating the expert, waits for
-its critics to learn what that costs, and then follows the gradient of an imitation loss too, whose weight fades.
-
-A resumed run does what it would have done; only the success rate of the last hundred episodes is not kept.
+Online Reinforcement Learning with Offline Data, 2023); what else they do is `ModelFree`'s.
 """
 
 import math
@@ -17,36 +14,27 @@ import numpy as np
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.demos import Demos, load_demos
-from ballbot_train.learners.model_free import Imitation, OwnRandomness, TrainingEnv, as_policy
+from ballbot_train.learners.model_free import ModelFree, ModelFreeConfig, as_policy
 from ballbot_train.policy import PolicyNetwork
 
 
 @dataclass(frozen=True)
-class SacConfig:
+class SacConfig(ModelFreeConfig):
     """Settings of `Sac`."""
 
     iterations: int = 200
-    """Of 1000 env steps or so."""
-    evaluations: int = 20
     envs: int = 16
     steps: int = 63
-    """Control steps of each env per iteration."""
+    fall_price: float = 200.0
+    clone_iterations: int = 15
+    imitation: float = 300.0
     gradient_steps: int = 4
     """After each control step of all envs."""
-    episode: float = 4.0
-    """s, after which episodes start anew in training."""
-    fall_price: float = 200.0
-    reward_scale: float = 0.1
-    discount: float = 0.995
-    """Per control step."""
-    hidden: tuple[int, ...] = (128, 128)
-    """Of actor and of critics."""
     critics: int = 2
     learning_rate: float = 5e-4
     """At the start; falls linearly to `final_rate` of it."""
@@ -62,16 +50,6 @@ class SacConfig:
     """Standard deviation of the actions at the start, before they are squashed."""
     demo_deviation: float = 0.05
     """In place of `deviation` where there are demonstrations."""
-    clone_iterations: int = 15
-    """Iterations of behaviour cloning before SAC's, of `clone_steps` gradient steps each."""
-    clone_steps: int = 300
-    clone_batch: int = 1024
-    clone_rate: float = 2e-3
-    """Learning rate at the start, falling linearly to 0."""
-    critic_iterations: int = 10
-    """How many of SAC's iterations teach the critics alone."""
-    imitation: float = 300.0
-    """Weight of the imitation loss, the mean squared difference of the actions, at the start of SAC."""
 
 
 TUNED: dict[str, SacConfig] = {
@@ -123,20 +101,16 @@ class SymmetricReplay(ReplayBuffer):
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class Sac:
+class Sac(ModelFree):
     """The learner; see `training.Learner`."""
 
     def __init__(self, task: Task, params: BallbotParams, config: SacConfig, seed: int = 0, demos: Demos | None = None):
         """Args: demos: `Demos` to learn from too, or None."""
-        self.config, self.iteration, self._task = config, 0, task
-        self._clone_iterations = 0 if demos is None else config.clone_iterations
-        self._critic_iterations = 0 if demos is None else config.critic_iterations
-        self.iterations, self.evaluations = config.iterations + self._clone_iterations, config.evaluations
-        self._env = TrainingEnv(task, params, config.envs, config.episode, config.fall_price, config.reward_scale)
-        self._model = SAC(
+        super().__init__(task, params, config, demos)
+        model = SAC(
             "MlpPolicy",
             self._env,
-            learning_rate=lambda _: self._learning_rate(),
+            learning_rate=lambda _: config.learning_rate * (1 - (1 - config.final_rate) * self._progress),
             buffer_size=config.iterations * config.steps * config.envs,
             learning_starts=0,
             batch_size=config.batch,
@@ -155,92 +129,32 @@ class Sac:
             seed=seed,
             device="cpu",
         )
-        self._model.set_logger(Logger(folder=None, output_formats=[]))
-        self._model._last_obs = self._env.reset()
-        actor = self._model.actor
+        actor = model.actor
         torch.nn.init.zeros_(actor.log_std.weight)
-        torch.nn.init.constant_(
-            actor.log_std.bias, math.log(config.deviation if demos is None else config.demo_deviation)
+        deviation = config.deviation if demos is None else config.demo_deviation
+        torch.nn.init.constant_(actor.log_std.bias, math.log(deviation))
+        self._begin(
+            model,
+            torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
+            (actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer),
         )
-        self._mean = torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh())
-        self._imitation = None if demos is None else Imitation(self._mean, demos, config.clone_batch)
-        actor.optimizer.register_step_pre_hook(self._add_imitation)
-        self._random = OwnRandomness()
 
     @property
     def network(self) -> PolicyNetwork:
-        return as_policy(self._mean, self._task, activation="silu", squash="tanh")
-
-    def iterate(self) -> dict[str, float]:
-        with self._random:
-            figures = self._clone() if self.iteration < self._clone_iterations else self._improve()
-        self.iteration += 1
-        return figures
+        return as_policy(self._actor, self._task, activation="silu", squash="tanh")
 
     def state_dict(self) -> dict[str, Any]:
         model = self._model
-        return {
-            "iteration": self.iteration,
-            "policy": model.policy.state_dict(),
-            "temperature": model.log_ent_coef.detach(),
-            "optimizers": [optimizer.state_dict() for optimizer in self._optimizers],
-            "imitation": self._imitation and self._imitation.state_dict(),
-            "replay": model.replay_buffer.state_dict(),
-            "env_steps": model.num_timesteps,
-            "env": self._env.state_dict(),
-            "observations": torch.as_tensor(model._last_obs),
-            "random": self._random.state_dict(),
-        }
+        own = {"temperature": model.log_ent_coef.detach(), "replay": model.replay_buffer.state_dict()}
+        return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        model = self._model
-        self.iteration = state["iteration"]
-        model.policy.load_state_dict(state["policy"])
-        model.log_ent_coef.data.copy_(state["temperature"])
-        for optimizer, old in zip(self._optimizers, state["optimizers"], strict=True):
-            optimizer.load_state_dict(old)
-        if self._imitation is not None:
-            self._imitation.load_state_dict(state["imitation"])
-        model.replay_buffer.load_state_dict(state["replay"])
-        model.num_timesteps = state["env_steps"]
-        self._env.load_state_dict(state["env"])
-        model._last_obs = state["observations"].numpy()
-        self._random.load_state_dict(state["random"])
+        super().load_state_dict(state)
+        self._model.log_ent_coef.data.copy_(state["temperature"])
+        self._model.replay_buffer.load_state_dict(state["replay"])
 
-    @property
-    def _optimizers(self) -> tuple[torch.optim.Optimizer, ...]:
-        return self._model.actor.optimizer, self._model.critic.optimizer, self._model.ent_coef_optimizer
-
-    @property
-    def _progress(self) -> float:
-        """Share of SAC's iterations done."""
-        return (self.iteration - self._clone_iterations) / self.config.iterations
-
-    @property
-    def _critic_only(self) -> bool:
-        return self.iteration < self._clone_iterations + self._critic_iterations
-
-    def _learning_rate(self) -> float:
-        return self.config.learning_rate * (1 - (1 - self.config.final_rate) * self._progress)
-
-    def _clone(self) -> dict[str, float]:
-        """One iteration of behaviour cloning."""
-        rate = self.config.clone_rate * (1 - self.iteration / self._clone_iterations)
-        return self._imitation.clone(self.config.clone_steps, rate)
-
-    def _improve(self) -> dict[str, float]:
-        """One iteration of SAC."""
-        config, model = self.config, self._model
-        model.actor.requires_grad_(not self._critic_only)
-        model.learn(config.envs * config.steps, log_interval=None, reset_num_timesteps=False)
-        model.actor.requires_grad_(True)
-        return {**model.logger.name_to_value, "train/env_steps": model.num_timesteps}
-
-    def _add_imitation(self, *_: object) -> None:
-        """Adds the imitation loss's gradient to that of a step of the actor."""
-        weight = self.config.imitation * (1 - self._progress)
-        if self._imitation is not None and not self._critic_only:
-            (weight * self._imitation.loss()).backward()
+    def _imitation_scale(self) -> float:
+        return 1.0
 
 
 def make(task: Task, params: BallbotParams, config: SacConfig, seed: int, demos: Path | None) -> Sac:
