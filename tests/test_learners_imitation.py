@@ -148,6 +148,26 @@ def test_where_the_goal_ends_the_episode_the_tube_leaves_the_freedom_that_the_op
     assert errors[0] < 0.5 * errors[1]
 
 
+@pytest.mark.parametrize("name", ["stabilize", "turn"])
+def test_followers_are_labelled_by_feedback_about_the_plan_and_only_near_it(name, monkeypatch):
+    task, params, rng = make_task(name), default_params(), np.random.default_rng(3)
+    x, c = task.sample(rng, params)
+    plan = find_optimum(task, params, x, c)
+    learner = dagger.Dagger(task, params, replace(TINY_DAGGER, followers=2, kept=8.0))
+    off = 1e-3 * rng.standard_normal(8)
+    met = np.stack([plan.trajectory.x, plan.trajectory.x + [*off[:4], *(off[4:] + 100)]], axis=1)
+    met[2, 0] = plan.trajectory.x[2] + off
+    over = np.zeros(met.shape[:2], bool)
+    over[-1] = True
+    monkeypatch.setattr(learner, "_roll", lambda x, c, steps: (met, over, np.zeros(2, bool)))
+    learner._follow([(plan, c)], rng)
+    samples = learner._samples
+    assert len(samples) == len(plan.trajectory.u)  # none of the follower who is 100 m/s off
+    expected = plan.trajectory.u / params.force_limit
+    expected[2] -= dagger.tube_gains(task, params, plan, c)[2] @ off / params.force_limit
+    np.testing.assert_allclose(samples.actions.numpy(), np.clip(expected, -1, 1), atol=1e-6)
+
+
 def test_dagger_falls_far_less_than_lqr_after_two_rounds():
     """LQR, within the limits of tanh, is where it starts; eight planned episodes and their surroundings halve its falls."""
     task, params = make_task("stabilize"), default_params()
