@@ -85,10 +85,32 @@ class DaggerConfig:
 
 TUNED: dict[str, DaggerConfig] = {
     "stabilize": DaggerConfig(),
+    # Its episodes are a family of one parameter: feedback about the plans is all there is to learn.
     "turn": DaggerConfig(
-        gathering=25, episodes=4, drives=1, scatter=0.5, tube=3, backoff=Backoff(goal=0.3, force=0.02)
+        iterations=100,
+        gathering=70,
+        evaluations=10,
+        episodes=8,
+        drives=0,
+        followers=8,
+        scatter=1.0,
+        tube=3,
+        kept=6.0,
+        steps=400,
+        backoff=Backoff(goal=0.5, force=0.02),
     ),
-    "orbit": DaggerConfig(),
+    "orbit": DaggerConfig(
+        iterations=100,
+        gathering=70,
+        evaluations=10,
+        episodes=16,
+        drives=0,
+        followers=3,
+        scatter=0.5,
+        kept=8.0,
+        steps=400,
+        hidden=(256, 256),
+    ),
     "weave": DaggerConfig(episodes=5, guesses=3, kept=5.0, backoff=Backoff(margin=0.05, force=0.02)),
 }
 """By task."""
