@@ -110,6 +110,7 @@ TUNED: dict[str, DaggerConfig] = {
         kept=8.0,
         steps=400,
         hidden=(256, 256),
+        backoff=Backoff(force=0.1),  # who pushes with all he has into an orbit cannot correct it
     ),
     "weave": DaggerConfig(episodes=5, guesses=3, kept=5.0, backoff=Backoff(margin=0.05, force=0.02)),
 }
