@@ -1,5 +1,6 @@
 """What README and documentation say runs as it stands, as a reader would paste it, page by page."""
 
+import json
 import re
 import shlex
 import subprocess
@@ -7,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from ballbot_train.policy import SHIPPED
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -55,6 +58,19 @@ def test_pictures_and_commands_that_it_names_exist(page):
         assert (page.parent / picture).exists(), picture
     for command in re.findall(r"`ballbot (\w+)", page.read_text()):
         assert command in COMMANDS
+
+
+def test_the_readme_says_of_every_shipped_policy_what_its_file_says():
+    text = (ROOT / "README.md").read_text()
+    for path in sorted(SHIPPED.glob("*.json")):
+        about = json.loads(path.read_text())
+        measured, training = about["measured"], about["training"]
+        seconds = about["training_seconds"]
+        row = (
+            f"| {training['task']} | {training['learner']} | {seconds / 60:.0f} min | {measured['success']:.1%} | "
+            f"{measured['falls']} | {measured['regret_mean']:.2%} | {measured['regret_median']:.2%} |"
+        )
+        assert row in text, row
 
 
 def test_the_site_builds_without_a_warning(tmp_path):

@@ -75,7 +75,9 @@ TUNED: dict[str, ShacConfig] = {
     "stabilize": ShacConfig(odd=True),
     "turn": ShacConfig(exit_softness=0.3),
     "orbit": ShacConfig(discount=0.998),
-    "weave": ShacConfig(clearance=0.1, margin_price=1000.0),
+    "weave": ShacConfig(
+        iterations=10_000, evaluations=25, restart=0.25, hidden=(256, 256), clearance=0.1, margin_price=3000.0
+    ),
 }
 """By task."""
 
