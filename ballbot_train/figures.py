@@ -23,9 +23,27 @@ from ballbot_train.basins import AXES, BasinMap
 from ballbot_train.evaluate import Result
 from ballbot_train.robustness import NONE, STRESSES, StressRow, curve_of
 
-COLORS = {"lqr": "#c0392b", "trajopt": "#1f6fb2", "nmpc": "#e08a00"}
-_OTHER_COLORS = ("#2e8b57", "#8e44ad", "#b9770e", "#34495e")
-LABELS = {"lqr": "LQR", "trajopt": "trajectory optimization + TVLQR", "nmpc": "NMPC"}
+COLORS = {
+    "lqr": "#c0392b",
+    "trajopt": "#1f6fb2",
+    "nmpc": "#e08a00",
+    "bc": "#8d6e63",
+    "dagger": "#34495e",
+    "ppo": "#2e8b57",
+    "sac": "#17a2b8",
+    "shac": "#8e44ad",
+}
+_OTHER_COLORS = ("#6b8e23", "#b9770e", "#5d6d7e", "#d35479")
+LABELS = {
+    "lqr": "LQR",
+    "trajopt": "trajectory optimization + TVLQR",
+    "nmpc": "NMPC",
+    "bc": "behaviour cloning",
+    "dagger": "DAgger",
+    "ppo": "PPO",
+    "sac": "SAC",
+    "shac": "SHAC",
+}
 
 
 @dataclass(frozen=True)
@@ -114,8 +132,10 @@ def regret_figure(results: Sequence[Result]) -> Figure:
         axis.set(xscale="log", xlim=(0.01, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %")
         axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("episodes that succeed, %")
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    # a controller may be in some of the tasks only
+    shown = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    labels = sorted(shown, key=[*LABELS.values(), *shown].index)
+    figure.legend([shown[label] for label in labels], labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return figure
 
 

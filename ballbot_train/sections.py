@@ -107,8 +107,10 @@ def learning_section(runs: Path) -> Section | None:
         lines = tasks.setdefault(str(described.get("task")), [])
         points = [(float(row["seconds"]), 100 * float(row["regret_mean"])) for row in rows]
         finite = np.array([point for point in points if np.isfinite(point).all()]).reshape(-1, 2)
-        shade = figures.color("", len(lines))
-        lines.append(Line(f"{described.get('learner')}: {path.parent.name}", *finite.T, shade))
+        learner = str(described.get("learner"))
+        again = any(line.label.startswith(f"{learner}:") for line in lines)
+        shade = figures.color("" if again else learner, len(lines))
+        lines.append(Line(f"{learner}: {path.parent.name}", *finite.T, shade))
     panels = [
         Panel(task, "training, s", "regret, %", [line for line in lines if len(line.x)], log_y=True)
         for task, lines in tasks.items()
