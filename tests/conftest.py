@@ -1,5 +1,11 @@
 """Fixtures that parametrize tests over everything registered, so that a new task arrives tested."""
 
+import os
+
+# Before torch is imported, here and in the processes that tests start: nothing in them is big enough for a second thread,
+# and on busy cores threads wait for each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 
