@@ -33,6 +33,7 @@ COLORS = {
     "sac": "#17a2b8",
     "shac": "#8e44ad",
 }
+_LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 _OTHER_COLORS = ("#6b8e23", "#b9770e", "#5d6d7e", "#d35479")
 LABELS = {
     "lqr": "LQR",
@@ -118,18 +119,27 @@ def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Cir
     return figure
 
 
+def regret_curves(results: Sequence[Result], task: str) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Of each controller on a task the regrets that it reaches (n,), in % and ascending, and the share of episodes within."""
+    curves = []
+    for controller in dict.fromkeys(result.controller for result in results if result.task == task):
+        group = [result for result in results if (result.task, result.controller) == (task, controller)]
+        # success, not only standing: an episode that misses its goal has no regret worth the name
+        regrets = np.sort([max(100 * result.regret, _LEAST_REGRET) for result in group if result.success])
+        curves.append((controller, regrets, 100 * np.arange(1, len(regrets) + 1) / len(group)))
+    return curves
+
+
 def regret_figure(results: Sequence[Result]) -> Figure:
     """For every task, the share of episodes that each controller finishes within a given regret."""
     tasks = list(dict.fromkeys(result.task for result in results))
     figure, axes = plt.subplots(1, len(tasks), figsize=(4.2 * len(tasks), 3.8), layout="constrained", squeeze=False)
     for axis, task in zip(axes[0], tasks, strict=True):
-        for i, controller in enumerate(dict.fromkeys(r.controller for r in results if r.task == task)):
-            group = [result for result in results if (result.task, result.controller) == (task, controller)]
-            # success, not only standing: an episode that misses its goal has no regret worth the name
-            regrets = np.sort([max(100 * result.regret, 0.01) for result in group if result.success])
-            share = 100 * np.arange(1, len(regrets) + 1) / len(group)
-            axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=_label(controller))
-        axis.set(xscale="log", xlim=(0.01, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %")
+        for i, (controller, regrets, share) in enumerate(regret_curves(results, task)):
+            axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=label(controller))
+        axis.set(
+            xscale="log", xlim=(_LEAST_REGRET, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %"
+        )
         axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("episodes that succeed, %")
     # a controller may be in some of the tasks only
@@ -162,7 +172,7 @@ def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
             points = curve_of(rows, task, controller, stress)
             levels, shade, width = [row.level for row in points], color(controller, k), max(1.5, 3.5 - k)
             success = [100 * row.success for row in points]
-            above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=_label(controller))
+            above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=label(controller))
             standing = [row for row in points if 2 * row.falls <= row.episodes and math.isfinite(row.regret_mean)]
             levels = [row.level for row in standing]
             below.plot(levels, [100 * row.regret_mean for row in standing], "o-", ms=4, lw=width, color=shade)
@@ -201,7 +211,7 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
                 basin.leans, basin.values, cells, cmap=colors, vmin=0, vmax=2, shading="nearest", alpha=0.85
             )
             axis.fill(*basin.boundary.T, fill=False, ec="k", lw=1.6)
-            axis.set_title(f"{_label(controller)}: {basin.fraction(controller):.0%}", fontsize=10)
+            axis.set_title(f"{label(controller)}: {basin.fraction(controller):.0%}", fontsize=10)
             axis.axhline(0, color="0.5", lw=0.5)
             axis.axvline(0, color="0.5", lw=0.5)
             axis.set_xlim(-81, 81)
@@ -235,7 +245,7 @@ def color(controller: str, i: int) -> str:
     return COLORS.get(controller, _OTHER_COLORS[i % len(_OTHER_COLORS)])
 
 
-def _label(controller: str) -> str:
+def label(controller: str) -> str:
     """What a controller is called in figures; a policy file goes by its name."""
     stem = Path(controller).stem
     return LABELS.get(stem, stem)

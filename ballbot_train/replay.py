@@ -120,8 +120,7 @@ def _take(
         note = f"fails at {run.trajectory.duration:.2f} s"
     else:
         note = f"regret {round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0:.1f} %"  # + 0: no −0.0
-    stem = Path(name).stem
-    return Take(figures.LABELS.get(stem, stem), run.trajectory, figures.color(stem, i), note)
+    return Take(figures.label(name), run.trajectory, figures.color(Path(name).stem, i), note)
 
 
 def with_ghosts(replay: Replay, task: str, episode: int, at: float, expert: str, physics: str) -> Replay:

@@ -21,8 +21,6 @@ from ballbot_train.report import (
     table_section,
 )
 
-_LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
-
 
 def leaderboard_sections(
     header: Sequence[str],
@@ -85,11 +83,8 @@ def regret_section(results: Sequence[Result]) -> Section | None:
     panels = []
     for task in dict.fromkeys(result.task for result in results):
         lines = []
-        for i, name in enumerate(dict.fromkeys(result.controller for result in results if result.task == task)):
-            group = [result for result in results if (result.task, result.controller) == (task, name)]
-            regrets = np.sort([max(100 * result.regret, _LEAST_REGRET) for result in group if result.success])
-            share = 100 * np.arange(1, len(regrets) + 1) / len(group)
-            lines.append(Line(_label(name), regrets, share, figures.color(name, i), steps=True))
+        for i, (name, regrets, share) in enumerate(figures.regret_curves(results, task)):
+            lines.append(Line(figures.label(name), regrets, share, figures.color(name, i), steps=True))
         panels.append(Panel(task, "cost above the optimum, %", "episodes that succeed, %", lines, log_x=True))
     lead = "The higher and the farther left, the better. A curve ends at the share of episodes that succeed."
     return curves_section("How close to the optimum", panels, lead)
@@ -117,8 +112,3 @@ def learning_section(runs: Path) -> Section | None:
         if any(len(line.x) for line in lines)
     ]
     return curves_section("Learning", panels, "Mean regret on certified episodes while training.")
-
-
-def _label(controller: str) -> str:
-    stem = Path(controller).stem
-    return figures.LABELS.get(stem, stem)

@@ -160,11 +160,12 @@ def test_followers_are_labelled_by_feedback_about_the_plan_and_only_near_it(name
     over = np.zeros(met.shape[:2], bool)
     over[-1] = True
     monkeypatch.setattr(learner, "_roll", lambda x, c, steps: (met, over, np.zeros(2, bool)))
-    learner._follow([(plan, c)], rng)
+    gains = dagger.tube_gains(task, params, plan, c)
+    learner._follow([(plan, c)], [gains], rng)
     samples = learner._samples
     assert len(samples) == len(plan.trajectory.u)  # none of the follower who is 100 m/s off
     expected = plan.trajectory.u / params.force_limit
-    expected[2] -= dagger.tube_gains(task, params, plan, c)[2] @ off / params.force_limit
+    expected[2] -= gains[2] @ off / params.force_limit
     np.testing.assert_allclose(samples.actions.numpy(), np.clip(expected, -1, 1), atol=1e-6)
 
 

@@ -160,17 +160,19 @@ class Dagger:
     def _gather(self, rng: np.random.Generator) -> dict[str, float]:
         """Plans episodes, drives, and labels what was met."""
         plans = self._planned(rng)
-        for plan, c in plans:
-            self._samples.add(self._labelled(plan, c, plan.cost, rng))
+        gains = [tube_gains(self._task, self._params, plan, c) for plan, c in plans]
+        for (plan, c), k in zip(plans, gains, strict=True):
+            self._samples.add(self._labelled(plan, k, c, plan.cost, rng))
         if self.config.followers and plans:
-            self._follow(plans, rng)
+            self._follow(plans, gains, rng)
         drives = [episode for episode in plans for _ in range(self.config.drives)]
         labelled = 0
         for (plan, c), (x, elapsed) in zip(drives, self._drive(drives, rng) if drives else (), strict=True):
             found = self._optimum(x, c, plan.trajectory.x[elapsed:, :2])
             if found is not None:
                 labelled += 1
-                self._samples.add(self._labelled(found, c, plan.cost, rng))
+                k = tube_gains(self._task, self._params, found, c)
+                self._samples.add(self._labelled(found, k, c, plan.cost, rng))
         return {"train/labelled": labelled / max(1, len(drives))}
 
     def _planned(self, rng: np.random.Generator) -> list[tuple[Optimum, np.ndarray]]:
@@ -190,7 +192,12 @@ class Dagger:
                     plans.append((find_optimum(self._task, self._params, x, c, config.backoff, config.guesses), c))
         return plans
 
-    def _follow(self, plans: Sequence[tuple[Optimum, np.ndarray]], rng: np.random.Generator) -> None:
+    def _follow(
+        self,
+        plans: Sequence[tuple[Optimum, np.ndarray]],
+        gains: Sequence[np.ndarray],
+        rng: np.random.Generator,
+    ) -> None:
         """Lets followers drive, and labels each of their states by TVLQR at the point of the plan nearest to it."""
         config = self.config
         followed = [episode for episode in plans for _ in range(config.followers)]
@@ -198,7 +205,6 @@ class Dagger:
         x += config.scatter * _SPREAD * rng.standard_normal(x.shape)
         steps = min(max(len(plan.trajectory.u) for plan, _ in plans), round(config.kept / self._task.control_dt))
         history, over, _ = self._roll(x, np.array([c for _, c in followed]), steps)
-        gains = [tube_gains(self._task, self._params, plan, c) for plan, c in plans]
         for i, (plan, c) in enumerate(followed):
             met = history[:, i][~over[:, i]]
             distance, nearest = KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD)
@@ -268,15 +274,19 @@ class Dagger:
                 history.append(result.final_x.T.double().numpy())
         return np.array(history), np.array(over), failed
 
-    def _labelled(self, plan: Optimum, c: np.ndarray, cost: float, rng: np.random.Generator) -> Samples:
-        """The states of an optimum, and those drawn around them, in an episode whose own optimum costs `cost`."""
+    def _labelled(
+        self, plan: Optimum, gains: np.ndarray, c: np.ndarray, cost: float, rng: np.random.Generator
+    ) -> Samples:
+        """The states of an optimum, and those drawn around them, in an episode whose own optimum costs `cost`.
+
+        gains (n, 2, 8) are the feedback about the optimum.
+        """
         config, task = self.config, self._task
         n = min(len(plan.trajectory.u), round(config.kept / task.control_dt))
         x, u = plan.trajectory.x[:n], plan.trajectory.u[:n]
         if config.tube:
-            gains = tube_gains(task, self._params, plan, c)[:n]
             off = _SPREAD * rng.standard_normal((config.tube, n, 8)) * rng.random((config.tube, n, 1))
-            change = -np.einsum("kij,tkj->tki", gains, off)
+            change = -np.einsum("kij,tkj->tki", gains[:n], off)
             small = np.abs(change).max(-1) < _SMALL * self._params.force_limit  # beyond, a derivative says too little
             x, u = np.concatenate([x, (x + off)[small]]), np.concatenate([u, (u + change)[small]])
         return self._samples_of(x, u, c, cost)
