@@ -26,6 +26,7 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train import controllers as registry
 from ballbot_train import jobs
+from ballbot_train.console import about
 from ballbot_train.policy import read_about, shipped_policies
 from ballbot_train.statistics import interval
 
@@ -303,6 +304,29 @@ def policy_digests(controllers: Mapping[str, Sequence[str]]) -> dict[str, str]:
                 weights = Path(shipped.get(name, name)).with_suffix(".safetensors")
                 digests[f"{task}/{name}"] = hashlib.sha256(weights.read_bytes()).hexdigest()
     return digests
+
+
+def begin(out: Path, controllers: Mapping[str, Sequence[str]], workers: int, **settings: Any) -> dict[str, Any]:
+    """Claims a folder for a run of controllers by task with some settings; returns the facts that its results name.
+
+    Raises:
+        ValueError: the folder holds an unfinished run with other settings, policies or code.
+    """
+    settings["policies"] = policy_digests(controllers)
+    facts = about() | settings | {"workers": workers}
+    jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
+    return facts
+
+
+def checked_episodes(episodes: int, quick: bool, few: int) -> int:
+    """How many certified episodes to run: `few` at most if quick.
+
+    Raises:
+        ValueError: there are not so many.
+    """
+    if not 1 <= episodes <= certified.EPISODES:
+        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
+    return min(episodes, few) if quick else episodes
 
 
 def benchmark(

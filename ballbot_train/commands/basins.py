@@ -6,7 +6,7 @@ from typing import Literal
 
 from ballbot_train import basins as maps
 from ballbot_train import evaluate, figures, jobs
-from ballbot_train.console import about, console, print_table, progress_bar
+from ballbot_train.console import console, print_table, progress_bar
 
 
 def basins(
@@ -31,9 +31,8 @@ def basins(
     if points < 3 or points % 2 == 0:
         raise ValueError(f"points must be odd and at least 3, not {points}")
     chosen = evaluate.controllers_of([maps.TASK], controllers)
-    names, digests = chosen[maps.TASK], evaluate.policy_digests(chosen)
-    facts = about() | {"physics": physics, "points": points, "workers": workers, "policies": digests}
-    jobs.claim(out, {key: facts[key] for key in ("version", "commit", "physics", "points", "policies")})
+    names = chosen[maps.TASK]
+    facts = evaluate.begin(out, chosen, workers, physics=physics, points=points)
     with progress_bar() as progress:
         bars = {"boundary": progress.add_task("boundary", total=len(maps.AXES))}
 

@@ -10,7 +10,7 @@ from ballbot_gym import certified, files
 from ballbot_gym.env import make_task
 from ballbot_gym.tasks import TASKS
 from ballbot_train import basins, evaluate, figures, jobs
-from ballbot_train.console import about, console, markdown, print_table, progress_bar
+from ballbot_train.console import console, markdown, print_table, progress_bar
 from ballbot_train.replay import certified_replay
 from ballbot_train.report import write_report
 from ballbot_train.sections import leaderboard_sections
@@ -43,12 +43,8 @@ def benchmark(
         workers: processes; 1 gives the cleanest times per control step.
     """
     chosen = evaluate.controllers_of(tasks, controllers)
-    if not 1 <= episodes <= certified.EPISODES:
-        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
-    episodes = min(episodes, 8) if quick else episodes
-    digests = evaluate.policy_digests(chosen)
-    facts = about() | {"physics": physics, "episodes": episodes, "seed": seed, "workers": workers, "policies": digests}
-    jobs.claim(out, {key: facts[key] for key in ("version", "commit", "physics", "episodes", "seed", "policies")})
+    episodes = evaluate.checked_episodes(episodes, quick, few=8)
+    facts = evaluate.begin(out, chosen, workers, physics=physics, episodes=episodes, seed=seed)
     with progress_bar() as progress:
         bars = {task: progress.add_task(task, total=episodes * len(group)) for task, group in chosen.items()}
         done = evaluate.benchmark(

@@ -5,11 +5,11 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from ballbot_gym import certified, files
+from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate, figures, jobs
 from ballbot_train import robustness as track
-from ballbot_train.console import about, console, markdown, print_table, progress_bar
+from ballbot_train.console import console, markdown, print_table, progress_bar
 
 
 def robustness(
@@ -38,12 +38,8 @@ def robustness(
     """
     chosen = evaluate.controllers_of(tasks, controllers)
     evaluate.check_names("stress", stresses, track.STRESSES)
-    if not 1 <= episodes <= certified.EPISODES:
-        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
-    episodes = min(episodes, 3) if quick else episodes
-    digests = evaluate.policy_digests(chosen)
-    facts = about() | {"physics": physics, "episodes": episodes, "seed": seed, "workers": workers, "policies": digests}
-    jobs.claim(out, {key: facts[key] for key in ("version", "commit", "physics", "episodes", "seed", "policies")})
+    episodes = evaluate.checked_episodes(episodes, quick, few=3)
+    facts = evaluate.begin(out, chosen, workers, physics=physics, episodes=episodes, seed=seed)
     runs = sum(map(len, chosen.values())) * episodes
     with progress_bar() as progress:
         bars = {
