@@ -12,7 +12,8 @@ from gymnasium import spaces
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.randomization import Disturbance, Randomization
-from ballbot_gym.simulator import PHYSICS, Scene
+from ballbot_gym.scene import Scene
+from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import TASKS, Task
 
 

@@ -6,7 +6,11 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
-URDF_PATH = Path(__file__).parent / "urdf" / "ballbot.urdf"
+_PLACES = (Path(__file__).parent, Path(__file__).parent.parent)  # an installed wheel; a checkout
+URDF_PATH = next(
+    (path for place in _PLACES if (path := place / "urdf" / "ballbot.urdf").is_file()), Path("urdf/ballbot.urdf")
+)
+"""The paper's robot: `urdf/ballbot.urdf` of the checkout, which a wheel carries inside the package."""
 
 STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
 

@@ -1,20 +1,14 @@
-"""Simulators of the ballbot behind one interface; the only file that knows PyBullet.
+"""Simulators of the ballbot behind one interface.
 
-`BulletSimulator` loads the URDF; `Rk4Simulator` integrates the closed form and needs no PyBullet. `Scene` draws states of
-either, in a physics client of its own, so that looking never changes a trajectory.
+`BulletSimulator` loads the URDF into PyBullet; `Rk4Simulator` integrates the closed form and needs no PyBullet.
 """
 
 import math
-import os
-import sys
 import tempfile
 import weakref
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol
-
-import numpy as np
 
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
@@ -22,7 +16,6 @@ from ballbot_gym.params import BallbotParams
 State = tuple[float, ...]
 """(8,) state as a tuple of floats; order and units in `dynamics.STATE`."""
 
-_CAMERA = (4.0, -55.0, -22.0)  # distance, m, yaw and pitch, deg: from behind a robot that moves along x
 _JOINTS = ("x", "y", "gamma", "theta")
 
 
@@ -86,9 +79,9 @@ class BulletSimulator:
         """
         substeps = _whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
         bullet = import_pybullet()
-        self._client = _connect(bullet, bullet.DIRECT)
+        self._client = connect(bullet, bullet.DIRECT)
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
-        self._robot, self._joints = _load_robot(bullet, self._client, params)
+        self._robot, self._joints = load_robot(bullet, self._client, params)
         # Substeps run in C++ with the torque held, bitwise equal to as many calls and a third faster.
         bullet.setPhysicsEngineParameter(fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client)
         bullet.setGravity(0, 0, -params.gravity, physicsClientId=self._client)
@@ -104,7 +97,7 @@ class BulletSimulator:
         if params.com_height != self._com_height:
             # Loaded anew, because changeDynamics cannot move a link's centre of mass.
             bullet.removeBody(self._robot, physicsClientId=client)
-            self._robot, self._joints = _load_robot(bullet, client, params)
+            self._robot, self._joints = load_robot(bullet, client, params)
             self._com_height = params.com_height
             return
         ball, body = self._joints[1], self._joints[3]  # a link has the index of the joint that carries it
@@ -131,119 +124,6 @@ PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": Bull
 """Simulators by the name that `gymnasium.make(..., physics=name)` takes."""
 
 
-@dataclass(frozen=True)
-class Marker:
-    """Something a task wants drawn: an upright cylinder of `radius` and `height`, its foot on the floor, both in m.
-
-    A `ring` is drawn as its circumference only.
-    """
-
-    position: tuple[float, float]
-    radius: float
-    height: float
-    color: tuple[float, float, float, float]
-    ring: bool = False
-
-
-class Scene:
-    """Draws the ballbot on a floor with a grid, through PyBullet's software renderer or its window.
-
-    The camera follows the ball; the floor's 1 m squares make speed readable.
-    """
-
-    def __init__(self, params: BallbotParams, human: bool = False, width: int = 640, height: int = 480):
-        """Args: human opens a window instead of drawing into arrays; width and height in pixels.
-
-        Raises:
-            ImportError: PyBullet is missing or was built without NumPy.
-            RuntimeError: human without a display.
-        """
-        bullet = import_pybullet()
-        if human and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            raise RuntimeError('render_mode="human" needs a display, and DISPLAY is not set; use "rgb_array"')
-        self._client = _connect(bullet, bullet.GUI if human else bullet.DIRECT)
-        self._release = weakref.finalize(self, bullet.disconnect, self._client)
-        self._bullet, self._human, self._size = bullet, human, (width, height)
-        if human:
-            bullet.configureDebugVisualizer(bullet.COV_ENABLE_GUI, 0, physicsClientId=self._client)
-        self._robot, self._joints = _load_robot(bullet, self._client, params)
-        self._params = params
-        self._markers: list[int] = []
-        self._add_floor()
-
-    def set_markers(self, markers: list[Marker]) -> None:
-        """Replaces what the task wants drawn."""
-        for body in self._markers:
-            self._bullet.removeBody(body, physicsClientId=self._client)
-        self._markers = [body for marker in markers for body in self._add_marker(marker)]
-
-    def draw(self, x: State) -> np.ndarray | None:
-        """Shows state x; returns (height, width, 3) uint8, or None in a window."""
-        bullet, client = self._bullet, self._client
-        for i, joint in enumerate(self._joints):
-            bullet.resetJointState(self._robot, joint, x[i], 0.0, physicsClientId=client)
-        target = (x[0], x[1], 0.5)
-        if self._human:
-            bullet.resetDebugVisualizerCamera(*_CAMERA, target, physicsClientId=client)
-            return None
-        width, height = self._size
-        view = bullet.computeViewMatrixFromYawPitchRoll(target, *_CAMERA, 0, 2)
-        projection = bullet.computeProjectionMatrixFOV(45, width / height, 0.1, 60)
-        image = bullet.getCameraImage(
-            width,
-            height,
-            view,
-            projection,
-            lightDirection=(-4, -6, 12),
-            lightDistance=20,
-            shadow=1,
-            renderer=bullet.ER_TINY_RENDERER,
-            flags=bullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=client,
-        )[2]
-        return np.reshape(image, (height, width, 4))[:, :, :3].astype(np.uint8)
-
-    def close(self) -> None:
-        """Closes the window or releases the client; may be called again."""
-        self._release()
-
-    def _add_floor(self) -> None:
-        import pybullet_data
-
-        bullet = self._bullet
-        floor = bullet.loadURDF(
-            str(Path(pybullet_data.getDataPath()) / "plane100.urdf"),
-            useFixedBase=True,
-            physicsClientId=self._client,
-        )
-        bullet.changeVisualShape(floor, -1, rgbaColor=(1, 1, 1, 1), physicsClientId=self._client)
-
-    def _add_marker(self, marker: Marker) -> list[int]:
-        x, y = marker.position
-        if not marker.ring:
-            return [self._cylinder((x, y, marker.height / 2), marker.radius, marker.height, marker.color)]
-        count = max(24, int(2 * math.pi * marker.radius / 0.2))
-        angles = [2 * math.pi * k / count for k in range(count)]
-        return [
-            self._cylinder(
-                (x + marker.radius * math.cos(a), y + marker.radius * math.sin(a), marker.height / 2),
-                0.025,
-                marker.height,
-                marker.color,
-            )
-            for a in angles
-        ]
-
-    def _cylinder(self, position: tuple, radius: float, height: float, color: tuple) -> int:
-        bullet, client = self._bullet, self._client
-        shape = bullet.createVisualShape(
-            bullet.GEOM_CYLINDER, radius=radius, length=height, rgbaColor=color, physicsClientId=client
-        )
-        return bullet.createMultiBody(
-            baseMass=0, baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client
-        )
-
-
 def import_pybullet() -> ModuleType:
     """PyBullet, or an ImportError that says what to do."""
     try:
@@ -261,14 +141,15 @@ def import_pybullet() -> ModuleType:
     return pybullet
 
 
-def _connect(bullet: ModuleType, mode: int) -> int:
+def connect(bullet: ModuleType, mode: int) -> int:
+    """A new physics client."""
     client = bullet.connect(mode)
     if client < 0:
         raise RuntimeError("PyBullet has no free physics client; close() environments that are no longer used")
     return client
 
 
-def _load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[int, tuple[int, ...]]:
+def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[int, tuple[int, ...]]:
     """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "ballbot.urdf"

@@ -19,12 +19,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from ballbot_baselines.certify import episode
-from ballbot_baselines.controller import rollout
+from ballbot_baselines.certification import episode
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 
 

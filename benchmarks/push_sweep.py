@@ -18,13 +18,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from ballbot_baselines.controller import Controller, simulate
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import files
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.rollout import Controller, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 
 _SECONDS = 6.0  # until which the robot must be upright again

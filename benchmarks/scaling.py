@@ -13,10 +13,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
+from ballbot_baselines.collocation import Guess, solve
 from ballbot_baselines.guess import along_path, cubic_hermite
 from ballbot_baselines.optimum import find_optimum
 from ballbot_baselines.paper import between_states, state
-from ballbot_baselines.transcription import Guess, solve
 from ballbot_gym import files
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.tasks.stabilize import Stabilize

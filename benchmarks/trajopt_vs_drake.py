@@ -26,11 +26,11 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.planning import DirectCollocation
 from pydrake.solvers import SnoptSolver
 
+from ballbot_baselines.collocation import Guess, Problem, hermite_simpson, solve
 from ballbot_baselines.guess import straight_line
 from ballbot_baselines.ocp import OcpSolver
 from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.paper import PAPER_PROBLEMS
-from ballbot_baselines.transcription import Guess, Problem, hermite_simpson, solve
 from ballbot_gym import files
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
 

@@ -7,7 +7,7 @@ import numpy as np
 import tyro
 
 from ballbot_train.console import print_table
-from ballbot_train.evaluate import HEADER, cells, evaluate
+from ballbot_train.evaluation.evaluate import HEADER, cells, evaluate
 
 GAIN = np.array([[0.3, 0, 1.3, 0, 0.7, 0, 1.3, 0], [0, 0.3, 0, 1.3, 0, 0.7, 0, 1.3]])
 

@@ -8,7 +8,8 @@ import ballbot_gym
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("ballbot_gym", "ballbot_baselines", "ballbot_train")
-FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+FOLDERS = ("ballbot_gym", "baselines/ballbot_baselines", "train/ballbot_train")
+FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for path in (ROOT / folder).rglob("*.py")})
 
 

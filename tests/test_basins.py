@@ -3,10 +3,11 @@ import math
 import numpy as np
 import pytest
 
-from ballbot_baselines.controller import FunctionController, rollout
 from ballbot_baselines.recovery import largest_leans
+from ballbot_gym.rollout import FunctionController, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_train import basins, figures
+from ballbot_train.evaluation import basins
+from ballbot_train.report.page import figures
 
 LEAN_RATE = 6  # its index in a state
 

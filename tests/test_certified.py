@@ -20,7 +20,7 @@ def test_set_has_200_episodes_and_20_trajectories(evaluation):
 
 
 def test_episodes_are_the_tasks_own_and_all_different(task, evaluation, params):
-    certify = pytest.importorskip("ballbot_baselines.certify")
+    certify = pytest.importorskip("ballbot_baselines.certification")
     for i in (0, 1, 199):
         x, c = certify.episode(task, params, i)
         np.testing.assert_array_equal(evaluation.states[i], x)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train import evaluate
 from ballbot_train.commands import COMMANDS
 from ballbot_train.commands.compare import compare
-from ballbot_train.evaluate import Result
+from ballbot_train.evaluation import evaluate
+from ballbot_train.evaluation.evaluate import Result
 
 
 def ballbot(*arguments, cwd):

@@ -4,9 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballbot_train.comparison import compare
-from ballbot_train.evaluate import Result
-from ballbot_train.statistics import interval, verdict
+from ballbot_train.evaluation.comparison import compare
+from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.statistics import interval, verdict
 
 EXPERT, POLICY = "lqr", "shac"
 

@@ -18,7 +18,7 @@ from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_train.cli import main
-from ballbot_train.demos import DemoConfig, Expert, command_of, load_demos, record, write_demos
+from ballbot_train.learning.demonstrations import DemoConfig, Expert, command_of, load_demos, record, write_demos
 
 
 def make(out, **changes):

@@ -13,8 +13,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ballbot_gym import BallbotEnv
-from ballbot_gym.simulator import PHYSICS, Marker, Scene
+from ballbot_gym.scene import Scene
+from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import Stabilize
 
 UPRIGHT = np.zeros(8)

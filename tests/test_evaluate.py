@@ -9,12 +9,12 @@ import pytest
 import stable_baselines3
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.controller import FunctionController, rollout
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.rollout import FunctionController, rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_train import evaluate
-from ballbot_train.evaluate import Result
+from ballbot_train.evaluation import evaluate
+from ballbot_train.evaluation.evaluate import Result
 from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy, shipped_policies
 
 

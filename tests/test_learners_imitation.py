@@ -11,9 +11,9 @@ from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train import training
-from ballbot_train.demos import DemoConfig, load_demos, write_demos
-from ballbot_train.learners import bc, dagger
+from ballbot_train.learning import training
+from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+from ballbot_train.learning.learners import bc, dagger
 
 TINY_BC = bc.BcConfig(iterations=4, steps=20, batch=128, hidden=(16,))
 TINY_DAGGER = dagger.DaggerConfig(

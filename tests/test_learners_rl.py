@@ -9,9 +9,9 @@ import torch
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
-from ballbot_train.demos import DemoConfig, Demos, load_demos, write_demos
-from ballbot_train.learners import LEARNERS, ppo, sac
-from ballbot_train.learners.model_free import OwnRandomness, TrainingEnv
+from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
+from ballbot_train.learning.learners import LEARNERS, ppo, sac
+from ballbot_train.learning.learners.model_free import OwnRandomness, TrainingEnv
 from ballbot_train.policy import load_network, save_policy
 
 IMITATING = {"clone_iterations": 2, "clone_steps": 5, "clone_batch": 32, "critic_iterations": 1}

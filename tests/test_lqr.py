@@ -5,7 +5,6 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines.controller import FunctionController, rollout
 from ballbot_baselines.linearize import discretize, goal_weight, linearize, quadratic_cost
 from ballbot_baselines.lqr import (
     LqrController,
@@ -18,6 +17,7 @@ from ballbot_baselines.lqr import (
 )
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import dynamics
+from ballbot_gym.rollout import FunctionController, rollout
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn

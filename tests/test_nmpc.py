@@ -3,11 +3,11 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines.controller import DelayedController, rollout, simulate
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import Grid, NmpcController
 from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_gym import certified, dynamics
+from ballbot_gym.rollout import DelayedController, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from ballbot_baselines.controller import rollout
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import default_params
+from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_train.controllers import make_controller, names
-from ballbot_train.evaluate import evaluate
+from ballbot_train.evaluation.controllers import make_controller, names
+from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.policy import (
     PolicyController,
     PolicyError,

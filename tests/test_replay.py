@@ -9,12 +9,20 @@ import pytest
 from ballbot_baselines.optimum import PlanError
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.simulator import Marker
+from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
-from ballbot_train.replay import Replay, Take, certified_replay, file_replay, film_frames, film_times, with_ghosts
-from ballbot_train.replay import write_film as write
-from ballbot_train.sketch import Camera, body_axis
+from ballbot_train.report.perspective import Camera, body_axis
+from ballbot_train.report.replay import (
+    Replay,
+    Take,
+    certified_replay,
+    file_replay,
+    film_frames,
+    film_times,
+    with_ghosts,
+)
+from ballbot_train.report.replay import write_film as write
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
 

@@ -7,22 +7,22 @@ import time
 import numpy as np
 import pytest
 
-from ballbot_gym.simulator import Marker
+from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train import figures
-from ballbot_train.replay import Replay, Take
-from ballbot_train.report import (
+from ballbot_train.report.page import (
     Line,
     Panel,
     Section,
     curves_section,
+    figures,
     folder_section,
     pictures_section,
     replay_section,
     table_section,
     write_report,
 )
-from ballbot_train.sections import learning_section
+from ballbot_train.report.replay import Replay, Take
+from ballbot_train.report.sections import learning_section
 
 webdriver = pytest.importorskip("selenium.webdriver")
 

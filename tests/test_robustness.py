@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from ballbot_gym.randomization import Randomization
-from ballbot_train import evaluate, figures, robustness
-from ballbot_train.robustness import NONE, STRESSES, StressResult
+from ballbot_train.evaluation import evaluate, robustness
+from ballbot_train.evaluation.robustness import NONE, STRESSES, StressResult
+from ballbot_train.report.page import figures
 
 
 @pytest.mark.parametrize("name", STRESSES)

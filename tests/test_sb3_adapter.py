@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from ballbot_gym import dynamics
 from ballbot_gym.vector import BallbotVectorEnv
-from ballbot_train.sb3 import BallbotVecEnv
+from ballbot_train.learning.sb3 import BallbotVecEnv
 
 
 def make(num_envs=4, **kwargs):

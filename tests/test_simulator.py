@@ -9,7 +9,8 @@ import pybullet
 import pytest
 
 from ballbot_gym import dynamics
-from ballbot_gym.simulator import PHYSICS, BulletSimulator, Rk4Simulator, Scene, import_pybullet
+from ballbot_gym.scene import Scene
+from ballbot_gym.simulator import PHYSICS, BulletSimulator, Rk4Simulator, import_pybullet
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
 FORCE = (60.0, -40.0)

@@ -15,8 +15,8 @@ import torch
 from ballbot_baselines.lqr import discrete_lqr
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train import training
-from ballbot_train.learners import LEARNERS, shac
+from ballbot_train.learning import training
+from ballbot_train.learning.learners import LEARNERS, shac
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 SETTINGS = ["iterations", "6", "evaluations", "3", "envs", "4", "window", "3", "hidden", "8", "compile", "false"]

@@ -12,9 +12,10 @@ pytest.importorskip("torch")
 import torch
 
 from ballbot_gym import BallbotEnv, BallbotParams, dynamics, vector
+from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.simulator import BulletSimulator
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.vector import BallbotBatch, BallbotVectorEnv
+from ballbot_gym.vector import BallbotVectorEnv
 
 INFO = ("state", "cost", "tilt", "success", "failure", "force", "clipped", "constants")
 

@@ -10,7 +10,7 @@ import numpy as np
 from ballbot_gym import dynamics, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import Marker
+from ballbot_gym.tasks.marker import Marker
 
 
 @dataclass(frozen=True)

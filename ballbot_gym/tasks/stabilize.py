@@ -9,8 +9,8 @@ import numpy as np
 from ballbot_gym import dynamics, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import Marker
 from ballbot_gym.tasks.base import Reference, Task, between, cubic, scaled, squared, then_stay
+from ballbot_gym.tasks.marker import Marker
 
 _GUESS_SECONDS = 2.5  # how long a guessed path takes to come to rest
 

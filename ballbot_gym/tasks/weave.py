@@ -9,8 +9,8 @@ import numpy as np
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import Marker
 from ballbot_gym.tasks.base import Reference, Task, between, scaled, squared, then_stay
+from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import at_rest
 
 MAX_OBSTACLES = 5

@@ -1,0 +1,403 @@
+"""BallbotBatch: many ballbots at once in torch, tensors in and out, differentiable.
+
+Components come first: a batch of B states is a tensor (8, B), so that every operation runs over contiguous memory.
+
+Random numbers are those of `counter_rng`, not the numbers that `BallbotEnv` draws from NumPy's generator for the same seed.
+The same seed and actions give the same results bit by bit among eager batches, and among compiled ones of two or more envs.
+Eager, compiled, and a compiled batch of one, whose sine is another library's, agree to rounding.
+"""
+
+import logging
+import shutil
+import types
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+
+from ballbot_gym import counter_rng, dynamics
+from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.randomization import Randomization, actuate
+from ballbot_gym.tasks import Task
+
+_log = logging.getLogger(__name__)
+
+COMPILE_FROM = 1024
+"""Batch size from which compile="auto" compiles: below, compiling for half a minute seldom pays."""
+
+_FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
+"""The fields of `BatchStep` that are bools."""
+
+
+class BatchState(NamedTuple):
+    """Everything that a batch of B environments remembers."""
+
+    x: torch.Tensor
+    """(8, B) states; order and units in `dynamics.STATE`."""
+    c: torch.Tensor
+    """(nc, B) constants of the running episodes."""
+    steps: torch.Tensor
+    """(B,) int64, control steps taken in the running episodes."""
+    episode: torch.Tensor
+    """(B,) int64, number of the running episode since the env was seeded."""
+    seed: torch.Tensor
+    """(B,) int64."""
+    drawn: torch.Tensor
+    """(6, B) what `Randomization.draw` drew for the running episodes; (0, B) where it is off."""
+    actuator: torch.Tensor
+    """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
+
+
+class BatchStep(NamedTuple):
+    """What one control step of B environments gave. Environments whose episode ended have started the next one."""
+
+    observation: torch.Tensor
+    """(B, no) observations; of ended episodes, the next one's first."""
+    reward: torch.Tensor
+    """(B,) −cost of the step."""
+    terminated: torch.Tensor
+    """(B,) bool."""
+    truncated: torch.Tensor
+    """(B,) bool."""
+    final_observation: torch.Tensor
+    """(B, no) observations after the step and before any reset."""
+    final_x: torch.Tensor
+    """(8, B) states after the step and before any reset."""
+    success: torch.Tensor
+    """(B,) bool: the episode ended in the goal."""
+    failure: torch.Tensor
+    """(B,) bool: the episode ended at a violated margin."""
+    force: torch.Tensor
+    """(2, B) N, what the actuator applied."""
+    clipped: torch.Tensor
+    """(B,) bool: the action was outside [−1, 1]."""
+    final_tilt: torch.Tensor
+    """(B,) rad, of `final_x`; carries no gradient."""
+    tilt: torch.Tensor
+    """(B,) rad, of the states that follow: `final_x`, or where an episode ended the next one's start; no gradient."""
+
+
+class _Robot(NamedTuple):
+    """What `dynamics` reads of `BallbotParams`, whose cached properties take a lock that torch.compile cannot."""
+
+    total_mass: Any
+    first_moment: Any
+    pivot_inertia: Any
+    axial_inertia: Any
+    gravity: Any
+
+    @classmethod
+    def of(cls, params: BallbotParams) -> "_Robot":
+        derived = (BallbotParams.total_mass, BallbotParams.first_moment, BallbotParams.pivot_inertia)
+        return cls(*(value.func(params) for value in derived), params.axial_inertia, params.gravity)
+
+
+class BallbotBatch:
+    """B ballbots that do one task, in torch, differentiable from actions and states to rewards and observations.
+
+    `transition` is a pure function of state and actions; `reset` and `step` apply it to `self.state`. Gradients flow
+    through `step` into earlier actions until an episode ends; `detach` cuts them. The physics is the closed form of
+    `BallbotEnv(physics="rk4")`.
+    """
+
+    def _init__(
+        self,
+        task: str | Task = "stabilize",
+        num_envs: int = 1,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float32,
+        compile: bool | str = "auto",
+        params: BallbotParams | None = None,
+        randomization: Randomization | None = None,
+        **task_fields: Any,
+    ):
+        """Makes the batch; call `reset` first.
+
+        Args:
+            task: a name in `TASKS`, or a Task.
+            num_envs: B.
+            device, dtype: of all tensors; torch.float32 or torch.float64.
+            compile: True compiles `transition` at the first step, for half a minute or so, and raises where that fails;
+                "auto" does so for batches of at least `COMPILE_FROM` where a compiler is found, and falls back to eager
+                execution with a warning in the log; False never compiles.
+            params: the nominal robot; default, the paper's.
+            randomization: what varies; default, nothing.
+            **task_fields: fields of the task that replace its defaults.
+
+        Raises:
+            ValueError: num_envs, dtype or compile out of range, or as `make_task`.
+            TypeError: a keyword that is no field of the task.
+        """
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype must be torch.float32 or torch.float64, not {dtype}")
+        if compile not in (True, False, "auto"):
+            raise ValueError(f'compile must be True, False or "auto", not {compile!r}')
+        self.task = make_task(task, **task_fields)
+        self.params = default_params() if params is None else params
+        self.randomization = Randomization() if randomization is None else randomization
+        self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
+        self.state: BatchState | None = None
+        for name in _Robot._fields:
+            getattr(self.params, name)  # computed and kept, before torch.compile meets a lock there
+        self._substeps = dynamics.substeps_for(self.task.control_dt)
+        self._past_steps = self.randomization.delay_steps(self.task.control_dt)[1]
+        self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
+        self._compile = compile
+        wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
+        self._run = _compiled(self._compilable) if wanted else self.transition
+        self._proven = not wanted
+
+    @property
+    def compiled(self) -> bool:
+        """Whether `step` runs compiled code; settled after the first step."""
+        return self._run != self.transition
+
+    def reset(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        mask: torch.Tensor | None = None,
+        x: torch.Tensor | None = None,
+        c: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Starts episodes.
+
+        Args:
+            seed: an int seeds env i with seed + i, a sequence env i with seed[i], where it is not None. Without one, each
+                env goes on to its next episode, or is seeded at random the first time.
+            mask: (B,) bool, the envs to reset; default, all. All are reset the first time.
+            x: (8, B) initial states and c: (nc, B) constants; default, drawn. They are not checked.
+
+        Returns:
+            (B, no) observations of all envs.
+        """
+        self.state = self.begin(seed, mask, x, c)
+        return self.observe(self.state)
+
+    def begin(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        mask: torch.Tensor | None = None,
+        x: torch.Tensor | None = None,
+        c: torch.Tensor | None = None,
+    ) -> BatchState:
+        """The state that `reset` would go to; changes nothing."""
+        old = self.state
+        if old is None:
+            mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+            seeds = torch.tensor(_seeds_of(self._entropy, self.num_envs), device=self.device)
+            episode = torch.zeros_like(seeds)
+        else:
+            mask = torch.ones_like(old.seed, dtype=torch.bool) if mask is None else mask
+            seeds, episode = old.seed, old.episode + 1
+        if seed is not None:
+            given = torch.tensor([-1 if s is None else s for s in _seeds_of(seed, self.num_envs)], device=self.device)
+            seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
+        new = self._start(seeds, episode, x, c)
+        return self._stacked(new if old is None else _select(mask, new, _rows(old)))
+
+    def observe(self, state: BatchState) -> torch.Tensor:
+        """(B, no) observations of a state: a pure function, the sensors' noise included."""
+        return self._observe(_rows(state))
+
+    def step(self, actions: torch.Tensor) -> BatchStep:
+        """Holds forces for one control step; see `transition`. Call `reset` first."""
+        if self.state is None:
+            raise gymnasium.error.ResetNeeded("step() before reset()")
+        try:
+            self.state, result = self._run(self.state, actions)
+        except Exception as error:
+            if self._proven or self._compile is True:
+                raise
+            reason = str(error).strip().splitlines()[:1]
+            _log.warning("torch.compile failed, the batch runs eagerly: %s %s", type(error).__name__, reason)
+            self._run = self.transition
+            self.state, result = self._run(self.state, actions)
+        self._proven = True
+        return result._replace(**{name: getattr(result, name).bool() for name in _FLAGS}) if self.compiled else result
+
+    def detach(self) -> None:
+        """Cuts the gradient: later steps do not reach back behind this point."""
+        if self.state is not None:
+            self.state = BatchState(*(part.detach() for part in self.state))
+
+    def transition(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
+        """One control step of every env, and the start of the next episode where one ended; a pure function.
+
+        Args:
+            state: of the batch.
+            actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1]. They are taken to be finite.
+        """
+        task, noise = self.task, self.randomization
+        now = _rows(state)
+        x, c = now.x, now.c
+        asked = actions.to(self.dtype).unbind(-1)
+        command = tuple(part.clamp(-1.0, 1.0) * self.params.force_limit for part in asked)
+        force, actuator = self._actuate(now, command)
+        total = force
+        if noise.pushes:
+            z = counter_rng.uniforms(
+                counter_rng.key(state.seed, state.episode, state.steps + 1), Randomization.PUSH_DRAWS, self.dtype
+            )
+            total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
+        robot = self.params
+        if noise.varies_robot:
+            robot = _Robot.of(noise.robot(self.params, now.drawn[:4]))
+
+        rate = task.cost(x, force, c)
+        end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
+        safe, reached = all_of(m >= 0 for m in task.margins(end, c)), all_of(g <= 0 for g in task.goal(end, c))
+        failure = ~safe  # so that a state that is not finite fails
+        steps = state.steps + 1
+        last = steps >= task.steps
+        success = safe & reached if task.first_exit else safe & reached & last
+        terminated = failure | success if task.first_exit else failure
+        truncated = last & ~terminated
+        done = terminated | truncated
+        cost = rate * task.control_dt + task.failure_cost * failure
+
+        after = now._replace(x=end, steps=steps, actuator=actuator)
+        new = _select(done, self._start(state.seed, state.episode + 1), after)
+        result = BatchStep(
+            observation=self._observe(new),
+            reward=-cost,
+            terminated=terminated,
+            truncated=truncated,
+            final_observation=self._observe(after),
+            final_x=torch.stack(end),
+            success=success,
+            failure=failure,
+            force=torch.stack(force),
+            clipped=any_of(part.abs() > 1.0 for part in asked),
+            final_tilt=tilt_of(end),
+            tilt=tilt_of(new.x),
+        )
+        return self._stacked(new), result
+
+    def _compilable(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
+        """`transition` with its flags as numbers 0 and 1: torch's CPU code generator stores bools one by one."""
+        state, result = self.transition(state, actions)
+        numbers = {name: torch.where(getattr(result, name), 1.0, 0.0) for name in _FLAGS}
+        return state, result._replace(**numbers)
+
+    def robot(self, i: int) -> BallbotParams:
+        """The robot of env i in its running episode."""
+        if self.state is None:
+            raise gymnasium.error.ResetNeeded("no episode before reset()")
+        if not self.randomization.varies_robot:
+            return self.params
+        return self.randomization.robot(self.params, tuple(self.state.drawn[:4, i].tolist()))
+
+    def _start(
+        self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
+    ) -> BatchState:
+        """The beginnings of episodes, in rows; x and c are drawn where they are not given."""
+        task, noise = self.task, self.randomization
+        key = counter_rng.key(seed, episode, 0 * episode)
+        varied = noise.varies_robot or noise.varies_actuator
+        count = task.constant_draws + task.state_draws + Randomization.EPISODE_DRAWS * varied
+        z = counter_rng.uniforms(key, count, self.dtype)
+        z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
+        constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
+        state = task.draw_state(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
+        zero = torch.zeros_like(episode)
+        drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
+        still = torch.zeros_like(seed, dtype=self.dtype)
+        actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
+        return BatchState(state, constants, zero, episode, seed, drawn, actuator)
+
+    def _actuate(self, now: BatchState, command: tuple) -> tuple[tuple, tuple]:
+        """Force (2) applied, and the actuator's new memory, of a state in rows."""
+        if not self.randomization.varies_actuator:
+            return command, now.actuator
+        pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
+        force = actuate(command, pairs[1:], pairs[0], now.drawn[4], now.drawn[5])
+        kept = (command, *pairs[1:])[: self._past_steps]
+        return force, tuple(part for pair in (force, *kept) for part in pair)
+
+    def _observe(self, now: BatchState) -> torch.Tensor:
+        """(B, no) of a state in rows with the sensors' noise, which is drawn for the episode's steps so far."""
+        x = now.x
+        if self.randomization.is_noisy:
+            key = counter_rng.key(now.seed, now.episode, now.steps + 1)
+            z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
+            x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :])
+        return torch.stack(self.task.observe(x, now.c)).T
+
+    def _stacked(self, rows: BatchState) -> BatchState:
+        """A state in rows as tensors."""
+        none = torch.zeros(0, *rows.seed.shape, dtype=self.dtype, device=rows.seed.device)
+        return BatchState(
+            *(part if isinstance(part, torch.Tensor) else torch.stack(part) if part else none for part in rows)
+        )
+
+
+def _has_compiler(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return True  # Triton brings its own
+    return any(shutil.which(name) for name in ("g++", "c++", "clang++"))
+
+
+def _compiled(transition: Any) -> Any:
+    """The bound method compiled, from a copy of its code: PyTorch limits recompilations per code object, and here every
+    batch size and task is one.
+    """
+    function = transition.__func__
+    own = types.FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
+    # By default no loop takes more than 64 operations, and what crosses from one loop to the next goes through memory.
+    options = {"max_fusion_size": 1000}
+    return torch.compile(types.MethodType(own, transition.__self__), fullgraph=True, dynamic=False, options=options)
+
+
+def _rows(state: BatchState) -> BatchState:
+    """The state with each of its matrices as a tuple of rows (B,), the form in which everything is computed."""
+    return BatchState(*(part.unbind(0) if part.ndim == 2 else part for part in state))
+
+
+def _select(mask: torch.Tensor, new: BatchState, old: BatchState) -> BatchState:
+    """The new state where the mask (B,) holds, else the old, both in rows."""
+
+    def chosen(a: Any, b: Any) -> Any:
+        if isinstance(a, tuple):
+            return tuple(map(chosen, a, b))
+        return a if a is b else torch.where(mask, a, b)
+
+    return BatchState(*map(chosen, new, old))
+
+
+def all_of(conditions: Any) -> torch.Tensor:
+    """Elementwise and."""
+    first, *others = conditions
+    for condition in others:
+        first = first & condition
+    return first
+
+
+def any_of(conditions: Any) -> torch.Tensor:
+    """Elementwise or."""
+    first, *others = conditions
+    for condition in others:
+        first = first | condition
+    return first
+
+
+def tilt_of(x: tuple) -> torch.Tensor:
+    """(B,) rad of states of 8 rows, without gradient, which is infinite at upright."""
+    # float rounding can leave a cosine a hair above 1
+    return torch.acos(dynamics.cos_tilt(tuple(part.detach() for part in x)).clamp(max=1.0))
+
+
+def _seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
+    """One seed per env."""
+    if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+        seed = [int(seed) + i for i in range(num_envs)]
+    if len(seed) != num_envs:
+        raise ValueError(f"seed has {len(seed)} entries for {num_envs} envs")
+    for value in seed:
+        if value is not None and not 0 <= value < 2**63:
+            raise ValueError(f"seeds must be in [0, 2^63), not {value}")
+    return list(seed)

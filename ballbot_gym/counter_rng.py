@@ -1,0 +1,27 @@
+"""Random numbers for batches: a hash of (the env's seed, the episode's number, the step, an index), in torch.
+
+So the same seed and actions give the same results in every batch, wherever the env stands in it, and ended episodes are
+drawn anew without a loop.
+"""
+
+import torch
+
+_WORD = 0xFFFFFFFF  # hashes are 32-bit words kept in int64, whose products then never overflow
+
+
+def key(seed: torch.Tensor, episode: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+    """(B,) words from which one step's random numbers follow; step 0 is the start of the episode."""
+    return _mix(_mix(_mix(_mix(seed & _WORD) ^ (seed >> 32)) ^ (episode & _WORD)) ^ (step & _WORD))
+
+
+def uniforms(key: torch.Tensor, count: int, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+    """`count` tensors (B,) of uniform numbers in [0, 1), multiples of 2⁻²⁴ and so the same in both dtypes."""
+    words = (_mix((key + 0x9E3779B9 * i) & _WORD) for i in range(1, count + 1))
+    return tuple((word >> 8).to(dtype) * 2.0**-24 for word in words)
+
+
+def _mix(word: torch.Tensor) -> torch.Tensor:
+    """A bijection of 32-bit words that scatters them: the multiply and xor-shift rounds of murmur's finalizer."""
+    word = ((word ^ (word >> 16)) * 0x21F0AAAD) & _WORD
+    word = ((word ^ (word >> 15)) * 0x735A2D97) & _WORD
+    return word ^ (word >> 15)

@@ -1,0 +1,224 @@
+"""The paper's three optimizations, with the weights for which reference optima are known, and its experiments.
+
+"High lean angle trajectory optimization for ball balancing robots", equations (2) to (4): direct collocation with a free
+time step, costs summed over knots and not multiplied by the step, and a final-time cost S·h·N in every summand.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballbot_baselines import guess as guesses
+from ballbot_baselines.collocation import Guess, Plan, Problem, solve
+from ballbot_gym import ops
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks.base import squared
+from ballbot_gym.tasks.orbit import steady_orbit
+
+DISTANCE_WEIGHT = 1.0  # Q0, of the squared ground distance from the destination
+REST_WEIGHT = 0.1  # Q1, of the other squared states
+EFFORT_WEIGHT = 1e-4  # R
+TIME_WEIGHT = 1.0  # S
+ORBIT_WEIGHT = 0.1  # Q of the orbit's x² + y²
+LEAN_LIMIT = 1.0  # rad
+
+INTERVALS = 40
+WEAVE_INTERVALS = 80  # obstacles bind at knots only: with 40 the path cuts 3 cm into them between knots
+
+
+@dataclass(frozen=True)
+class PaperProblem:
+    """One of the paper's experiments: the problem, the guess it is solved from, and the figure it is in."""
+
+    name: str
+    title: str
+    figure: str
+    problem: Problem
+    guess: Callable[[BallbotParams], Guess]
+    obstacles: tuple[tuple[float, float, float], ...] = ()
+    """x, y and the distance that the ball's centre keeps, m."""
+
+    def solve(self, params: BallbotParams, solver: str = "ipopt") -> Plan:
+        """The optimum.
+
+        Raises:
+            PlanError: the solver stopped without it.
+        """
+        return solve(self.problem, params, self.guess(params), solver)
+
+
+def between_states(
+    name: str,
+    x0: np.ndarray,
+    x1: np.ndarray,
+    obstacles: tuple[tuple[float, float, float], ...] = (),
+    intervals: int = INTERVALS,
+) -> Problem:
+    """The paper's optimizations 1 and, with obstacles, 3: from state x0 to state x1, (8,) each."""
+    steps = intervals
+
+    def cost(x: ops.Vector, u: ops.Vector, h: float, q: ops.Vector) -> float:
+        px, py, *rest = ops.components(x)
+        return (
+            DISTANCE_WEIGHT * squared(px - x1[0], py - x1[1])
+            + REST_WEIGHT * squared(*rest)
+            + EFFORT_WEIGHT * squared(*ops.components(u))
+            + TIME_WEIGHT * h * steps
+        )
+
+    def clearances(x: ops.Vector, u: ops.Vector, q: ops.Vector) -> tuple:
+        px, py, *_ = ops.components(x)
+        return tuple(squared(px - ox, py - oy) - distance**2 for ox, oy, distance in obstacles)
+
+    return Problem(
+        name=name,
+        cost=cost,
+        initial=(x0, x0),
+        final=(x1, x1),
+        intervals=intervals,
+        lean_limit=LEAN_LIMIT,
+        inequalities=clearances if obstacles else None,
+    )
+
+
+def circular_orbit(name: str, speed: float, intervals: int = INTERVALS) -> Problem:
+    """The paper's optimization 2: a closed circle of free radius q[0] at constant ground speed, m/s, from (0, y ≥ 0)."""
+
+    def cost(x: ops.Vector, u: ops.Vector, h: float, q: ops.Vector) -> float:
+        px, py, *_ = ops.components(x)
+        effort = EFFORT_WEIGHT * squared(*ops.components(u))
+        return ORBIT_WEIGHT * squared(px, py) + effort + TIME_WEIGHT * h * intervals
+
+    def on_circle(x: ops.Vector, u: ops.Vector, q: ops.Vector) -> tuple:
+        px, py, _, _, vx, vy, _, _ = ops.components(x)
+        return squared(px, py) - squared(*ops.components(q)), squared(vx, vy) - speed**2
+
+    lower, upper = np.full(8, -np.inf), np.full(8, np.inf)
+    lower[0] = upper[0] = lower[1] = 0.0
+    everywhere = np.full(8, np.inf)
+    return Problem(
+        name=name,
+        cost=cost,
+        initial=(lower, upper),
+        final=(-everywhere, everywhere),
+        intervals=intervals,
+        lean_limit=LEAN_LIMIT,
+        periodic=True,
+        free=((0.1, 10.0),),
+        equalities=on_circle,
+    )
+
+
+def hermite_guess(x0: np.ndarray, x1: np.ndarray, duration: float) -> Callable[[BallbotParams], Guess]:
+    """A cubic ground path, with the leans that hold its accelerations and zero forces: it has no kink to iron out."""
+
+    def make(params: BallbotParams) -> Guess:
+        h = duration / INTERVALS
+        x, _ = guesses.along_path(params, guesses.cubic_hermite(x0, x1, duration, INTERVALS), h)
+        x[0], x[-1] = x0, x1
+        return Guess(x, np.zeros((INTERVALS + 1, 2)), h)
+
+    return make
+
+
+def straight_guess(x0: np.ndarray, x1: np.ndarray, duration: float) -> Callable[[BallbotParams], Guess]:
+    """The paper's guess: a straight line from state to state."""
+    return lambda params: Guess(
+        guesses.straight_line(x0, x1, INTERVALS), np.zeros((INTERVALS + 1, 2)), duration / INTERVALS
+    )
+
+
+def _orbit_guess(speed: float, radius: float) -> Callable[[BallbotParams], Guess]:
+    def make(params: BallbotParams) -> Guess:
+        bearings = np.pi / 2 + np.linspace(0, 2 * np.pi, INTERVALS + 1)
+        x, u = steady_orbit(params, radius, speed, bearings)
+        return Guess(x, u, 2 * np.pi * radius / speed / INTERVALS, (radius,))
+
+    return make
+
+
+def _weave_guess(
+    x0: np.ndarray, x1: np.ndarray, via: tuple[tuple[float, float], ...], duration: float
+) -> Callable[[BallbotParams], Guess]:
+    """A spline that passes each obstacle on a chosen side, leans from its accelerations, zero forces."""
+
+    def make(params: BallbotParams) -> Guess:
+        from scipy.interpolate import CubicSpline
+
+        h = duration / WEAVE_INTERVALS
+        points = np.array([x0[:2], *via, x1[:2]])
+        s = np.linspace(0, 1, WEAVE_INTERVALS + 1)
+        along = s**3 * (10 - 15 * s + 6 * s**2)
+        spline = CubicSpline((points[:, 0] - points[0, 0]) / np.ptp(points[:, 0]), points)
+        x, _ = guesses.along_path(params, spline(along), h)
+        x[0], x[-1] = x0, x1
+        return Guess(x, np.zeros((WEAVE_INTERVALS + 1, 2)), h)
+
+    return make
+
+
+def state(x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0) -> np.ndarray:
+    """(8,) an upright state with this ball position, m, and velocity, m/s."""
+    return np.array([x, y, 0.0, 0.0, vx, vy, 0.0, 0.0])
+
+
+def _stabilization(speed: float, figure: str, duration: float) -> PaperProblem:
+    x0 = state(x=-1.0, vy=speed)
+    return PaperProblem(
+        name=f"stabilize-{speed:g}",
+        title=f"Stabilization from x = −1 m, ẏ = {speed:g} m/s",
+        figure=figure,
+        problem=between_states(f"stabilize-{speed:g}", x0, state()),
+        guess=hermite_guess(x0, state(), duration),
+    )
+
+
+def _turn(speed: float, figure: str, duration: float) -> PaperProblem:
+    x0, x1 = state(y=-1.0, vy=speed), state(x=1.0, vx=speed)
+    return PaperProblem(
+        name=f"turn-{speed:g}",
+        title=f"90° turn at {speed:g} m/s",
+        figure=figure,
+        problem=between_states(f"turn-{speed:g}", x0, x1),
+        guess=hermite_guess(x0, x1, duration),
+    )
+
+
+def _orbit(speed: float, figure: str, radius: float) -> PaperProblem:
+    return PaperProblem(
+        name=f"orbit-{speed:g}",
+        title=f"Circular orbit at {speed:g} m/s",
+        figure=figure,
+        problem=circular_orbit(f"orbit-{speed:g}", speed),
+        guess=_orbit_guess(speed, radius),
+    )
+
+
+def _weave(figure: str) -> PaperProblem:
+    x0, x1 = state(), state(x=6.0)
+    obstacles = ((1.5, 0.25, 0.6), (3.0, -0.25, 0.6), (4.5, 0.25, 0.6))
+    via = tuple((x, y - np.sign(y) * (distance + 0.1)) for x, y, distance in obstacles)
+    return PaperProblem(
+        name="weave",
+        title="Weave through three obstacles",
+        figure=figure,
+        problem=between_states("weave", x0, x1, obstacles, WEAVE_INTERVALS),
+        guess=_weave_guess(x0, x1, via, 3.0),
+        obstacles=obstacles,
+    )
+
+
+PAPER_PROBLEMS: dict[str, PaperProblem] = {
+    entry.name: entry
+    for entry in (
+        _stabilization(1, "Fig. 2", 2.0),
+        _stabilization(5, "Fig. 3", 3.0),
+        _turn(3, "Fig. 4a", 2.0),
+        _turn(10, "Fig. 4b", 6.0),
+        _orbit(4, "Fig. 5a", 1.2),
+        _orbit(5.5, "Fig. 5a", 1.2),
+        _weave("Fig. 5b"),
+    )
+}
+"""The paper's experiments by name."""

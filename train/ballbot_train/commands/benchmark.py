@@ -1,0 +1,87 @@
+"""`ballbot benchmark`: controllers by their regret on the certified episodes."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from ballbot_gym import certified, files
+from ballbot_gym.env import make_task
+from ballbot_gym.tasks import TASKS
+from ballbot_train import jobs
+from ballbot_train.console import console, markdown, print_table, progress_bar
+from ballbot_train.evaluation import basins, evaluate
+from ballbot_train.report.page import figures, write_report
+from ballbot_train.report.replay import certified_replay
+from ballbot_train.report.sections import leaderboard_sections
+
+
+def benchmark(
+    tasks: tuple[str, ...] = tuple(TASKS),
+    controllers: tuple[str, ...] = (),
+    episodes: int = certified.EPISODES,
+    quick: bool = False,
+    physics: Literal["bullet", "rk4"] = "bullet",
+    seed: int = 0,
+    runs: Path = Path("runs"),
+    out: Path = Path("runs/benchmark"),
+    workers: int = os.cpu_count() or 1,
+) -> None:
+    """Compares controllers by their regret on the certified episodes, and writes a leaderboard with figures.
+
+    Args:
+        tasks: names of tasks.
+        controllers: names of experts and policies, or files of policies; default all experts and all policies that come
+            with the package. A policy is run on the task it was made for.
+        episodes: how many of each task's certified episodes.
+        quick: only 8 episodes of each task.
+        physics: "bullet" or "rk4".
+        seed: of the bootstrap intervals, and of whatever an episode draws.
+        runs: folder where other commands left their results: the recovered share of `basins` joins the leaderboard, and
+            basins, robustness, training and the paper's figures join the report.
+        out: folder of the results; an interrupted run continues here.
+        workers: processes; 1 gives the cleanest times per control step.
+    """
+    chosen = evaluate.controllers_of(tasks, controllers)
+    episodes = evaluate.checked_episodes(episodes, quick, few=8)
+    facts = evaluate.begin(out, chosen, workers, physics=physics, episodes=episodes, seed=seed)
+    with progress_bar() as progress:
+        bars = {task: progress.add_task(task, total=episodes * len(group)) for task, group in chosen.items()}
+        done = evaluate.benchmark(
+            chosen,
+            episodes,
+            physics,
+            out,
+            workers,
+            lambda task, count: progress.advance(bars[task], count),
+            seed,
+        )
+    recovered = basins.recovered_fractions(runs / "basins")
+    rows = [
+        replace(row, recovered=recovered.get((row.task, row.controller), row.recovered))
+        for row in evaluate.leaderboard(done, seed)
+    ]
+    evaluate.write_leaderboard(rows, done, facts, out)
+    figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
+    pictures = [_episode_figure(task, group, physics, out) for task, group in chosen.items()]
+    table = [evaluate.cells(row) for row in rows]
+    files.write(out / "leaderboard.md", markdown(evaluate.HEADER, table))
+    sections = leaderboard_sections(evaluate.HEADER, table, done, chosen, pictures, physics, runs)
+    page = write_report("ballbot-gym: leaderboard", sections, facts, out / "report.html")
+    jobs.release(out)
+    print_table(f"{episodes} certified episodes per task, physics={physics}", evaluate.HEADER, table)
+    for result in done:
+        if result.note:
+            console.print(f"no plan: {result.task} episode {result.episode}: {result.note}", markup=False)
+    console.print(f"report: {page}")
+
+
+def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path) -> Path:
+    """The first certified episode of a task under every controller, with its optimum."""
+    replay = certified_replay(task, controllers, 0, physics, skip_planless=True)
+    optimum = certified.load(make_task(task)).trajectories[0]
+    curves = [figures.Curve("optimum", optimum, "0.35", "--")]
+    curves += [figures.Curve(f"{take.label}, {take.note}", take.trajectory, take.color) for take in replay.takes]
+    figure = figures.trajectory_figure(replay.title, curves, figures.marker_circles(replay.markers))
+    return figures.save(figure, out / "figures" / f"{task}.png")

@@ -1,0 +1,58 @@
+"""`ballbot certify`: the certified evaluation sets anew."""
+
+import os
+from multiprocessing import get_context
+from pathlib import Path
+
+from ballbot_baselines import certify as certification
+from ballbot_baselines.optimum import Optimum, PlanError, find_optimum
+from ballbot_gym import certified
+from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_train.console import progress_bar
+from ballbot_train.evaluation import evaluate
+
+
+def certify(
+    tasks: tuple[str, ...] = tuple(TASKS),
+    episodes: int = certified.EPISODES,
+    out: Path | None = None,
+    workers: int = os.cpu_count() or 1,
+) -> None:
+    """Computes the certified evaluation sets: the optimum of every episode.
+
+    Args:
+        tasks: names of tasks.
+        episodes: how many, from the first.
+        out: folder of the .npz files; default, in the package.
+        workers: processes.
+    """
+    evaluate.check_names("task", list(tasks), TASKS)
+    failed = []
+    with progress_bar() as progress, get_context("spawn").Pool(workers) as pool:
+        for name in tasks:
+            bar = progress.add_task(name, total=episodes)
+            optima = []
+            for index, result in enumerate(pool.imap(_certify_one, [(name, i) for i in range(episodes)], chunksize=5)):
+                progress.advance(bar)
+                if isinstance(result, str):
+                    failed.append(f"{name} episode {index}: {result}")
+                else:
+                    optima.append(result)
+            if len(optima) == episodes:
+                task = make_task(name)
+                path = certified.path_of(task) if out is None else out / certified.path_of(task).name
+                certification.evaluation_set(task, default_params(), optima).save(task, path)
+                progress.console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+    if failed:
+        raise PlanError("no optimum for\n" + "\n".join(failed))
+
+
+def _certify_one(job: tuple[str, int]) -> Optimum | str:
+    """The optimum, or the message of why there is none: an exception would end the pool."""
+    task, params = make_task(job[0]), default_params()
+    try:
+        return find_optimum(task, params, *certification.episode(task, params, job[1]))
+    except PlanError as error:
+        return str(error)

@@ -1,0 +1,59 @@
+"""`ballbot compare`: is one benchmark's result better than another's?"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+from ballbot_gym import files
+from ballbot_train.console import console, print_table
+from ballbot_train.evaluation import comparison, evaluate
+
+
+def compare(
+    a: Path,
+    b: Path,
+    /,
+    match: tuple[str, str] | None = None,
+    margin: float = comparison.MARGIN,
+    training_margin: float = comparison.TRAINING_MARGIN,
+    out: Path | None = None,
+) -> None:
+    """Says for every task and controller whether B is better than A, worse, or that the episodes cannot tell.
+
+    Args:
+        a: folder of a benchmark, its leaderboard.json or its episodes.csv.
+        b: the other.
+        match: a controller of A and one of B, to compare controllers of different names.
+        margin: differences of success and regret up to this decide nothing; 0.001 is 0.1 %.
+        training_margin: the same between policies with different weights, which the seed of their training makes differ.
+        out: file for the same as JSON.
+    """
+    runs = tuple(evaluate.read_results(path) for path in (a, b))
+    compared = comparison.compare(*runs, match, margin, training_margin)
+    for key in sorted(runs[0][0].keys() | runs[1][0].keys()):
+        first, second = (run[0].get(key) for run in runs)
+        if runs[0][0] and runs[1][0] and first != second and key != "policies":
+            console.print(f"{key}: {first} in A, {second} in B", markup=False)
+    header = ["task", "controller", "B is", "episodes", "success B − A", "regret B − A", "because"]
+    print_table(f"A: {a}\nB: {b}", header, [_cells(entry) for entry in compared])
+    if out is not None:
+        files.write(out, evaluate.to_json({"about": [run[0] for run in runs], "rows": compared}))
+
+
+def _cells(entry: comparison.Comparison) -> list[str]:
+    def shown(value: float, low: float, high: float) -> str:
+        if not math.isfinite(value):
+            return "–"
+        return f"{100 * value:+.2f} % ({100 * low:+.2f} to {100 * high:+.2f})"
+
+    success: Any = (entry.success, entry.success_low, entry.success_high)
+    regret: Any = (entry.regret, entry.regret_low, entry.regret_high)
+    return [
+        entry.task,
+        entry.controller,
+        entry.verdict,
+        str(entry.episodes),
+        shown(*success),
+        shown(*regret),
+        entry.why,
+    ]

@@ -1,0 +1,61 @@
+"""`ballbot demos`: demonstrations of an expert as a Minari dataset."""
+
+import os
+import shlex
+from pathlib import Path
+from typing import Literal
+
+import minari
+import numpy as np
+
+from ballbot_baselines.optimum import Backoff
+from ballbot_baselines.trajopt import EXECUTED
+from ballbot_gym.tasks import TASKS
+from ballbot_train.console import console, progress_bar
+from ballbot_train.evaluation import evaluate
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos
+
+
+def demos(
+    task: str = "stabilize",
+    expert: Literal["trajopt", "nmpc", "lqr"] = "trajopt",
+    episodes: int = 200,
+    physics: Literal["bullet", "rk4"] = "bullet",
+    noise: float = 0.05,
+    pushes: float = 0.5,
+    backoff: Backoff = EXECUTED,
+    seed: int = 0,
+    out: Path | None = None,
+    workers: int = os.cpu_count() or 1,
+) -> None:
+    """Rolls an expert out with exploration and writes a Minari dataset; a killed run continues when started again.
+
+    Args:
+        task: name of a task.
+        expert: trajopt (a plan, tracked by TVLQR), nmpc or lqr.
+        episodes: how many, each with a seed of its own.
+        physics: "bullet" or "rk4".
+        noise: each episode draws the standard deviation of its noise from [0, this], in units of the force limit.
+        pushes: mean number per second of control steps in which a random force replaces the expert's.
+        backoff: what the expert's plans keep from their limits: margins in their units, shares of the goal's tolerance
+            and of the force.
+        seed: of the dataset.
+        out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
+        workers: processes.
+    """
+    evaluate.check_names("task", [task], TASKS)
+    config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed)
+    out = Path("runs") / "demos" / f"{task}-{expert}-v0" if out is None else out
+    with progress_bar() as progress:
+        bar = progress.add_task(f"{task} {expert}", total=episodes)
+        folder = write_demos(config, out, workers, lambda count: progress.advance(bar, count))
+    dataset = minari.MinariDataset(folder / "data")
+    facts = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+    success = np.mean([fact["success"] for fact in facts])
+    load = f"import minari; minari.load_dataset({folder.name!r})"
+    console.print(
+        f"{len(facts)} episodes, {dataset.total_steps} steps, {100 * success:.1f} % successful in spite of what disturbed "
+        f"them\nMINARI_DATASETS_PATH={shlex.quote(str(folder.parent))} python -c {shlex.quote(load)}",
+        markup=False,
+        soft_wrap=True,
+    )

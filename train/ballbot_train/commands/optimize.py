@@ -1,0 +1,71 @@
+"""`ballbot optimize`: the optimum of one episode."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ballbot_baselines.optimum import find_optimum
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_train.console import console, print_table
+from ballbot_train.evaluation import evaluate
+from ballbot_train.report.page import figures
+
+
+def optimize(
+    task: str,
+    /,
+    state: tuple[float, float, float, float, float, float, float, float] | None = None,
+    constants: dict[str, float] = {},  # noqa: B006 (tyro's default; never changed)
+    seed: int = 0,
+    duration: float | None = None,
+    max_tilt: float | None = None,
+    force_limit: float | None = None,
+    out: Path = Path("runs/optimize"),
+) -> None:
+    """Finds the optimum of one episode, and writes its trajectory and figure.
+
+    Args:
+        task: name of a task.
+        state: x y γ θ ẋ ẏ γ̇ θ̇ at the start, in m, rad, m/s, rad/s; default drawn with the seed.
+        constants: constants of the episode by name, e.g. --constants speed 3; others are drawn with the seed.
+        seed: of what is drawn.
+        duration: longest episode, s.
+        max_tilt: degrees.
+        force_limit: N.
+        out: folder of trajectory.npz and figure.png.
+    """
+    evaluate.check_names("task", [task], TASKS)
+    fields = {"duration": duration, "max_tilt": None if max_tilt is None else math.radians(max_tilt)}
+    params = default_params()
+    if force_limit is not None:
+        if force_limit <= 0:
+            raise ValueError(f"force_limit must be positive, not {force_limit} N")
+        params = replace(params, force_limit=force_limit)
+    env = BallbotEnv(
+        make_task(task, **{key: value for key, value in fields.items() if value is not None}),
+        physics="rk4",
+        params=params,
+    )
+    options = {"constants": constants} | ({} if state is None else {"state": state})
+    _, info = env.reset(seed=seed, options=options)
+    optimum = find_optimum(env.task, params, info["state"], info["constants"])
+    trajectory = optimum.trajectory
+    path = trajectory.save(out / "trajectory.npz")
+    circles = figures.marker_circles(env.task.markers(info["constants"]))
+    curve = figures.Curve("optimum", trajectory, figures.COLORS["trajopt"])
+    picture = figures.save(figures.trajectory_figure(env.task.id, [curve], circles), out / "figure.png")
+    rows = [
+        ["cost", f"{optimum.cost:.6f}"],
+        ["duration, s", f"{trajectory.duration:.2f}"],
+        ["peak tilt, deg", f"{math.degrees(trajectory.tilt.max()):.2f}"],
+        ["peak force, N", f"{np.abs(trajectory.u).max():.1f}"],
+        ["status", f"{optimum.solver}: {optimum.status}, {optimum.iterations} iterations"],
+        ["constraint violation", f"{optimum.violation:.1e}"],
+        ["solver time, s", f"{optimum.seconds:.3f}"],
+    ]
+    print_table(env.task.id, ["", ""], rows)
+    console.print(f"trajectory: {path}\nfigure: {picture}")

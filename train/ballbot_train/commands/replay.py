@@ -1,0 +1,103 @@
+"""`ballbot replay`: an episode or trajectory files, drawn."""
+
+import math
+from pathlib import Path
+from typing import Literal
+
+from ballbot_baselines import CONTROLLERS
+from ballbot_gym.tasks import TASKS
+from ballbot_train.console import console, progress_bar
+from ballbot_train.evaluation import evaluate
+from ballbot_train.report.replay import (
+    Format,
+    Replay,
+    certified_replay,
+    file_replay,
+    film_times,
+    with_ghosts,
+    write_film,
+)
+from ballbot_train.report.replay import write_strip as _write_strip
+
+_WIDTHS = {"mp4": 1280, "gif": 640}  # px
+
+
+def replay(
+    source: tuple[str, ...],
+    /,
+    controllers: tuple[str, ...] = ("trajopt",),
+    episode: int = 0,
+    physics: Literal["bullet", "rk4"] = "bullet",
+    format: Format = "png",
+    seconds: float | None = None,
+    frames: int = 5,
+    fps: int = 25,
+    speed: float = 1.0,
+    width: int | None = None,
+    ghost_at: float | None = None,
+    ghost_by: str = "trajopt",
+    out: Path = Path("runs/replay"),
+) -> None:
+    """Draws a certified episode under controllers, or trajectory files: a strip of pictures, or a film.
+
+    Args:
+        source: name of a task, or trajectory files (.npz).
+        controllers: names of controllers or policy files; several are shown side by side.
+        episode: index of the certified episode.
+        physics: "bullet" or "rk4".
+        format: png, a strip of frames; mp4 or gif, a film with tilts, forces and paths.
+        seconds: of the last frame; default the end of the episode.
+        frames: of a strip, at equal times.
+        fps: frames per second of a film.
+        speed: of a film; 0.5 is half as fast as life.
+        width: of a film, px; default 1280 for mp4, 640 for gif.
+        ghost_at: shows as a ghost what an expert would do from this time on, s.
+        ghost_by: name of that expert.
+        out: folder of the file, which is named after task, controllers and episode.
+    """
+    _check(fps >= 1, f"fps must be at least 1, not {fps}")
+    _check(frames >= 1, f"frames must be at least 1, not {frames}")
+    _check(0 < speed < math.inf, f"speed must be positive, not {speed}")
+    _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
+    _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
+    shown, name = _read(source, controllers, episode, physics, ghost_at, ghost_by)
+    end = min(shown.duration if seconds is None else seconds, shown.duration)
+    path = out / f"{name}.{format}"
+    if format == "png":
+        console.print(f"picture: {_write_strip(shown, path, frames, end)}")
+        return
+    with progress_bar() as progress:
+        bar = progress.add_task("frames", total=len(film_times(end, fps, speed)))
+        write_film(shown, path, end, fps, speed, width or _WIDTHS[format], on_frame=lambda: progress.advance(bar))
+    console.print(f"film: {path}, {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _read(
+    source: tuple[str, ...],
+    controllers: tuple[str, ...],
+    episode: int,
+    physics: str,
+    ghost_at: float | None,
+    ghost_by: str,
+) -> tuple[Replay, str]:
+    """What is to be shown, and the name of its file."""
+    if all(Path(entry).suffix == ".npz" for entry in source):
+        _check(bool(source), "give the name of a task, or trajectory files")
+        _check(ghost_at is None, "a trajectory file does not say which task it is of, so it has no ghost")
+        paths = [Path(entry) for entry in source]
+        return file_replay(paths), "-".join(path.stem for path in paths)
+    _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
+    task = source[0]
+    evaluate.check_names("task", [task], TASKS)
+    evaluate.check_names("expert", [ghost_by], CONTROLLERS)
+    _check(bool(controllers), "give at least one controller")
+    shown = certified_replay(task, controllers, episode, physics)
+    name = f"{task}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
+    if ghost_at is None:
+        return shown, name
+    return with_ghosts(shown, task, episode, ghost_at, ghost_by, physics), f"{name}-ghost"
+
+
+def _check(right: bool, message: str) -> None:
+    if not right:
+        raise ValueError(message)

@@ -1,0 +1,1 @@
+"""How good a controller is: results, leaderboards, robustness, basins, comparisons, statistics."""

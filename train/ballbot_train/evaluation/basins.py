@@ -1,0 +1,215 @@
+"""Basins of attraction: from which states each controller brings the robot to rest, of those from which it is possible.
+
+A map spans the lean γ and one other component of Stabilize's initial state; the rest is zero. A state is recovered if the
+episode succeeds: at rest at the origin when it ends. It is recoverable if it lies within the boundary that
+`ballbot_baselines.recovery` finds, or if any controller recovers from it. Turning the world by 180° takes (γ, v) to
+(−γ, −v), so only half of every map is run.
+"""
+
+import json
+import math
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_baselines.optimum import PlanError
+from ballbot_baselines.recovery import largest_leans
+from ballbot_gym import files
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.rollout import rollout
+from ballbot_train import jobs
+from ballbot_train.evaluation.controllers import make_controller
+
+TASK = "stabilize"
+LEAN_LIMIT = 75.0  # degrees, either side
+_BOUNDARY_POINTS = 31  # its search goes from value to value, in steps that it can follow
+_DOUBT = 2.0  # degrees beyond the boundary that are run too: the boundary is as exact as its regularization
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The other component of a map, from −limit to limit."""
+
+    component: int
+    """Its index in a state."""
+    limit: float
+    label: str
+
+
+AXES: dict[str, Axis] = {
+    "speed": Axis(4, 15.0, "speed ẋ, m/s"),
+    "lean rate": Axis(6, 15.0, "lean rate γ̇, rad/s"),
+}
+
+
+@dataclass(frozen=True)
+class BasinMap:
+    """One map: n leans, degrees, by n values of its axis; arrays are (values, leans)."""
+
+    axis: str
+    leans: np.ndarray
+    values: np.ndarray
+    boundary: np.ndarray
+    """(m, 2) lean, degrees, and value: the corners of what is recoverable, once around."""
+    recoverable: np.ndarray
+    recovered: dict[str, np.ndarray]
+    """By controller."""
+
+    def fraction(self, controller: str) -> float:
+        """The share of the recoverable states from which a controller recovers."""
+        return float(np.sum(self.recovered[controller]) / np.sum(self.recoverable))
+
+
+def boundaries(out: Path, workers: int, on_progress: Callable[[str, int], None]) -> dict[str, np.ndarray]:
+    """The boundary of what is recoverable along every axis, (m, 2) lean, degrees, and value, resumably.
+
+    Args:
+        out: folder of the results.
+        workers: processes.
+        on_progress: called with "boundary" and a number of finished axes.
+    """
+    work = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (), (name,), "boundary") for name in AXES]
+    done = jobs.run(work, out, workers, on_progress)
+    return {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, done, strict=True)}
+
+
+def _boundary(names: Sequence[str]) -> Iterator[jobs.Entry]:
+    for name in names:
+        values = grid(name, _BOUNDARY_POINTS)[1]
+        highest = np.degrees(largest_leans(make_task(TASK), default_params(), AXES[name].component, values))
+        known = np.isfinite(highest)
+        right = np.column_stack([highest, values])[known]
+        # −right begins at the top left, where right ends
+        yield {"boundary": np.concatenate([right, -right]).tolist()}
+
+
+def _within(boundary: np.ndarray, leans: np.ndarray, values: np.ndarray, doubt: float = 0.0) -> np.ndarray:
+    """(values, leans) whether each state is inside a boundary, or at most some degrees of lean beyond it."""
+    right, left = np.split(boundary, 2)
+    highest = np.interp(values, right[:, 1], right[:, 0], left=-np.inf, right=-np.inf)
+    lowest = np.interp(values, left[::-1, 1], left[::-1, 0], left=np.inf, right=np.inf)
+    return (leans >= lowest[:, None] - doubt) & (leans <= highest[:, None] + doubt)
+
+
+def grid(axis: str, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Leans (points,), degrees, and values (points,) of the axis."""
+    limit = AXES[axis].limit
+    return np.linspace(-LEAN_LIMIT, LEAN_LIMIT, points), np.linspace(-limit, limit, points)
+
+
+def cell_jobs(
+    bounds: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str
+) -> list[jobs.Job]:
+    """Every state to run, row by row of every map: those within the boundaries or little beyond, of half a map."""
+    work = []
+    for name, boundary in bounds.items():
+        worth = _within(boundary, *grid(name, points), _DOUBT)
+        for controller in controllers:
+            for i in range(points // 2, points):
+                items = tuple((i, int(j)) for j in np.flatnonzero(worth[i]))
+                stem = f"{_slug(name)}-{_slug(controller)}-{zlib.crc32(controller.encode()):08x}-{physics}-{points}-{i:02d}"
+                work.append(jobs.Job(stem, _cells, (name, controller, physics, points), items, controller))
+    return work
+
+
+def _cells(
+    axis: str, controller: str, physics: str, points: int, items: Sequence[tuple[int, int]]
+) -> Iterator[jobs.Entry]:
+    env = BallbotEnv(TASK, physics=physics)
+    made = make_controller(controller, env.task, env.params)
+    leans, values = grid(axis, points)
+    for i, j in items:
+        x = np.zeros(8)
+        x[2], x[AXES[axis].component] = math.radians(leans[j]), values[i]
+        try:
+            recovered = rollout(env, made, seed=0, options={"state": x}).success
+        except PlanError:
+            recovered = False
+        yield {"axis": axis, "controller": controller, "i": i, "j": j, "recovered": recovered}
+    env.close()
+
+
+def maps_of(
+    bounds: Mapping[str, np.ndarray],
+    entries: Iterable[jobs.Entry],
+    controllers: Sequence[str],
+    points: int,
+) -> list[BasinMap]:
+    """The maps that finished states make up."""
+    recovered = {name: {c: np.zeros((points, points), bool) for c in controllers} for name in bounds}
+    for entry in entries:
+        cells, i, j = recovered[entry["axis"]][entry["controller"]], entry["i"], entry["j"]
+        cells[i, j] |= entry["recovered"]
+        cells[-1 - i, -1 - j] |= entry["recovered"]
+    maps = []
+    for name, boundary in bounds.items():
+        leans, values = grid(name, points)
+        recoverable = np.logical_or.reduce([_within(boundary, leans, values), *recovered[name].values()])
+        maps.append(BasinMap(name, leans, values, boundary, recoverable, recovered[name]))
+    return maps
+
+
+def fraction(maps: Sequence[BasinMap], controller: str) -> float:
+    """The share of the recoverable states of all maps from which a controller recovers."""
+    recovered = sum(int(np.sum(basin.recovered[controller])) for basin in maps)
+    return recovered / sum(int(np.sum(basin.recoverable)) for basin in maps)
+
+
+def write(maps: Sequence[BasinMap], about: dict[str, object], out: Path) -> None:
+    """Writes basins.json, which holds about, rows and maps, and basins.csv with a line for each state."""
+    rows = [
+        {"task": TASK, "controller": c, "recovered": fraction(maps, c)}
+        | {basin.axis: basin.fraction(c) for basin in maps}
+        for c in maps[0].recovered
+    ]
+    document = {"about": about, "rows": rows, "maps": [_as_json(basin) for basin in maps]}
+    files.write(out / "basins.json", json.dumps(document, ensure_ascii=False) + "\n")
+    lines = ["axis,value,lean_deg,recoverable," + ",".join(maps[0].recovered)]
+    for basin in maps:
+        for i, value in enumerate(basin.values):
+            for j, lean in enumerate(basin.leans):
+                flags = (basin.recoverable[i, j], *(cells[i, j] for cells in basin.recovered.values()))
+                lines.append(f"{basin.axis},{value:g},{lean:g}," + ",".join(str(int(flag)) for flag in flags))
+    files.write(out / "basins.csv", "\n".join(lines) + "\n")
+
+
+def _as_json(basin: BasinMap) -> dict[str, Any]:
+    return {
+        "axis": basin.axis,
+        "label": AXES[basin.axis].label,
+        "leans": basin.leans.tolist(),
+        "values": basin.values.tolist(),
+        "boundary": basin.boundary.tolist(),
+        "recoverable": basin.recoverable.astype(int).tolist(),
+        "recovered": {name: cells.astype(int).tolist() for name, cells in basin.recovered.items()},
+    }
+
+
+def read(folder: Path) -> list[BasinMap]:
+    """The maps of a folder that `write` wrote."""
+    document = json.loads((folder / "basins.json").read_text())
+    return [
+        BasinMap(
+            axis=entry["axis"],
+            **{name: np.array(entry[name], np.float64) for name in ("leans", "values", "boundary")},
+            recoverable=np.array(entry["recoverable"], bool),
+            recovered={name: np.array(cells, bool) for name, cells in entry["recovered"].items()},
+        )
+        for entry in document["maps"]
+    ]
+
+
+def recovered_fractions(folder: Path) -> dict[tuple[str, str], float]:
+    """The shares that a folder of `ballbot basins` holds, by task and controller; none where it holds none."""
+    path = folder / "basins.json"
+    rows = json.loads(path.read_text())["rows"] if path.exists() else []
+    return {(row["task"], row["controller"]): row["recovered"] for row in rows}
+
+
+def _slug(text: str) -> str:
+    return "".join(sign if sign.isalnum() else "-" for sign in text)[-60:]

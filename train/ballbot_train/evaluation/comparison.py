@@ -1,0 +1,176 @@
+"""Two benchmarks of the same episodes, compared pair by pair: better, worse, or cannot tell.
+
+Both runs met the same episodes, so what is compared is each episode with itself: how hard it is cancels. Of the differences
+per episode, the mean and its 95 % bootstrap interval are reported, and they decide only beyond a margin:
+
+- Success decides first, if a sign test over the episodes in which only one of the two succeeded agrees: the bootstrap of a
+  handful of falls is surer than it may be. Else regret decides, over the episodes in which neither failed.
+- Episodes are not all that varies. Training a policy anew with another seed gives another policy, and one of each is a sample
+  of one: no number of episodes says which method is better. So policies with different weights must differ by more than
+  `TRAINING_MARGIN`, about what a seed changes. To compare methods more finely, train several seeds of each.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ballbot_baselines import CONTROLLERS
+from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.statistics import CONFIDENCE, interval, verdict
+
+MARGIN = 0.001
+"""Of regret and of success: PyBullet and the model of the optimum differ by as much."""
+TRAINING_MARGIN = 0.02
+"""The same between policies that were trained separately."""
+
+_FEWEST = 8  # episodes: of fewer, a bootstrap makes too little of what it has not seen
+_SAME_OPTIMUM = 1e-6  # relative; beyond, equally numbered episodes are not the same
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One controller on one task: what B is more than A. Success and regret are fractions."""
+
+    task: str
+    controller: str
+    episodes: int
+    """How many both ran."""
+    success: float
+    success_low: float
+    success_high: float
+    regret: float
+    """Over the episodes in which neither failed; less is better."""
+    regret_low: float
+    regret_high: float
+    margin: float
+    verdict: str
+    """B is "better" or "worse", "cannot tell", or "not comparable"."""
+    why: str
+
+
+Run = tuple[Mapping[str, Any], Sequence[Result]]
+"""Facts and episodes, as `read_results` gives."""
+
+
+def compare(
+    a: Run,
+    b: Run,
+    match: tuple[str, str] | None = None,
+    margin: float = MARGIN,
+    training_margin: float = TRAINING_MARGIN,
+    seed: int = 0,
+) -> list[Comparison]:
+    """Compares controllers of the same name on every task that both runs have.
+
+    Args:
+        a: a run.
+        b: another.
+        match: a controller of A and one of B to compare instead; where each has but one, they are compared anyway.
+        margin: of success and regret.
+        training_margin: the same between policies with different weights.
+        seed: of the bootstrap.
+
+    Raises:
+        ValueError: there is nothing to compare.
+    """
+    groups_a, groups_b = _groups(a[1]), _groups(b[1])
+    pairs = _pairs(groups_a, groups_b, match)
+    if not pairs:
+        raise ValueError(f"nothing in common: A has {_named(groups_a)}, B has {_named(groups_b)}")
+    return [
+        _compare_one(
+            task,
+            name_a if name_a == name_b else f"{name_a} → {name_b}",
+            groups_a[task, name_a],
+            groups_b[task, name_b],
+            training_margin if _trained_apart(f"{task}/{name_a}", f"{task}/{name_b}", a[0], b[0]) else margin,
+            seed,
+        )
+        for task, name_a, name_b in pairs
+    ]
+
+
+Groups = dict[tuple[str, str], dict[int, Result]]
+
+
+def _groups(results: Sequence[Result]) -> Groups:
+    groups: Groups = {}
+    for result in results:
+        groups.setdefault((result.task, result.controller), {})[result.episode] = result
+    return groups
+
+
+def _named(groups: Groups) -> str:
+    return ", ".join(f"{controller} on {task}" for task, controller in groups) or "nothing"
+
+
+def _pairs(a: Groups, b: Groups, match: tuple[str, str] | None) -> list[tuple[str, str, str]]:
+    """(task, controller of A, controller of B)."""
+    tasks = [task for task in dict.fromkeys(task for task, _ in a) if any(task == other for other, _ in b)]
+    if match is None:
+        common = [(task, name, name) for task, name in a if (task, name) in b]
+        only_a, only_b = ({name for _, name in groups} for groups in (a, b))
+        if common or len(only_a) != 1 or len(only_b) != 1:
+            return common
+        match = only_a.pop(), only_b.pop()
+    return [(task, *match) for task in tasks if (task, match[0]) in a and (task, match[1]) in b]
+
+
+def _trained_apart(a: str, b: str, about_a: Mapping[str, Any], about_b: Mapping[str, Any]) -> bool:
+    """Whether either is a learned policy and they have not the same weights."""
+    if all(name.partition("/")[2] in CONTROLLERS for name in (a, b)):
+        return False
+    weights = about_a.get("policies", {}).get(a)
+    return weights is None or weights != about_b.get("policies", {}).get(b)
+
+
+def _compare_one(
+    task: str, name: str, a: Mapping[int, Result], b: Mapping[int, Result], margin: float, seed: int
+) -> Comparison:
+    shared = sorted(a.keys() & b.keys())
+    pairs = [(a[i], b[i]) for i in shared]
+    hindrance = _hindrance(pairs)
+    nothing = math.nan, (math.nan, math.nan)
+    success = regret = nothing
+    if hindrance:
+        outcome, why = "not comparable", hindrance
+    else:
+        wins = np.array([float(second.success) - float(first.success) for first, second in pairs])
+        regrets = np.array([s.regret - f.regret for f, s in pairs if not (f.failure or s.failure)])
+        success = float(wins.mean()), interval(wins, seed)
+        regret = (float(regrets.mean()), interval(regrets, seed)) if len(regrets) else nothing
+        outcome, why = _judge(wins, success[1], regret[1], len(regrets), margin)
+    return Comparison(task, name, len(shared), success[0], *success[1], regret[0], *regret[1], margin, outcome, why)
+
+
+def _hindrance(pairs: Sequence[tuple[Result, Result]]) -> str:
+    """Why the episodes cannot be compared; empty if they can."""
+    if not pairs:
+        return "no episode was run by both"
+    if any(first.physics != second.physics for first, second in pairs):
+        return f"different physics: {pairs[0][0].physics} and {pairs[0][1].physics}"
+    changed = [f.episode for f, s in pairs if not math.isclose(f.optimum, s.optimum, rel_tol=_SAME_OPTIMUM)]
+    if changed:
+        return (
+            f"other episodes: the optimum of episode {changed[0]} differs, and of {len(changed)} of {len(pairs)} in all"
+        )
+    return ""
+
+
+def _judge(
+    wins: np.ndarray, success: tuple[float, float], regret: tuple[float, float], standing: int, margin: float
+) -> tuple[str, str]:
+    if len(wins) < _FEWEST:
+        return "cannot tell", f"{len(wins)} episodes are too few"
+    won, lost = int(np.sum(wins > 0)), int(np.sum(wins < 0))
+    by_success = verdict(*success, margin)
+    if by_success != "cannot tell" and stats.binomtest(won, won + lost).pvalue < 1 - CONFIDENCE:
+        return by_success, f"succeeds in {won} episodes where A does not, A in {lost} where it does not"
+    by_regret = verdict(-regret[1], -regret[0], margin) if standing >= _FEWEST else "cannot tell"
+    if by_regret != "cannot tell":
+        return by_regret, f"regret, over {standing} episodes"
+    return "cannot tell", f"no difference beyond {margin:.1%} is sure"

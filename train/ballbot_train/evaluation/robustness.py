@@ -1,0 +1,161 @@
+"""The leaderboard under disturbances: how success and regret change with their severity.
+
+Nobody is told of the disturbance: experts plan for the nominal robot, ideal actuators and sensors. Regret is taken against
+the undisturbed optimum, so part of it no controller could avoid. Every controller meets the same draws.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ballbot_gym import files
+from ballbot_gym.randomization import Randomization
+from ballbot_train import jobs
+from ballbot_train.evaluation import evaluate
+
+
+@dataclass(frozen=True)
+class Stress:
+    """One kind of disturbance, by severity; severity 0 is none."""
+
+    label: str
+    """What the severity is, with its unit."""
+    levels: tuple[float, ...]
+    at: Callable[[float], Randomization]
+
+
+def _push(impulse: float) -> Randomization:
+    return Randomization(push_impulse=(impulse, impulse), push_interval=2.0)
+
+
+def _noise(factor: float) -> Randomization:
+    return Randomization(
+        position_noise=0.01 * factor,
+        lean_noise=0.01 * factor,
+        velocity_noise=0.05 * factor,
+        lean_rate_noise=0.05 * factor,
+    )
+
+
+def _delay(milliseconds: float) -> Randomization:
+    return Randomization(actuator_delay=(1e-3 * milliseconds, 1e-3 * milliseconds))
+
+
+def _lag(milliseconds: float) -> Randomization:
+    return Randomization(actuator_lag=(1e-3 * milliseconds, 1e-3 * milliseconds))
+
+
+def _mass(percent: float) -> Randomization:
+    factor = 1 + 0.01 * percent
+    return Randomization(body_mass=(factor, factor), ball_mass=(factor, factor))
+
+
+def _com(percent: float) -> Randomization:
+    factor = 1 + 0.01 * percent
+    return Randomization(com_height=(factor, factor))
+
+
+STRESSES: dict[str, Stress] = {
+    "push": Stress("impulse of pushes on the ball, one in 2 s, N·s", (1.0, 2.0, 4.0, 8.0), _push),
+    "noise": Stress("sensor noise × (1 cm, 0.01 rad, 5 cm/s, 0.05 rad/s)", (0.5, 1.0, 2.0, 4.0), _noise),
+    "delay": Stress("delay of the force, ms", (20.0, 40.0, 60.0), _delay),
+    "lag": Stress("time constant of the actuator, ms", (10.0, 20.0, 40.0, 60.0), _lag),
+    "mass": Stress("error of both masses, %", (-20.0, -10.0, 10.0, 20.0), _mass),
+    "com": Stress("error of the centre of mass's height, %", (-20.0, -10.0, 10.0, 20.0), _com),
+}
+"""Every disturbance by its name on the command line."""
+
+NONE = "none"
+"""The name of no disturbance, severity 0 of every stress."""
+
+
+@dataclass(frozen=True)
+class StressResult(evaluate.Result):
+    """An episode under a disturbance."""
+
+    stress: str = NONE
+    level: float = 0.0
+
+
+@dataclass(frozen=True)
+class StressRow(evaluate.Row):
+    """A leaderboard row under a disturbance."""
+
+    stress: str = NONE
+    level: float = 0.0
+
+
+def conditions(stresses: Sequence[str]) -> list[tuple[str, float]]:
+    """(stress, level) of everything to run; the undisturbed once."""
+    return [(NONE, 0.0), *((name, level) for name in stresses for level in STRESSES[name].levels)]
+
+
+def run(
+    controllers: Mapping[str, Sequence[str]],
+    stresses: Sequence[str],
+    episodes: int,
+    physics: str,
+    out: Path,
+    workers: int,
+    on_progress: Callable[[str, int], None],
+    seed: int = 0,
+) -> list[StressResult]:
+    """Runs everything, resumably.
+
+    Args:
+        controllers: names by task.
+        stresses: names in `STRESSES`.
+        episodes: certified episodes of each task, from the first.
+        physics: "bullet" or "rk4".
+        out: folder of the results.
+        workers: processes.
+        on_progress: called with a stress and a number of finished episodes.
+        seed: of the draws: episode i draws the same with every controller.
+    """
+    work = [
+        (
+            stress,
+            level,
+            evaluate.episode_job(
+                task, name, physics, range(episodes), seed, _randomization(stress, level), f"{stress}-{level:g}", stress
+            ),
+        )
+        for stress, level in conditions(stresses)
+        for task, group in controllers.items()
+        for name in group
+    ]
+    done = jobs.run([job for *_, job in work], out, workers, on_progress)
+    return [
+        StressResult(**entry, stress=stress, level=level)
+        for (stress, level, _), entries in zip(work, done, strict=True)
+        for entry in entries
+    ]
+
+
+def _randomization(stress: str, level: float) -> Randomization:
+    return Randomization() if stress == NONE else STRESSES[stress].at(level)
+
+
+def rows_of(results: Sequence[StressResult], seed: int = 0) -> list[StressRow]:
+    """One row per condition, task and controller; seed is of the bootstrap."""
+    groups: dict[tuple[str, float, str, str], list[StressResult]] = {}
+    for result in results:
+        groups.setdefault((result.stress, result.level, result.task, result.controller), []).append(result)
+    return [
+        StressRow(**asdict(evaluate.summarize(group, seed)), stress=stress, level=level)
+        for (stress, level, *_), group in groups.items()
+    ]
+
+
+def curve_of(rows: Sequence[StressRow], task: str, controller: str, stress: str) -> list[StressRow]:
+    """The rows of one curve, by severity, the undisturbed among them."""
+    chosen = [row for row in rows if (row.task, row.controller) == (task, controller) and row.stress in (stress, NONE)]
+    return sorted(chosen, key=lambda row: row.level)
+
+
+def write(rows: Sequence[StressRow], results: Sequence[StressResult], about: dict[str, object], out: Path) -> None:
+    """Writes robustness.csv, robustness.json, which holds about, stresses and rows, and episodes.csv."""
+    labels = {name: stress.label for name, stress in STRESSES.items()}
+    files.write(out / "robustness.csv", evaluate.to_csv(rows))
+    files.write(out / "episodes.csv", evaluate.to_csv(results))
+    files.write(out / "robustness.json", evaluate.to_json({"about": about, "stresses": labels, "rows": rows}))

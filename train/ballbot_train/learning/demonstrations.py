@@ -1,0 +1,440 @@
+"""Demonstrations: experts rolled out with exploration, kept as Minari datasets.
+
+In every step the expert says what it would do, and the robot does that plus noise; now and then a push, a random force for
+one control step, replaces it, and the expert plans anew from where the push led. So the dataset shows recoveries too.
+
+| in the dataset | is |
+|---|---|
+| actions (T, 2) | what was executed: the env, reset with the episode's seed, replays the episode from them |
+| infos/expert_action (T, 2) | what the expert answered in the states visited: the labels to imitate |
+| infos/state (T+1, 8) | states; order and units in `dynamics.STATE` |
+| an episode's metadata | seed, expert, physics, cost, success, failure, optimum and what follows |
+
+`optimum` is the cost of the best undisturbed episode from the same start (NaN where none was found), with `solver_status`
+and `violation` of its search; `plans` counts the expert's own plans, and `plans_failed` its searches without one.
+
+`load_demos` reads a dataset for learners.
+"""
+
+import importlib.metadata
+import json
+import math
+import os
+import shlex
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import minari
+import numpy as np
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_dataset import parse_dataset_id
+
+from ballbot_baselines.lqr import LqrController
+from ballbot_baselines.nmpc import NmpcController
+from ballbot_baselines.optimum import Backoff, PlanError, find_optimum
+from ballbot_baselines.trajopt import EXECUTED, TrajoptController
+from ballbot_gym import files
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import Controller
+from ballbot_gym.tasks import Task
+from ballbot_train import jobs
+from ballbot_train.policy import OBSERVATION_VERSION
+
+EXPERTS = ("trajopt", "nmpc", "lqr")
+"""Controllers that can be asked what they would do in any state."""
+
+_CHUNK = 5  # episodes of a job
+_SEEDS = 1_000_000  # per dataset seed: seeds of one dataset are no other's
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """What a dataset is made of."""
+
+    task: str = "stabilize"
+    """Name of a task."""
+    expert: Literal["trajopt", "nmpc", "lqr"] = "trajopt"
+    """Who is asked."""
+    episodes: int = 200
+    physics: Literal["bullet", "rk4"] = "bullet"
+    noise: float = 0.05
+    """Exploration: each episode draws the standard deviation of its noise from [0, this], in units of the force limit."""
+    pushes: float = 0.5
+    """Mean number per second of control steps in which a random force replaces the expert's."""
+    backoff: Backoff = EXECUTED
+    """What the expert's plans keep from their limits; LQR has none."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        make_task(self.task)
+        if self.expert not in EXPERTS:
+            raise ValueError(f"unknown expert {self.expert!r}; known: {', '.join(EXPERTS)}")
+        if not 1 <= self.episodes <= _SEEDS:
+            raise ValueError(f"episodes must be 1 to {_SEEDS}, not {self.episodes}")
+        for name in ("noise", "pushes"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and at least 0, not {getattr(self, name)}")
+
+    def episode_seed(self, i: int) -> int:
+        """With which the env is reset in episode i."""
+        return _SEEDS * (self.seed + 1) + i
+
+
+@dataclass(frozen=True)
+class Demos:
+    """n steps of demonstrations, episode after episode.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | observations | (n, no) float32 | before the step |
+    | actions | (n, 2) float32 | the expert's answers, in [−1, 1] |
+    | rewards | (n,) float32 | of what was executed |
+    | next_observations | (n, no) float32 | after the step; of an episode's last step too |
+    | terminations, truncations | (n,) bool | the episode ended with this step |
+    | executed | (n, 2) float32 | actions executed: the expert's plus noise, in [−1, 1] |
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    next_observations: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+    executed: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode of T steps under an expert.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | observations | (T+1, no) float32 | |
+    | states | (T+1, 8) | order and units in `dynamics.STATE` |
+    | labels | (T, 2) float32 | the expert's answers, in [−1, 1] |
+    | actions | (T, 2) float32 | executed |
+    | rewards | (T,) | |
+    | terminations, truncations | (T,) bool | |
+    """
+
+    observations: np.ndarray
+    states: np.ndarray
+    labels: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+
+
+class Expert:
+    """A controller that is asked along an episode that does not follow it, and that plans anew where told to."""
+
+    def __init__(self, name: str, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
+        """Args: name: in `EXPERTS`."""
+        make: dict[str, Callable[[], Controller]] = {
+            "trajopt": lambda: TrajoptController(task, params, backoff),
+            "nmpc": lambda: NmpcController(task, params, backoff=backoff),
+            "lqr": lambda: LqrController(task, params),
+        }
+        self._task, self._params, self._controller = task, params, make[name]()
+        self.plans = self.plans_failed = 0
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        """Starts an episode at time t, s, in state x (8,) with constants c (nc,); raises a PlanError without a plan."""
+        self._c, self._start = c, t
+        self._controller.reset(t, x, c)
+        self.plans, self.plans_failed = 1, 0
+
+    def replan(self, t: float, x: np.ndarray) -> None:
+        """Plans from state x (8,); keeps the plan it has where there is none."""
+        if not hasattr(self._controller, "plan"):
+            return
+        plan = self._controller.plan
+        try:
+            self._controller.reset(t, x, self._c)
+            self.plans, self._start = self.plans + 1, t
+        except PlanError:
+            self._controller.plan = plan
+            self.plans_failed += 1
+
+    def label(self, t: float, x: np.ndarray) -> np.ndarray:
+        """(2,) float32 action in [−1, 1] that the expert would take in state x (8,)."""
+        if self._over(t) and not self.plans_failed:
+            self.replan(t, x)
+        force = self._controller.act(t, x)
+        return np.clip(force / self._params.force_limit, -1, 1).astype(np.float32)
+
+    def _over(self, t: float) -> bool:
+        """Whether a first-exit goal was missed at the plan's end."""
+        plan = getattr(self._controller, "plan", None)
+        return self._task.first_exit and plan is not None and t - self._start > plan.trajectory.duration - 1e-9
+
+
+def record(
+    env: BallbotEnv,
+    expert: Expert,
+    rng: np.random.Generator,
+    noise: float,
+    pushes: float,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+) -> tuple[Recording, dict[str, Any]]:
+    """One episode of an expert, disturbed.
+
+    Args:
+        env: what to run in.
+        expert: who is asked in every step.
+        rng: of the exploration.
+        noise: as in `DemoConfig`; this episode's standard deviation is drawn.
+        pushes: as in `DemoConfig`.
+        seed: as for `env.reset`.
+        options: as for `env.reset`.
+
+    Returns:
+        The recording and the last step's info.
+
+    Raises:
+        PlanError: the expert has no plan from the start.
+    """
+    dt = env.task.control_dt
+    observation, info = env.reset(seed=seed, options=options)
+    expert.reset(0.0, info["state"], info["constants"])
+    std = noise * rng.random()
+    observations, states = [observation], [info["state"]]
+    labels, actions, rewards, ends = [], [], [], []
+    pushed = done = False
+    while not done:
+        t = dt * len(actions)
+        if pushed:
+            expert.replan(t, info["state"])
+        label = expert.label(t, info["state"])
+        pushed = rng.random() < pushes * dt
+        disturbed = rng.uniform(-1, 1, 2) if pushed else label + std * rng.standard_normal(2)
+        action = np.clip(disturbed, -1, 1).astype(np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        observations.append(observation)
+        states.append(info["state"])
+        labels.append(label)
+        actions.append(action)
+        rewards.append(reward)
+        ends.append((terminated, truncated))
+    terminations, truncations = np.array(ends).T
+    recording = Recording(
+        np.array(observations),
+        np.array(states),
+        np.array(labels),
+        np.array(actions),
+        np.array(rewards),
+        terminations,
+        truncations,
+    )
+    return recording, info
+
+
+def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callable[[int], None]) -> Path:
+    """Makes a dataset, in parallel processes; what a killed run finished is not done again.
+
+    Args:
+        config: of the dataset.
+        out: its folder, whose name is the dataset's id: NAME-vNUMBER. It appears when all is there.
+        workers: processes.
+        on_progress: called with a number of episodes that are there.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: `out` is no dataset's name, or holds something else.
+        PlanError: no episode could be started.
+    """
+    out = dataset_folder(out)
+    described = json.loads(json.dumps(asdict(config)))
+    unfinished = out.with_name(f".{out.name}.unfinished")
+    if out.exists():
+        if _metadata(out).get("demos") != described:
+            raise ValueError(f"{out} already holds another dataset; give another --out or delete it")
+        on_progress(config.episodes)
+    else:
+        jobs.claim(unfinished, described)
+        chunks = [
+            tuple(range(start, min(start + _CHUNK, config.episodes))) for start in range(0, config.episodes, _CHUNK)
+        ]
+        work = [
+            jobs.Job(f"{chunk[0]:06d}", _record_episodes, (config, unfinished / "episodes"), chunk) for chunk in chunks
+        ]
+        done = jobs.run(work, unfinished, workers, lambda group, count: on_progress(count))
+        _assemble(config, [entry for entries in done for entry in entries], unfinished, out)
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return out
+
+
+def dataset_folder(out: Path) -> Path:
+    """The absolute path of a dataset's folder.
+
+    Raises:
+        ValueError: its name cannot be that of a dataset.
+    """
+    out = Path(out).absolute()
+    try:
+        parse_dataset_id(out.name)
+    except (ValueError, TypeError):
+        raise ValueError(f"a dataset's folder is named NAME-vNUMBER, as stabilize-trajopt-v0, not {out.name}") from None
+    return out
+
+
+def load_demos(path: Path, task: Task) -> Demos:
+    """Reads a dataset of `ballbot demos`, all its episodes.
+
+    Args:
+        path: its folder.
+        task: that it must have been made for.
+
+    Raises:
+        ValueError: it is no such dataset, or one of another task or observation version.
+    """
+    path = Path(path)
+    metadata = _metadata(path)
+    if metadata["task"] != repr(task):
+        raise ValueError(f"{path} holds demonstrations of {metadata['task']}, not of {task!r}")
+    if metadata["observation_version"] != OBSERVATION_VERSION:
+        raise ValueError(
+            f"{path} holds observations of version {metadata['observation_version']}, this is {OBSERVATION_VERSION}; "
+            'make it anew with "ballbot demos"'
+        )
+    episodes = list(minari.MinariDataset(path / "data"))
+
+    def joined(kind: type, part: Callable[[Any], np.ndarray]) -> np.ndarray:
+        return np.concatenate([np.asarray(part(episode), kind) for episode in episodes])
+
+    return Demos(
+        observations=joined(np.float32, lambda e: e.observations[:-1]),
+        actions=joined(np.float32, lambda e: e.infos["expert_action"]),
+        rewards=joined(np.float32, lambda e: e.rewards),
+        next_observations=joined(np.float32, lambda e: e.observations[1:]),
+        terminations=joined(np.bool_, lambda e: e.terminations),
+        truncations=joined(np.bool_, lambda e: e.truncations),
+        executed=joined(np.float32, lambda e: e.actions),
+    )
+
+
+def command_of(path: Path) -> str:
+    """The command that writes a dataset of ours anew.
+
+    Raises:
+        ValueError: it is none.
+    """
+    options = {"out": str(path)}
+    for name, value in _metadata(path)["demos"].items():
+        options |= (
+            {f"{name}.{part}": each for part, each in value.items()} if isinstance(value, dict) else {name: value}
+        )
+    return shlex.join(
+        ["ballbot", "demos", *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
+    )
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    """Of a dataset of ours, else a ValueError."""
+    try:
+        metadata = json.loads((path / "data" / "metadata.json").read_text())
+        if "demos" not in metadata:
+            raise ValueError("not made by ballbot demos")
+    except (OSError, ValueError) as error:
+        raise ValueError(f'{path} is no dataset of "ballbot demos": {error}') from error
+    return metadata
+
+
+def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
+    """Writes each episode's arrays to a file, and yields its metadata."""
+    env = BallbotEnv(config.task, physics=config.physics)
+    expert = Expert(config.expert, env.task, env.params, config.backoff)
+    for i in episodes:
+        rng = np.random.default_rng([config.episode_seed(i), 1])  # not the numbers that the env draws
+        try:
+            recording, info = record(env, expert, rng, config.noise, config.pushes, config.episode_seed(i))
+        except PlanError as error:
+            yield {"seed": config.episode_seed(i), "note": str(error)}  # an episode that nobody can demonstrate
+            continue
+        files.write_npz(folder / f"{i:06d}.npz", asdict(recording))
+        yield {
+            "seed": config.episode_seed(i),
+            "expert": config.expert,
+            "physics": config.physics,
+            **_optimum(env, recording.states[0], info["constants"]),
+            "cost": -float(recording.rewards.sum()),
+            "success": bool(info["success"]),
+            "failure": bool(info["failure"]),
+            "plans": expert.plans,
+            "plans_failed": expert.plans_failed,
+        }
+    env.close()
+
+
+def _optimum(env: BallbotEnv, x: np.ndarray, c: np.ndarray) -> dict[str, Any]:
+    try:
+        optimum = find_optimum(env.task, env.params, x, c)
+    except PlanError as error:
+        return {"optimum": math.nan, "solver_status": str(error), "violation": math.nan}
+    return {
+        "optimum": optimum.cost,
+        "solver_status": f"{optimum.solver}: {optimum.status}",
+        "violation": optimum.violation,
+    }
+
+
+def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, out: Path) -> None:
+    """Puts the episodes together under a temporary name, and renames."""
+    made = [i for i, entry in enumerate(entries) if "note" not in entry]
+    if not made:
+        raise PlanError(f"the expert found no plan in any of {len(entries)} episodes: {entries[0]['note']}")
+    root = unfinished / "datasets"
+    shutil.rmtree(root, ignore_errors=True)
+    env = gymnasium.make(make_task(config.task).id, physics=config.physics)
+    before = os.environ.get("MINARI_DATASETS_PATH")
+    os.environ["MINARI_DATASETS_PATH"] = str(root)  # the only way to tell Minari where
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
+            dataset = minari.create_dataset_from_buffers(
+                dataset_id=out.name,
+                buffer=[_buffer(unfinished / "episodes" / f"{i:06d}.npz", entries[i]["seed"]) for i in made],
+                env=env,
+                algorithm_name=config.expert,
+                description=f"{config.expert} on {env.spec.id}, with exploration; see ballbot_train/demos.py.",
+                requirements=[f"ballbot-gym>={importlib.metadata.version('ballbot-gym')}"],
+                data_format="hdf5",
+            )
+    finally:
+        if before is None:
+            del os.environ["MINARI_DATASETS_PATH"]
+        else:
+            os.environ["MINARI_DATASETS_PATH"] = before
+        env.close()
+    dataset.storage.update_episode_metadata([entries[i] for i in made])
+    dataset.storage.update_metadata(
+        {"task": repr(make_task(config.task)), "observation_version": OBSERVATION_VERSION, "demos": asdict(config)}
+    )
+    (root / out.name).rename(out)
+
+
+def _buffer(path: Path, seed: int) -> EpisodeBuffer:
+    with np.load(path, allow_pickle=False) as arrays:
+        return EpisodeBuffer(
+            seed=seed,
+            observations=arrays["observations"],
+            actions=arrays["actions"],
+            rewards=arrays["rewards"],
+            terminations=arrays["terminations"],
+            truncations=arrays["truncations"],
+            infos={"expert_action": arrays["labels"], "state": arrays["states"]},
+        )

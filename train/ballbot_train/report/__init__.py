@@ -1,0 +1,1 @@
+"""What people look at: figures, replays and the report page."""

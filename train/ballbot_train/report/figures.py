@@ -1,0 +1,284 @@
+"""Figures of trajectories and of comparisons, in matplotlib."""
+
+import io
+import math
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # files only: no display needed
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+
+from ballbot_gym import files
+from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.evaluation.basins import AXES, BasinMap
+from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.robustness import NONE, STRESSES, StressRow, curve_of
+
+COLORS = {
+    "lqr": "#c0392b",
+    "trajopt": "#1f6fb2",
+    "nmpc": "#e08a00",
+    "bc": "#8d6e63",
+    "dagger": "#34495e",
+    "ppo": "#2e8b57",
+    "sac": "#17a2b8",
+    "shac": "#8e44ad",
+}
+_LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
+_OTHER_COLORS = ("#6b8e23", "#b9770e", "#5d6d7e", "#d35479")
+LABELS = {
+    "lqr": "LQR",
+    "trajopt": "trajectory optimization + TVLQR",
+    "nmpc": "NMPC",
+    "bc": "behaviour cloning",
+    "dagger": "DAgger",
+    "ppo": "PPO",
+    "sac": "SAC",
+    "shac": "SHAC",
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A trajectory to draw, with its label, colour and line style."""
+
+    label: str
+    trajectory: Trajectory
+    color: str
+    style: str = "-"
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Something round on the ground path: an obstacle if filled, else a line to follow; metres."""
+
+    x: float
+    y: float
+    radius: float
+    filled: bool = True
+    color: tuple[float, ...] | str = "0.75"
+
+
+def marker_circles(markers: Sequence[Marker]) -> list[Circle]:
+    """What a task draws besides the robot, seen from above."""
+    return [Circle(*marker.position, marker.radius, not marker.ring, marker.color[:3]) for marker in markers]
+
+
+def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Circle] = ()) -> Figure:
+    """The paper's form: position, velocity and lean over time, forces over time, and the ground path."""
+    figure = plt.figure(figsize=(12, 6.2), layout="constrained")
+    figure.suptitle(title, fontsize=13)
+    axes = figure.subplot_mosaic(
+        [["position", "velocity", "path"], ["lean", "force", "path"]], width_ratios=[1, 1, 1.25]
+    )
+    panels = {
+        "position": ("ball position, m", 0, ("x", "y"), 1.0),
+        "velocity": ("ball velocity, m/s", 4, ("ẋ", "ẏ"), 1.0),
+        "lean": ("lean, deg", 2, ("γ", "θ"), 180 / math.pi),
+    }
+    for curve in curves:
+        t, x = curve.trajectory.t, curve.trajectory.x
+        for key, (_, first, names, factor) in panels.items():
+            for i, name in enumerate(names):
+                axes[key].plot(
+                    t,
+                    factor * x[:, first + i],
+                    _component_style(curve, i),
+                    color=curve.color,
+                    lw=1.5,
+                    alpha=_alpha(i),
+                    label=f"{name}" if curve is curves[0] else None,
+                )
+        _plot_forces(axes["force"], curve)
+        axes["path"].plot(x[:, 0], x[:, 1], curve.style, color=curve.color, lw=2, label=curve.label)
+    for key, (label, *_rest) in panels.items():
+        axes[key].set_ylabel(label)
+    axes["force"].set_ylabel("force, N")
+    for key in ("lean", "force"):
+        axes[key].set_xlabel("time, s")
+    for key in ("position", "velocity", "lean", "force"):
+        axes[key].grid(alpha=0.3)
+        axes[key].axhline(0, color="0.6", lw=0.6)
+    for key, names in (
+        ("position", "x solid, y dotted"),
+        ("velocity", "ẋ solid, ẏ dotted"),
+        ("lean", "γ solid, θ dotted"),
+        ("force", "Fx solid, Fy dotted"),
+    ):
+        axes[key].set_title(names, fontsize=9, color="0.35")
+    _finish_path(axes["path"], curves, circles)
+    return figure
+
+
+def regret_curves(results: Sequence[Result], task: str) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Of each controller on a task the regrets that it reaches (n,), in % and ascending, and the share of episodes within."""
+    curves = []
+    for controller in dict.fromkeys(result.controller for result in results if result.task == task):
+        group = [result for result in results if (result.task, result.controller) == (task, controller)]
+        # success, not only standing: an episode that misses its goal has no regret worth the name
+        regrets = np.sort([max(100 * result.regret, _LEAST_REGRET) for result in group if result.success])
+        curves.append((controller, regrets, 100 * np.arange(1, len(regrets) + 1) / len(group)))
+    return curves
+
+
+def regret_figure(results: Sequence[Result]) -> Figure:
+    """For every task, the share of episodes that each controller finishes within a given regret."""
+    tasks = list(dict.fromkeys(result.task for result in results))
+    figure, axes = plt.subplots(1, len(tasks), figsize=(4.2 * len(tasks), 3.8), layout="constrained", squeeze=False)
+    for axis, task in zip(axes[0], tasks, strict=True):
+        for i, (controller, regrets, share) in enumerate(regret_curves(results, task)):
+            axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=label(controller))
+        axis.set(
+            xscale="log", xlim=(_LEAST_REGRET, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %"
+        )
+        axis.grid(alpha=0.3)
+    axes[0][0].set_ylabel("episodes that succeed, %")
+    # a controller may be in some of the tasks only
+    shown = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    labels = sorted(shown, key=[*LABELS.values(), *shown].index)
+    figure.legend([shown[label] for label in labels], labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    return figure
+
+
+def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
+    """Success and regret of every controller on a task against the severity of every disturbance.
+
+    Regret, with its 95 % interval, is drawn where at least half of the episodes did not fail.
+    """
+    stresses = list(dict.fromkeys(row.stress for row in rows if row.stress != NONE))
+    controllers = list(dict.fromkeys(row.controller for row in rows if row.task == task))
+    figure, axes = plt.subplots(
+        2,
+        len(stresses),
+        figsize=(2.9 * len(stresses), 5.6),
+        layout="constrained",
+        squeeze=False,
+        sharey="row",
+        sharex="col",
+    )
+    figure.suptitle(f"{task}: success and regret under disturbances", fontsize=13)
+    for i, stress in enumerate(stresses):
+        above, below = axes[:, i]
+        for k, controller in enumerate(controllers):
+            points = curve_of(rows, task, controller, stress)
+            levels, shade, width = [row.level for row in points], color(controller, k), max(1.5, 3.5 - k)
+            success = [100 * row.success for row in points]
+            above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=label(controller))
+            standing = [row for row in points if 2 * row.falls <= row.episodes and math.isfinite(row.regret_mean)]
+            levels = [row.level for row in standing]
+            below.plot(levels, [100 * row.regret_mean for row in standing], "o-", ms=4, lw=width, color=shade)
+            low, high = ([100 * getattr(row, f"regret_{end}") for row in standing] for end in ("low", "high"))
+            below.fill_between(levels, low, high, color=shade, alpha=0.15, lw=0)
+        above.set(ylim=(-4, 104), title=stress)
+        below.set_yscale("symlog", linthresh=1)
+        below.set_xlabel(_folded(STRESSES[stress].label), fontsize=9)
+        for axis in (above, below):
+            axis.grid(alpha=0.3)
+    axes[0][0].set_ylabel("success, %")
+    axes[1][0].set_ylabel("regret, %")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    return figure
+
+
+def basin_figure(maps: Sequence[BasinMap]) -> Figure:
+    """From where each controller recovers, coloured; from where anything could, grey, with its boundary on top."""
+    controllers = list(maps[0].recovered)
+    figure, axes = plt.subplots(
+        len(maps),
+        len(controllers),
+        figsize=(max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps)),
+        layout="constrained",
+        squeeze=False,
+        sharex=True,
+        sharey="row",
+    )
+    figure.suptitle("Stabilize: initial states from which the robot comes to rest at the origin", fontsize=13)
+    for basin, line in zip(maps, axes, strict=True):
+        for k, (controller, axis) in enumerate(zip(controllers, line, strict=True)):
+            cells = np.where(basin.recovered[controller], 2.0, np.where(basin.recoverable, 1.0, 0.0))
+            colors = ListedColormap(["white", "0.88", color(controller, k)])
+            axis.pcolormesh(
+                basin.leans, basin.values, cells, cmap=colors, vmin=0, vmax=2, shading="nearest", alpha=0.85
+            )
+            axis.fill(*basin.boundary.T, fill=False, ec="k", lw=1.6)
+            axis.set_title(f"{label(controller)}: {basin.fraction(controller):.0%}", fontsize=10)
+            axis.axhline(0, color="0.5", lw=0.5)
+            axis.axvline(0, color="0.5", lw=0.5)
+            axis.set_xlim(-81, 81)
+        line[0].set_ylabel(AXES[basin.axis].label)
+    for axis in axes[-1]:
+        axis.set_xlabel("lean γ, degrees")
+    figure.supxlabel("black: the boundary of what 350 N can recover; per cent: share of it recovered", fontsize=9)
+    return figure
+
+
+def add_circles(axis: plt.Axes, circles: Sequence[Circle]) -> None:
+    """Draws circles on a ground path, below everything else."""
+    for circle in circles:
+        line = "-" if circle.filled else "--"
+        shape = plt.Circle(
+            (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
+        )
+        axis.add_patch(shape).set_zorder(0)
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Writes a PNG and closes the figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    plt.close(figure)
+    return files.write(path, buffer.getvalue())
+
+
+def color(controller: str, i: int) -> str:
+    """A controller's colour, the same in every figure."""
+    return COLORS.get(controller, _OTHER_COLORS[i % len(_OTHER_COLORS)])
+
+
+def label(controller: str) -> str:
+    """What a controller is called in figures; a policy file goes by its name."""
+    stem = Path(controller).stem
+    return LABELS.get(stem, stem)
+
+
+def _folded(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, 28))
+
+
+def _component_style(curve: Curve, i: int) -> str:
+    return curve.style if i == 0 else ":"
+
+
+def _alpha(i: int) -> float:
+    return 1.0 if i == 0 else 0.8
+
+
+def _plot_forces(axis: plt.Axes, curve: Curve) -> None:
+    trajectory = curve.trajectory
+    for i in range(2):
+        style, common = _component_style(curve, i), {"color": curve.color, "lw": 1.2, "alpha": _alpha(i)}
+        if trajectory.held:
+            axis.step(trajectory.t[:-1], trajectory.u[:, i], style, where="post", **common)
+        else:
+            axis.plot(trajectory.t, trajectory.u[:, i], style, **common)
+
+
+def _finish_path(axis: plt.Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
+    add_circles(axis, circles)
+    start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
+    axis.plot(*start[:2], "o", color="k", ms=5)
+    axis.plot(*end[:2], "s", color="k", ms=5)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set(xlabel="x, m", ylabel="y, m", title="ground path (● start, ■ end)")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=9, loc="best")

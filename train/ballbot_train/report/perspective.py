@@ -1,0 +1,257 @@
+"""The ballbot in perspective, drawn with matplotlib's polygons: clean lines at any size, and ghosts that shine through.
+
+A sphere is a circle, and a cylinder the hull of its two end circles; what is farther from the camera is painted first.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgb
+from scipy.spatial import ConvexHull
+
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks.marker import Marker
+
+_YAW, _PITCH, _DISTANCE = (
+    math.radians(-55),
+    math.radians(20),
+    3.4,
+)  # rad, rad, m: from behind a robot that moves along x
+_HALF_HEIGHT = 0.42  # of the view, as a tangent
+_AIM_HEIGHT = 0.55  # m above the floor
+_NEAR = 0.4  # m: what is closer to the camera's plane is not drawn
+_FLOOR_REACH = 12  # m
+_LIGHT = np.array([-0.45, -0.55, 1.0]) / math.sqrt(0.45**2 + 0.55**2 + 1)  # towards the light
+_BALL = (0.16, 0.18, 0.23)
+_FORCE = (0.85, 0.1, 0.55)
+_FORCE_SCALE = 1 / 400  # m/N of the arrow
+_ANGLES = np.linspace(0, 2 * math.pi, 28, endpoint=False)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A ballbot to draw: state x (8,), force u (2,) N if it is to be seen, colour, and opacity."""
+
+    x: np.ndarray
+    color: str
+    u: np.ndarray | None = None
+    alpha: float = 1.0
+
+
+@dataclass(frozen=True)
+class GroundPath:
+    """A line on the floor through points (n, 2), m."""
+
+    points: np.ndarray
+    color: str
+    dashed: bool = False
+
+
+class Camera:
+    """Looks at a point from the side and above; x and y of a picture are tangents of angles from its middle."""
+
+    def __init__(self, target: np.ndarray, distance: float = _DISTANCE):
+        """Args: target (3,) and the distance from it, m."""
+        ahead = np.array([-math.sin(_YAW) * math.cos(_PITCH), math.cos(_YAW) * math.cos(_PITCH), -math.sin(_PITCH)])
+        right = np.array([math.cos(_YAW), math.sin(_YAW), 0.0])
+        self.eye = np.asarray(target) - distance * ahead
+        self._axes = np.stack([right, np.cross(right, ahead), ahead])
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(..., 2) places in the picture of points (..., 3), and (...) their depths, m, at least `_NEAR`."""
+        seen = (np.asarray(points, np.float64) - self.eye) @ self._axes.T
+        depth = np.maximum(seen[..., 2], _NEAR)
+        return seen[..., :2] / depth[..., None], depth
+
+
+class Sketch:
+    """Robots, paths and markers on a chequered floor, in one axes, drawn anew for every frame."""
+
+    def __init__(self, axis: Axes, params: BallbotParams, markers: Sequence[Marker], aspect: float):
+        """Args: aspect is the axes' width over its height."""
+        self._params, self._markers, self._aspect = params, markers, aspect
+        axis.set(xlim=(-_HALF_HEIGHT * aspect, _HALF_HEIGHT * aspect), ylim=(-_HALF_HEIGHT, _HALF_HEIGHT))
+        axis.set_xticks([])
+        axis.set_yticks([])
+        axis.set_facecolor("#fbfbfa")
+        for spine in axis.spines.values():
+            spine.set_color("0.85")
+        self._floor = axis.add_collection(PolyCollection([], lw=0))
+        self._lines = axis.add_collection(LineCollection([], capstyle="round"))
+        self._solids = axis.add_collection(PolyCollection([], lw=0.3))
+        self._solids.set_snap(False)  # else upright thin things get wavy edges
+        self.artists = (self._floor, self._lines, self._solids)
+
+    def show(
+        self,
+        middle: np.ndarray,
+        robots: Sequence[Robot],
+        paths: Sequence[GroundPath] = (),
+        zoom_out: float = 0.0,
+    ) -> None:
+        """Replaces what is drawn; the camera looks at the middle (2,), m, from `zoom_out` m farther than usual."""
+        camera = Camera(np.array([*middle, _AIM_HEIGHT]), _DISTANCE + zoom_out)
+        self._show_floor(camera, middle)
+        self._show_lines(camera, paths)
+        solids = [(0.0, _shadow(camera, self._params, robot)) for robot in robots]  # nearest of all to the floor
+        bodies = [_marker(camera, marker) for marker in self._markers if not marker.ring]
+        for robot in robots:
+            bodies += _robot(camera, self._params, robot)
+        solids += sorted(bodies, key=lambda body: -body[0])
+        faces = [face for _, body in solids for face in body]
+        self._solids.set_verts([outline for outline, _ in faces])
+        self._solids.set_facecolor([color for _, color in faces])
+        self._solids.set_edgecolor([color if color[3] == 1 else (0, 0, 0, 0) for _, color in faces])
+
+    def _show_floor(self, camera: Camera, middle: np.ndarray) -> None:
+        """Every other square metre, fading into the distance."""
+        low = np.floor(middle).astype(int) - _FLOOR_REACH
+        i, j = np.meshgrid(*(np.arange(start, start + 2 * _FLOOR_REACH + 1) for start in low), indexing="ij")
+        dark = (i + j) % 2 == 0
+        corners = np.stack([i[dark], j[dark], np.zeros(dark.sum())], axis=-1)[:, None] + np.array(
+            [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+        )
+        places, depth = camera.project(corners)
+        seen = (depth > _NEAR).all(axis=1)
+        fade = np.clip(1 - depth[seen].mean(axis=1) / (_FLOOR_REACH + 2), 0, 1)
+        self._floor.set_verts(places[seen])
+        self._floor.set_facecolor([(0.80, 0.83, 0.88, 0.8 * share) for share in fade])
+
+    def _show_lines(self, camera: Camera, paths: Sequence[GroundPath]) -> None:
+        lines = [(path.points, to_rgb(path.color), "--" if path.dashed else "-", 2.2) for path in paths]
+        for marker in self._markers:
+            if marker.ring:
+                around = marker.radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+                fine = np.concatenate([around, around[:1]]) + np.array(marker.position)
+                lines.append((fine, marker.color[:3], (0, (4, 3)), 1.5))
+        segments, colors, styles, widths = [], [], [], []
+        for points, color, style, width in lines:
+            places, depth = camera.project(np.column_stack([points, np.full(len(points), 0.004)]))
+            for run in np.split(np.arange(len(places)), np.flatnonzero(np.diff(depth <= _NEAR)) + 1):
+                if depth[run[0]] > _NEAR:  # the part before the camera
+                    segments.append(places[run])
+                    colors.append(color)
+                    styles.append(style)
+                    widths.append(width)
+        self._lines.set_segments(segments)
+        self._lines.set_color(colors)
+        self._lines.set_linestyle(styles)
+        self._lines.set_linewidth(widths)
+
+
+Face = tuple[np.ndarray, tuple[float, ...]]
+"""A polygon (n, 2) of the picture and its colour, RGBA."""
+
+
+def body_axis(x: np.ndarray) -> np.ndarray:
+    """(3,) along the body of state x (8,), upwards."""
+    gamma, theta = x[2], x[3]
+    return np.array(
+        [math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)],
+    )
+
+
+def _robot(camera: Camera, params: BallbotParams, robot: Robot) -> list[tuple[float, list[Face]]]:
+    ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
+    axis = body_axis(robot.x)
+    middle = ball + params.com_height * axis
+    half = params.body_length / 2 * axis
+    parts = [
+        _sphere(camera, ball, params.ball_radius, _BALL, robot.alpha),
+        _cylinder(camera, middle - half, middle + half, params.body_radius, to_rgb(robot.color), robot.alpha),
+    ]
+    if robot.u is not None and np.hypot(*robot.u) > 2:
+        parts.append(_arrow(camera, ball, _FORCE_SCALE * robot.u, robot.alpha))
+    return parts
+
+
+def _marker(camera: Camera, marker: Marker) -> tuple[float, list[Face]]:
+    foot = np.array([*marker.position, 0.0])
+    depth, faces = _cylinder(
+        camera, foot, foot + np.array([0, 0, marker.height]), marker.radius, marker.color[:3], marker.color[3]
+    )
+    return (math.inf if marker.height < 0.05 else depth), faces  # a disc lies under everything
+
+
+def _shadow(camera: Camera, params: BallbotParams, robot: Robot) -> list[Face]:
+    """What the body and ball keep the light from."""
+    ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
+    top = ball + (params.com_height + params.body_length / 2) * body_axis(robot.x)
+    ring = params.ball_radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES], axis=1)
+    points = np.concatenate([ball + ring, top + ring])
+    on_floor = points - points[:, 2:] * (_LIGHT / _LIGHT[2])
+    return [(_hull(camera.project(on_floor)[0]), (0.1, 0.12, 0.2, 0.16 * robot.alpha))]
+
+
+def _sphere(
+    camera: Camera, centre: np.ndarray, radius: float, color: Sequence[float], alpha: float
+) -> tuple[float, list[Face]]:
+    (place,), (depth,) = camera.project(centre[None])
+    circle = radius / depth * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+    glance = radius / depth * np.array([-0.3, 0.4])
+    shades = ((1.0, 0.0), (0.6, 0.18), (0.25, 0.4)) if alpha == 1 else ((1.0, 0.0),)
+    faces = [(place + size * circle + (1 - size) * glance, (*_lighter(color, light), alpha)) for size, light in shades]
+    return depth, faces
+
+
+def _cylinder(
+    camera: Camera, low: np.ndarray, high: np.ndarray, radius: float, color: Sequence[float], alpha: float
+) -> tuple[float, list[Face]]:
+    axis = (high - low) / np.linalg.norm(high - low)
+    across = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])
+    across /= np.linalg.norm(across)
+    normals = np.outer(np.cos(_ANGLES), across) + np.outer(np.sin(_ANGLES), np.cross(axis, across))
+    rings = [camera.project(end + radius * normals)[0] for end in (low, high)]
+    (_,), (depth,) = camera.project((low + high)[None] / 2)
+    faces: list[Face] = [(_hull(np.concatenate(rings)), (*_shaded(color, 0.2), alpha))]
+    if alpha == 1:  # through translucent sides the inner edges would be seen
+        for k in range(len(normals)):
+            after = (k + 1) % len(normals)
+            normal = normals[k] + normals[after]
+            if normal @ (camera.eye - low) > 2 * radius:
+                side = np.array([rings[0][k], rings[0][after], rings[1][after], rings[1][k]])
+                faces.append((side, (*_shaded(color, normal @ _LIGHT / np.linalg.norm(normal)), 1.0)))
+    for end, ring, outward in ((low, rings[0], -axis), (high, rings[1], axis)):
+        if outward @ (camera.eye - end) > 0:
+            faces.append((ring, (*_shaded(color, 0.3 + outward @ _LIGHT), alpha)))
+    return depth, faces
+
+
+def _arrow(camera: Camera, start: np.ndarray, vector: np.ndarray, alpha: float) -> tuple[float, list[Face]]:
+    """A level arrow, m."""
+    length = float(np.hypot(*vector))
+    along, head = np.array([*vector, 0.0]) / length, min(0.16, length)
+    aside = np.array([-along[1], along[0], 0.0])
+    neck, tip = start + (length - head) * along, start + length * along
+    outline = np.array(
+        [
+            start - 0.02 * aside,
+            neck - 0.02 * aside,
+            neck - 0.07 * aside,
+            tip,
+            neck + 0.07 * aside,
+            neck + 0.02 * aside,
+            start + 0.02 * aside,
+        ]
+    )
+    places, depth = camera.project(outline)
+    return float(depth.mean()), [(places, (*_FORCE, alpha))]
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    return points[ConvexHull(points, qhull_options="QJ").vertices]
+
+
+def _shaded(color: Sequence[float], light: float) -> tuple[float, ...]:
+    """From dim, where the light does not reach, to bright."""
+    return _lighter(color, -0.2 + 0.45 * min(max(light, 0.0), 1.0))
+
+
+def _lighter(color: Sequence[float], share: float) -> tuple[float, ...]:
+    """Mixed with white, or with black where share < 0."""
+    target = 1.0 if share > 0 else 0.0
+    return tuple(float(value + abs(share) * (target - value)) for value in color)

@@ -1,0 +1,114 @@
+"""What the leaderboard's page holds besides its table, each part where its data exist."""
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.report.page import (
+    Line,
+    Panel,
+    Section,
+    curves_section,
+    figures,
+    folder_section,
+    pictures_section,
+    replay_section,
+    table_section,
+)
+from ballbot_train.report.replay import Replay, certified_replay
+
+
+def leaderboard_sections(
+    header: Sequence[str],
+    table: Sequence[Sequence[str]],
+    results: Sequence[Result],
+    controllers: Mapping[str, Sequence[str]],
+    pictures: Sequence[Path],
+    physics: str,
+    runs: Path,
+) -> list[Section | None]:
+    """The page of `ballbot benchmark`.
+
+    Args:
+        header, table: the leaderboard's cells.
+        results: its episodes.
+        controllers: by task.
+        pictures: of certified episodes.
+        physics: "bullet" or "rk4".
+        runs: folder in which other commands have left theirs: basins, robustness, paper, and any training.
+    """
+    replays = [replay_of(task, names, results, physics) for task, names in controllers.items()]
+    return [
+        table_section(
+            "Leaderboard",
+            header,
+            table,
+            "Regret is cost / optimum − 1 over the episodes that did not fail. Press a column's head to sort by it.",
+        ),
+        replay_section(
+            "Watch an episode",
+            replays,
+            "The same start under every controller. Drag to turn the camera; play, or drag the time; "
+            "the pink line is the force on the ball.",
+        ),
+        regret_section(results),
+        pictures_section(
+            "Basins of attraction",
+            [path for path in (runs / "basins" / "basins.png",) if path.exists()],
+            "From where each controller recovers, within what 350 N allow.",
+        ),
+        folder_section("Robustness", runs / "robustness" / "figures", "The same episodes under growing disturbances."),
+        learning_section(runs),
+        pictures_section("One certified episode of each task", pictures),
+        folder_section("The paper's figures", runs / "paper", "High lean angle trajectory optimization, reproduced."),
+    ]
+
+
+def replay_of(task: str, controllers: Sequence[str], results: Sequence[Result], physics: str) -> Replay:
+    """A telling episode of a task: the first in which one controller fails and another does not, else the first."""
+    failures: dict[int, set[bool]] = {}
+    for result in results:
+        if result.task == task:
+            failures.setdefault(result.episode, set()).add(result.failure)
+    episode = next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
+    return certified_replay(task, controllers, episode, physics, skip_planless=True)
+
+
+def regret_section(results: Sequence[Result]) -> Section | None:
+    """For every task, the share of episodes that each controller finishes within a given regret."""
+    panels = []
+    for task in dict.fromkeys(result.task for result in results):
+        lines = []
+        for i, (name, regrets, share) in enumerate(figures.regret_curves(results, task)):
+            lines.append(Line(figures.label(name), regrets, share, figures.color(name, i), steps=True))
+        panels.append(Panel(task, "cost above the optimum, %", "episodes that succeed, %", lines, log_x=True))
+    lead = "The higher and the farther left, the better. A curve ends at the share of episodes that succeed."
+    return curves_section("How close to the optimum", panels, lead)
+
+
+def learning_section(runs: Path) -> Section | None:
+    """Regret against wall time of every training run below a folder."""
+    tasks: dict[str, list[Line]] = {}
+    for path in sorted(runs.rglob("evaluations.csv")):
+        config = path.with_name("config.json")
+        if not config.exists():
+            continue
+        described = json.loads(config.read_text())
+        rows = list(csv.DictReader(path.read_text().splitlines()))
+        lines = tasks.setdefault(str(described.get("task")), [])
+        points = [(float(row["seconds"]), 100 * float(row["regret_mean"])) for row in rows]
+        finite = np.array([point for point in points if np.isfinite(point).all()]).reshape(-1, 2)
+        learner = str(described.get("learner"))
+        again = any(line.label.startswith(f"{learner}:") for line in lines)
+        shade = figures.color("" if again else learner, len(lines))
+        lines.append(Line(f"{learner}: {path.parent.name}", *finite.T, shade))
+    panels = [
+        Panel(task, "training, s", "regret, %", [line for line in lines if len(line.x)], log_y=True)
+        for task, lines in tasks.items()
+        if any(len(line.x) for line in lines)
+    ]
+    return curves_section("Learning", panels, "Mean regret on certified episodes while training.")
