@@ -103,7 +103,7 @@ class BallbotBatch:
     `BallbotEnv(physics="rk4")`.
     """
 
-    def _init__(
+    def __init__(
         self,
         task: str | Task = "stabilize",
         num_envs: int = 1,

@@ -7,7 +7,7 @@ from ballbot_baselines.recovery import largest_leans
 from ballbot_gym.rollout import FunctionController, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.evaluation import basins
-from ballbot_train.report.page import figures
+from ballbot_train.report import figures
 
 LEAN_RATE = 6  # its index in a state
 

@@ -9,12 +9,12 @@ import pytest
 
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.report import figures
 from ballbot_train.report.page import (
     Line,
     Panel,
     Section,
     curves_section,
-    figures,
     folder_section,
     pictures_section,
     replay_section,

@@ -9,7 +9,7 @@ import pytest
 from ballbot_gym.randomization import Randomization
 from ballbot_train.evaluation import evaluate, robustness
 from ballbot_train.evaluation.robustness import NONE, STRESSES, StressResult
-from ballbot_train.report.page import figures
+from ballbot_train.report import figures
 
 
 @pytest.mark.parametrize("name", STRESSES)

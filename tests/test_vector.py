@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 
 import torch
 
-from ballbot_gym import BallbotEnv, BallbotParams, dynamics, vector
+from ballbot_gym import BallbotEnv, BallbotParams, batch, counter_rng, dynamics
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.simulator import BulletSimulator
 from ballbot_gym.tasks import TASKS
@@ -394,8 +394,8 @@ def test_float32_and_float64_start_alike(task):
 def test_hashed_numbers_are_uniform_and_uncorrelated():
     n = 20_000
     seed = torch.arange(n)
-    z = torch.stack(vector._uniforms(vector._key(seed, 0 * seed, 0 * seed), 8, torch.float64))
-    later = torch.stack(vector._uniforms(vector._key(seed, 0 * seed + 1, 0 * seed), 8, torch.float64))
+    z = torch.stack(counter_rng.uniforms(counter_rng.key(seed, 0 * seed, 0 * seed), 8, torch.float64))
+    later = torch.stack(counter_rng.uniforms(counter_rng.key(seed, 0 * seed + 1, 0 * seed), 8, torch.float64))
     assert z.min() >= 0
     assert z.max() < 1
     counts = torch.stack([torch.histc(row, 100, 0, 1) for row in z])
@@ -403,7 +403,7 @@ def test_hashed_numbers_are_uniform_and_uncorrelated():
     assert ((chi2 > 99 - 5 * 14.1) & (chi2 < 99 + 5 * 14.1)).all()  # 99 ± five standard deviations
     both = torch.corrcoef(torch.cat([z, later, z[:, torch.roll(seed, 1)]]))
     assert (both - torch.eye(24)).abs().max() < 5 / math.sqrt(n)
-    assert len(vector._mix(torch.arange(2**16)).unique()) == 2**16
+    assert len(counter_rng._mix(torch.arange(2**16)).unique()) == 2**16
 
 
 # --- gradients ---
@@ -489,7 +489,7 @@ def test_detach_cuts_the_gradient():
 # --- compiled ---
 
 
-@pytest.mark.skipif(not vector._has_compiler(torch.device("cpu")), reason="no C++ compiler")
+@pytest.mark.skipif(not batch._has_compiler(torch.device("cpu")), reason="no C++ compiler")
 def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wherever_an_env_stands():
     """37 envs fill vector registers and leave a remainder, 5 fill none, and turning the order round moves each elsewhere."""
     actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -521,8 +521,8 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
         return run
 
     monkeypatch.setattr(torch, "compile", broken)
-    monkeypatch.setattr(vector, "COMPILE_FROM", 4)
-    monkeypatch.setattr(vector, "_has_compiler", lambda device: True)
+    monkeypatch.setattr(batch, "COMPILE_FROM", 4)
+    monkeypatch.setattr(batch, "_has_compiler", lambda device: True)
     with caplog.at_level(logging.WARNING):
         batch = BallbotBatch("stabilize", 4)
         batch.reset(seed=0)

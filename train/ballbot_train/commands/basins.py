@@ -8,7 +8,7 @@ from ballbot_train import jobs
 from ballbot_train.console import console, print_table, progress_bar
 from ballbot_train.evaluation import basins as maps
 from ballbot_train.evaluation import evaluate
-from ballbot_train.report.page import figures
+from ballbot_train.report import figures
 
 
 def basins(

@@ -12,7 +12,8 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.console import console, markdown, print_table, progress_bar
 from ballbot_train.evaluation import basins, evaluate
-from ballbot_train.report.page import figures, write_report
+from ballbot_train.report import figures
+from ballbot_train.report.page import write_report
 from ballbot_train.report.replay import certified_replay
 from ballbot_train.report.sections import leaderboard_sections
 

@@ -12,7 +12,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import console, print_table
 from ballbot_train.evaluation import evaluate
-from ballbot_train.report.page import figures
+from ballbot_train.report import figures
 
 
 def optimize(

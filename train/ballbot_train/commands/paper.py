@@ -14,7 +14,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.rollout import rollout, simulate
 from ballbot_train.console import console, print_table
 from ballbot_train.evaluation import evaluate
-from ballbot_train.report.page import figures
+from ballbot_train.report import figures
 
 _PAPER_CONTROL_DT = 0.01  # s, at which the paper's plans are tracked
 _PAPER_LQR_DT = 0.001  # s: the paper's LQR is continuous

@@ -11,7 +11,7 @@ from ballbot_train import jobs
 from ballbot_train.console import console, markdown, print_table, progress_bar
 from ballbot_train.evaluation import evaluate
 from ballbot_train.evaluation import robustness as track
-from ballbot_train.report.page import figures
+from ballbot_train.report import figures
 
 
 def robustness(

@@ -21,7 +21,7 @@ from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.report.page import figures
+from ballbot_train.report import figures
 from ballbot_train.report.perspective import GroundPath, Robot, Sketch
 
 Format = Literal["png", "mp4", "gif"]

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.report import figures
 from ballbot_train.report.page import (
     Line,
     Panel,
     Section,
     curves_section,
-    figures,
     folder_section,
     pictures_section,
     replay_section,
