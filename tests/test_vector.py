@@ -11,7 +11,8 @@ pytest.importorskip("torch")
 
 import torch
 
-from ballbot_gym import BallbotEnv, BallbotParams, batch, counter_rng, dynamics
+from ballbot_gym import BallbotEnv, BallbotParams, counter_rng, dynamics
+from ballbot_gym import batch as batch_module
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.simulator import BulletSimulator
 from ballbot_gym.tasks import TASKS
@@ -489,7 +490,7 @@ def test_detach_cuts_the_gradient():
 # --- compiled ---
 
 
-@pytest.mark.skipif(not batch._has_compiler(torch.device("cpu")), reason="no C++ compiler")
+@pytest.mark.skipif(not batch_module._has_compiler(torch.device("cpu")), reason="no C++ compiler")
 def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wherever_an_env_stands():
     """37 envs fill vector registers and leave a remainder, 5 fill none, and turning the order round moves each elsewhere."""
     actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -521,8 +522,8 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
         return run
 
     monkeypatch.setattr(torch, "compile", broken)
-    monkeypatch.setattr(batch, "COMPILE_FROM", 4)
-    monkeypatch.setattr(batch, "_has_compiler", lambda device: True)
+    monkeypatch.setattr(batch_module, "COMPILE_FROM", 4)
+    monkeypatch.setattr(batch_module, "_has_compiler", lambda device: True)
     with caplog.at_level(logging.WARNING):
         batch = BallbotBatch("stabilize", 4)
         batch.reset(seed=0)

@@ -4,7 +4,7 @@ import os
 from multiprocessing import get_context
 from pathlib import Path
 
-from ballbot_baselines import certify as certification
+from ballbot_baselines import certification
 from ballbot_baselines.optimum import Optimum, PlanError, find_optimum
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
