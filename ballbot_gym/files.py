@@ -1,9 +1,11 @@
 """Files that appear whole or not at all."""
 
+import csv
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,3 +28,13 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     return write(path, buffer.getvalue())
+
+
+def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> Path:
+    """Writes one line for each row under a line of column names; columns default to the keys of the first row."""
+    text = io.StringIO()
+    names = list(columns or (rows[0] if rows else ()))
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return write(path, text.getvalue())

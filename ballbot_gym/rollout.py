@@ -16,6 +16,10 @@ from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.trajectory import Trajectory
 
 
+class PlanError(RuntimeError):
+    """A controller found no plan for the episode; the message gives each try's solver, status and constraint violation."""
+
+
 class Controller(Protocol):
     """Anything that turns states into forces: LQR, a tracked plan, MPC, a learned policy."""
 

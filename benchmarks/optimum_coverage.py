@@ -14,9 +14,10 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from ballbot_baselines.optimum import PlanError, find_optimum
+from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import files
 from ballbot_gym.params import default_params
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.weave import sides_passed, split_constants
 

@@ -20,11 +20,10 @@ import tyro
 
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import files
 from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.rollout import Controller, simulate
+from ballbot_gym.rollout import Controller, PlanError, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 
 _SECONDS = 6.0  # until which the robot must be upright again

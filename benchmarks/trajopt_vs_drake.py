@@ -29,10 +29,10 @@ from pydrake.solvers import SnoptSolver
 from ballbot_baselines.collocation import Guess, Problem, hermite_simpson, solve
 from ballbot_baselines.guess import straight_line
 from ballbot_baselines.ocp import OcpSolver
-from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.paper import PAPER_PROBLEMS
 from ballbot_gym import files
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
+from ballbot_gym.rollout import PlanError
 
 PROBLEMS = ("stabilize-1", "stabilize-5", "turn-3", "turn-10")
 _EQUAL = 1e-3  # relative difference of optima that counts as none

@@ -6,11 +6,11 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.lqr import LqrController, discrete_lqr
-from ballbot_baselines.optimum import PlanError, find_optimum
+from ballbot_baselines.optimum import find_optimum
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym import dynamics
-from ballbot_gym.rollout import FunctionController, rollout, simulate
+from ballbot_gym.rollout import FunctionController, PlanError, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
 

@@ -14,9 +14,9 @@ import minari
 import numpy as np
 import pytest
 
-from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.rollout import PlanError
 from ballbot_train.cli import main
 from ballbot_train.learning.demonstrations import DemoConfig, Expert, command_of, load_demos, record, write_demos
 

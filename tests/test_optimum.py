@@ -12,10 +12,10 @@ import casadi
 from ballbot_baselines import compiled
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
-from ballbot_baselines.optimum import FEASIBLE, Backoff, PlanError, find_optimum, is_feasible
+from ballbot_baselines.optimum import FEASIBLE, Backoff, find_optimum, is_feasible
 from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
-from ballbot_gym.rollout import rollout
+from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.weave import Weave, split_constants

@@ -7,9 +7,9 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import guess as guesses
 from ballbot_baselines.collocation import Guess, collocation_error, solve
-from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.paper import PAPER_PROBLEMS, between_states, circular_orbit, state, straight_guess
 from ballbot_gym import dynamics
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.orbit import orbit_tilt
 from ballbot_gym.trajectory import Trajectory
 

@@ -6,9 +6,9 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from ballbot_baselines.optimum import PlanError
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay

@@ -5,9 +5,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ballbot_baselines.optimum import Optimum, PlanError, find_optimum
+from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
 

@@ -20,9 +20,10 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
-from ballbot_baselines.optimum import FEASIBLE, PlanError
+from ballbot_baselines.optimum import FEASIBLE
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
 _UNLIKE = 0.2

@@ -26,10 +26,11 @@ import numpy as np
 from ballbot_baselines.compiled import compiled
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.lqr import final_weight
-from ballbot_baselines.optimum import Backoff, Optimum, PlanError, find_optimum
+from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
 _BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan: half of TrajoptController's for the goal

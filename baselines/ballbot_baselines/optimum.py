@@ -20,6 +20,7 @@ from ballbot_baselines import guess
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -30,10 +31,6 @@ _FREE_TIME_INTERVALS = 60
 _COARSE = 2  # control steps per interval when several guesses are compared
 _BASIN_DOUBT = 0.01  # relaxed costs nearer than this may change places on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
-
-
-class PlanError(RuntimeError):
-    """No plan was found; the message gives each try's solver, status and constraint violation."""
 
 
 @dataclass(frozen=True)

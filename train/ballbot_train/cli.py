@@ -5,7 +5,7 @@ import sys
 import tyro
 from rich.console import Console
 
-from ballbot_baselines.optimum import PlanError
+from ballbot_gym.rollout import PlanError
 from ballbot_train.commands import COMMANDS
 
 

@@ -5,10 +5,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from ballbot_baselines import certification
-from ballbot_baselines.optimum import Optimum, PlanError, find_optimum
+from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import progress_bar
 from ballbot_train.evaluation import evaluate

@@ -16,12 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import PlanError
 from ballbot_baselines.recovery import largest_leans
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
-from ballbot_gym.rollout import rollout
+from ballbot_gym.rollout import PlanError, rollout
 from ballbot_train import jobs
 from ballbot_train.evaluation.controllers import make_controller
 

@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.optimum import PlanError
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.rollout import Controller, rollout
+from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train import jobs
 from ballbot_train.console import about

@@ -36,12 +36,12 @@ from minari.dataset.minari_dataset import parse_dataset_id
 
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.optimum import Backoff, PlanError, find_optimum
+from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_baselines.trajopt import EXECUTED, TrajoptController
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.rollout import Controller
+from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.policy import OBSERVATION_VERSION

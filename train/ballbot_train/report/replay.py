@@ -13,11 +13,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.optimum import PlanError
 from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.rollout import Controller, rollout
+from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.controllers import make_controller

@@ -23,10 +23,11 @@ import torch
 from scipy.spatial import KDTree
 
 from ballbot_baselines.linearize import quadratic_cost
-from ballbot_baselines.optimum import Backoff, Optimum, PlanError, find_optimum
+from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.base import then_stay
 from ballbot_train.learning.demonstrations import Demos, load_demos
