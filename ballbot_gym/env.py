@@ -221,7 +221,7 @@ class BallbotEnv(gymnasium.Env):
             values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
             raise ValueError(
                 f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
-                f"tilt {math.degrees(_tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
+                f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
             )
         return x, c
 
@@ -257,7 +257,7 @@ class BallbotEnv(gymnasium.Env):
         return {
             "state": np.array(self._state),
             "cost": cost,
-            "tilt": _tilt(self._state),
+            "tilt": dynamics.tilt(self._state),
             "success": success,
             "failure": failure,
             "force": np.array(force),
@@ -294,8 +294,3 @@ def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:
     if vector.shape != (size,) or not np.isfinite(vector).all():
         raise ValueError(f"{what} must be {size} finite numbers, not {value!r}")
     return vector
-
-
-def _tilt(x: Sequence[float]) -> float:
-    # float rounding can leave a cosine a hair above 1
-    return math.acos(min(1.0, math.cos(x[2]) * math.cos(x[3])))

@@ -47,6 +47,16 @@ def log(a: Any) -> Any:
     return math.log(a) if isinstance(a, float) else _library(a).log(a)
 
 
+def arccos(a: Any) -> Any:
+    """Arc cosine, elementwise. Not for CasADi."""
+    return math.acos(a) if isinstance(a, float | int) else _library(a).arccos(a)
+
+
+def clip(a: Any, low: float, high: float) -> Any:
+    """The nearest number in [low, high], elementwise; NaN stays NaN. Not for CasADi."""
+    return max(min(a, high), low) if isinstance(a, float | int) else _library(a).clip(a, low, high)
+
+
 def where(condition: Any, a: Any, b: Any) -> Any:
     """a where the condition holds, else b, elementwise. Not for CasADi: what tasks ask of optimizers is smooth."""
     if isinstance(condition, bool):
@@ -56,6 +66,21 @@ def where(condition: Any, a: Any, b: Any) -> Any:
         as_tensor = functools.partial(library.as_tensor, device=condition.device)
         return library.where(condition, as_tensor(a), as_tensor(b))
     return np.where(condition, a, b)
+
+
+def between(z: Any, low: Any, high: Any) -> Any:
+    """A uniform number z in [0, 1) as one in [low, high), elementwise."""
+    return low + (high - low) * z
+
+
+def squared(*parts: Any) -> Any:
+    """Sum of the squares of components."""
+    return sum(part * part for part in parts)
+
+
+def scaled(parts: tuple[Any, ...], scale: tuple[float, ...], like: Vector) -> Vector:
+    """A vector of the kind of `like` whose components are the parts, each divided by its scale."""
+    return stack(tuple(part / s for part, s in zip(parts, scale, strict=True)), like)
 
 
 def components(v: Vector) -> tuple[Any, ...]:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import ops
+from ballbot_gym.ops import between
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import between
 
 Range = tuple[float, float]
 """(low, high), both included; drawn uniformly."""

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_gym import files
+from ballbot_gym import dynamics, files
+from ballbot_gym.paths import hermite_basis
 
 
 class TrajectoryError(ValueError):
@@ -62,7 +63,7 @@ class Trajectory:
     @property
     def tilt(self) -> np.ndarray:
         """(N+1,) angle between the body's axis and the vertical, rad."""
-        return np.arccos(np.clip(np.cos(self.x[:, 2]) * np.cos(self.x[:, 3]), -1.0, 1.0))
+        return dynamics.tilt(self.x)
 
     def state(self, t: float) -> np.ndarray:
         """x(t), (8,); before the start and after the end, the nearest end."""
@@ -74,13 +75,8 @@ class Trajectory:
             return a + fraction * (b - a)
         h = self.t[i + 1] - self.t[i]
         slope_a, slope_b = h * self.xdot[i], h * self.xdot[i + 1]
-        s = fraction
-        return (
-            (1 + 2 * s) * (1 - s) ** 2 * a
-            + s * (1 - s) ** 2 * slope_a
-            + s**2 * (3 - 2 * s) * b
-            + s**2 * (s - 1) * slope_b
-        )
+        start, start_slope, end, end_slope = hermite_basis(fraction)
+        return start * a + start_slope * slope_a + end * b + end_slope * slope_b
 
     def force(self, t: float) -> np.ndarray:
         """u(t), (2,) N; before the start and after the end, the nearest end."""

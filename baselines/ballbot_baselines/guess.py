@@ -3,7 +3,7 @@
 import numpy as np
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import cubic
+from ballbot_gym.paths import cubic
 
 _SMOOTHING = 0.15  # s: shorter turns of a guessed path are rounded off, because the body cannot follow them
 

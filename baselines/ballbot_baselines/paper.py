@@ -12,8 +12,8 @@ import numpy as np
 from ballbot_baselines import guess as guesses
 from ballbot_baselines.collocation import Guess, Plan, Problem, solve
 from ballbot_gym import ops
+from ballbot_gym.ops import squared
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import squared
 from ballbot_gym.tasks.orbit import steady_orbit
 
 DISTANCE_WEIGHT = 1.0  # Q0, of the squared ground distance from the destination

@@ -3,7 +3,7 @@
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_gym import certified, files
+from ballbot_gym import certified, dynamics, files
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.rollout import Controller, PlanError, rollout
@@ -63,7 +63,7 @@ class Replay:
     title: str
     takes: tuple[Take, ...]
     markers: tuple[Marker, ...] = ()
-    params: BallbotParams = default_params()
+    params: BallbotParams = field(default_factory=default_params)
 
     @property
     def duration(self) -> float:
@@ -356,4 +356,4 @@ def _drawstyle(trajectory: Trajectory) -> str:
 
 def _tilt(x: np.ndarray) -> float:
     """In degrees."""
-    return math.degrees(math.acos(min(1.0, math.cos(x[2]) * math.cos(x[3]))))
+    return math.degrees(dynamics.tilt(x))
