@@ -13,6 +13,7 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 
@@ -56,6 +57,34 @@ class DelayedController:
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         self._pending.append(self._controller.act(t, x))
         return self._pending.pop(0)
+
+
+class ActionController:
+    """A function from observation to action as a Controller. It gets the observations that the env would show.
+
+    This is the one place where an observation is turned into a force.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray]):
+        """Wraps a function.
+
+        Args:
+            task: what is observed.
+            params: the robot, whose force limit is the unit of actions.
+            action: gets an observation (no,) float32 and whether an episode begins; returns an action (2,) in [−1, 1].
+        """
+        self._task, self._params, self._action = task, params, action
+        self._c: tuple[float, ...] = ()
+        self._begins = True
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
+        action = np.asarray(self._action(observation, self._begins), np.float64)
+        self._begins = False
+        return self._params.force_limit * action
 
 
 @dataclass(frozen=True)

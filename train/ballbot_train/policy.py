@@ -18,6 +18,7 @@ import torch
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
 
 OBSERVATION_VERSION = 1
@@ -89,19 +90,12 @@ class PolicyNetwork(torch.nn.Module):
         return bent if self.linear is None else bent + self.linear(observation)
 
 
-class PolicyController:
+class PolicyController(ActionController):
     """A policy as a Controller of forces, and with Stable-Baselines3's `predict` of actions."""
 
     def __init__(self, task: Task, params: BallbotParams, network: PolicyNetwork):
-        self._task, self._params, self._network = task, params, network.eval()
-        self._c: tuple[float, ...] = ()
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._c = tuple(np.asarray(c, np.float64).tolist())
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
-        return self._params.force_limit * self.predict(observation)[0].astype(np.float64)
+        super().__init__(task, params, lambda observation, begins: self.predict(observation)[0])
+        self._network = network.eval()
 
     def predict(
         self,

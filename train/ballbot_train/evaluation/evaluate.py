@@ -21,7 +21,7 @@ from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.rollout import Controller, PlanError, rollout
+from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train import jobs
 from ballbot_train.console import about
@@ -82,27 +82,6 @@ class Row:
     step_us_median: float
     recovered: float = math.nan
     """Share of the physically recoverable states from which it recovers, where `ballbot basins` measured it."""
-
-
-class ActionController:
-    """What maps observations to actions in [−1, 1]² as a Controller: it sees what the env would show it.
-
-    `act` of the wrapped function gets (observation, whether the episode begins).
-    """
-
-    def __init__(self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray]):
-        self._task, self._params, self._action = task, params, action
-        self._c: tuple[float, ...] = ()
-        self._begins = True
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
-        action = np.asarray(self._action(observation, self._begins), np.float64)
-        self._begins = False
-        return self._params.force_limit * action
 
 
 def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
