@@ -10,7 +10,7 @@ Eager, compiled, and a compiled batch of one, whose sine is another library's, a
 import logging
 import shutil
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -78,6 +78,23 @@ class BatchStep(NamedTuple):
     """(B,) rad, of `final_x`; carries no gradient."""
     tilt: torch.Tensor
     """(B,) rad, of the states that follow: `final_x`, or where an episode ended the next one's start; no gradient."""
+
+
+class BatchEpisodes(NamedTuple):
+    """One episode of each of B environments."""
+
+    cost: torch.Tensor
+    """(B,) float64, minus the return."""
+    success: torch.Tensor
+    """(B,) bool: the episode ended in the goal."""
+    failure: torch.Tensor
+    """(B,) bool: the episode ended at a violated margin."""
+    terminated: torch.Tensor
+    """(B,) bool: the episode ended by success or failure, not because its time was over."""
+    steps: torch.Tensor
+    """(B,) int64, control steps taken."""
+    states: torch.Tensor | None
+    """(T, 8, B) states after each control step, where they were recorded. What follows the end of an episode is undefined."""
 
 
 class _Robot(NamedTuple):
@@ -175,17 +192,17 @@ class BallbotBatch:
         Returns:
             (B, no) observations of all envs.
         """
-        self.state = self.begin(seed, mask, x, c)
+        self.state = self.initial_state(seed, mask, x, c)
         return self.observe(self.state)
 
-    def begin(
+    def initial_state(
         self,
         seed: int | Sequence[int | None] | None = None,
         mask: torch.Tensor | None = None,
         x: torch.Tensor | None = None,
         c: torch.Tensor | None = None,
     ) -> BatchState:
-        """The state that `reset` would go to; changes nothing."""
+        """The state in which `reset` with these arguments would start; changes nothing."""
         old = self.state
         if old is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -336,6 +353,44 @@ class BallbotBatch:
         )
 
 
+@torch.no_grad()
+def run_episodes(
+    batch: BallbotBatch,
+    policy: Callable[[torch.Tensor], torch.Tensor],
+    x: np.ndarray | torch.Tensor,
+    c: np.ndarray | torch.Tensor,
+    record: bool = False,
+) -> BatchEpisodes:
+    """Runs one episode of each environment, all at once and without gradients.
+
+    Args:
+        batch: where to run; it is reset with seed 0.
+        policy: from observations (B, no) to actions (B, 2).
+        x: (B, 8) initial states.
+        c: (B, nc) constants of the episodes.
+        record: whether to keep the states of all control steps.
+    """
+    start = (torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device) for part in (x, c))
+    observation = batch.reset(0, None, *start)
+    running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
+    success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
+    cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)
+    steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=batch.device)
+    states: list[torch.Tensor] = []
+    for _ in range(batch.task.steps):
+        result = batch.step(policy(observation))
+        observation = result.observation
+        cost -= torch.where(running, result.reward, 0.0)
+        steps += running
+        success |= running & result.success
+        failure |= running & result.failure
+        terminated |= running & result.terminated
+        running &= ~(result.terminated | result.truncated)
+        if record:
+            states.append(result.final_x)
+    return BatchEpisodes(cost, success, failure, terminated, steps, torch.stack(states) if record else None)
+
+
 def _has_compiler(device: torch.device) -> bool:
     if device.type == "cuda":
         return True  # Triton brings its own
@@ -386,9 +441,8 @@ def any_of(conditions: Any) -> torch.Tensor:
 
 
 def tilt_of(x: tuple) -> torch.Tensor:
-    """(B,) rad of states of 8 rows, without gradient, which is infinite at upright."""
-    # float rounding can leave a cosine a hair above 1
-    return torch.acos(dynamics.cos_tilt(tuple(part.detach() for part in x)).clamp(max=1.0))
+    """(B,) tilt, rad, of states in 8 rows. It carries no gradient, because that is infinite where a robot is upright."""
+    return dynamics.tilt(tuple(part.detach() for part in x))
 
 
 def _seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:

@@ -91,10 +91,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             mask = np.ones_like(mask)
         tensor_mask = torch.from_numpy(mask).to(self.batch.device)
         with torch.no_grad():
-            state = self.batch.begin(seed, tensor_mask)
+            state = self.batch.initial_state(seed, tensor_mask)
             if constants is not None:
                 c = self._constants(constants, state, mask)
-                state = self.batch.begin(seed, tensor_mask, c=c)
+                state = self.batch.initial_state(seed, tensor_mask, c=c)
             if x is not None:
                 state = self._with_x(state, x, mask)
             self.batch.state = state

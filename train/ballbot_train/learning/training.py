@@ -29,7 +29,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
-from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import Task
@@ -84,31 +84,16 @@ def score(network: PolicyNetwork, task: Task) -> Score:
     """Runs all certified episodes at once, some seconds faster than PyBullet one by one."""
     episodes = certified.load(task)
     batch = BallbotBatch(task, len(episodes), compile=False)
-    observation = batch.reset(
-        seed=0,
-        x=torch.as_tensor(episodes.states.T, dtype=batch.dtype),
-        c=torch.as_tensor(episodes.constants.T, dtype=batch.dtype),
-    )
-    cost = torch.zeros(len(episodes), dtype=torch.float64)
-    running = torch.ones(len(episodes), dtype=torch.bool)
-    success, failure = torch.zeros_like(running), torch.zeros_like(running)
-    with torch.no_grad():
-        for _ in range(task.steps):
-            result = batch.step(network(observation))
-            cost -= torch.where(running, result.reward, 0.0)
-            success |= running & result.success
-            failure |= running & result.failure
-            running &= ~(result.terminated | result.truncated)
-            observation = result.observation
-    ratio = cost.numpy() / episodes.costs
-    priced = np.where(success.numpy(), ratio, np.maximum(ratio, task.failure_cost / episodes.costs))
-    standing = ratio[~failure.numpy()] - 1
+    run = run_episodes(batch, network, episodes.states, episodes.constants)
+    ratio = run.cost.numpy() / episodes.costs
+    priced = np.where(run.success.numpy(), ratio, np.maximum(ratio, task.failure_cost / episodes.costs))
+    standing = ratio[~run.failure.numpy()] - 1
     return Score(
         cost_ratio=float(priced.mean()),
         regret_mean=float(standing.mean()) if standing.size else math.nan,
         regret_median=float(np.median(standing)) if standing.size else math.nan,
-        success=float(success.double().mean()),
-        failures=int(failure.sum()),
+        success=float(run.success.double().mean()),
+        failures=int(run.failure.sum()),
     )
 
 
