@@ -51,6 +51,18 @@ class BatchState(NamedTuple):
     """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
 
 
+class _Rows(NamedTuple):
+    """A `BatchState` in which each matrix is a tuple of its rows (B,). Everything is computed in this form."""
+
+    x: tuple[torch.Tensor, ...]
+    c: tuple[torch.Tensor, ...]
+    steps: torch.Tensor
+    episode: torch.Tensor
+    seed: torch.Tensor
+    drawn: tuple[torch.Tensor, ...]
+    actuator: tuple[torch.Tensor, ...]
+
+
 class BatchStep(NamedTuple):
     """What one control step of B environments gave. Environments whose episode ended have started the next one."""
 
@@ -109,7 +121,8 @@ class _Robot(NamedTuple):
     @classmethod
     def of(cls, params: BallbotParams) -> "_Robot":
         derived = (BallbotParams.total_mass, BallbotParams.first_moment, BallbotParams.pivot_inertia)
-        return cls(*(value.func(params) for value in derived), params.axial_inertia, params.gravity)
+        total_mass, first_moment, pivot_inertia = (value.func(params) for value in derived)
+        return cls(total_mass, first_moment, pivot_inertia, params.axial_inertia, params.gravity)
 
 
 class BallbotBatch:
@@ -223,17 +236,18 @@ class BallbotBatch:
 
     def step(self, actions: torch.Tensor) -> BatchStep:
         """Holds forces for one control step; see `transition`. Call `reset` first."""
-        if self.state is None:
+        state = self.state
+        if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         try:
-            self.state, result = self._run(self.state, actions)
+            self.state, result = self._run(state, actions)
         except Exception as error:
             if self._proven or self._compile is True:
                 raise
             reason = str(error).strip().splitlines()[:1]
             _log.warning("torch.compile failed, the batch runs eagerly: %s %s", type(error).__name__, reason)
             self._run = self.transition
-            self.state, result = self._run(self.state, actions)
+            self.state, result = self._run(state, actions)
         self._proven = True
         return result._replace(**{name: getattr(result, name).bool() for name in _FLAGS}) if self.compiled else result
 
@@ -261,7 +275,7 @@ class BallbotBatch:
                 counter_rng.key(state.seed, state.episode, state.steps + 1), Randomization.PUSH_DRAWS, self.dtype
             )
             total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
-        robot = self.params
+        robot: Any = self.params
         if noise.varies_robot:
             robot = _Robot.of(noise.robot(self.params, now.drawn[:4]))
 
@@ -311,8 +325,8 @@ class BallbotBatch:
 
     def _start(
         self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
-    ) -> BatchState:
-        """The beginnings of episodes, in rows; x and c are drawn where they are not given."""
+    ) -> _Rows:
+        """The starts of episodes; x and c are drawn where they are not given."""
         task, noise = self.task, self.randomization
         key = counter_rng.key(seed, episode, 0 * episode)
         varied = noise.varies_robot or noise.varies_actuator
@@ -325,10 +339,10 @@ class BallbotBatch:
         drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
         actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
-        return BatchState(state, constants, zero, episode, seed, drawn, actuator)
+        return _Rows(state, constants, zero, episode, seed, drawn, actuator)
 
-    def _actuate(self, now: BatchState, command: tuple) -> tuple[tuple, tuple]:
-        """Force (2) applied, and the actuator's new memory, of a state in rows."""
+    def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
+        """Force (2) that the actuator applies, and its new memory."""
         if not self.randomization.varies_actuator:
             return command, now.actuator
         pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
@@ -336,8 +350,8 @@ class BallbotBatch:
         kept = (command, *pairs[1:])[: self._past_steps]
         return force, tuple(part for pair in (force, *kept) for part in pair)
 
-    def _observe(self, now: BatchState) -> torch.Tensor:
-        """(B, no) of a state in rows with the sensors' noise, which is drawn for the episode's steps so far."""
+    def _observe(self, now: _Rows) -> torch.Tensor:
+        """(B, no) observations with the sensors' noise, which depends on the number of steps taken in the episode."""
         x = now.x
         if self.randomization.is_noisy:
             key = counter_rng.key(now.seed, now.episode, now.steps + 1)
@@ -345,8 +359,8 @@ class BallbotBatch:
             x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :])
         return torch.stack(self.task.observe(x, now.c)).T
 
-    def _stacked(self, rows: BatchState) -> BatchState:
-        """A state in rows as tensors."""
+    def _stacked(self, rows: _Rows) -> BatchState:
+        """The rows as tensors."""
         none = torch.zeros(0, *rows.seed.shape, dtype=self.dtype, device=rows.seed.device)
         return BatchState(
             *(part if isinstance(part, torch.Tensor) else torch.stack(part) if part else none for part in rows)
@@ -404,24 +418,24 @@ def _compiled(transition: Any) -> Any:
     function = transition.__func__
     own = types.FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
     # By default no loop takes more than 64 operations, and what crosses from one loop to the next goes through memory.
-    options = {"max_fusion_size": 1000}
+    options: dict[str, Any] = {"max_fusion_size": 1000}
     return torch.compile(types.MethodType(own, transition.__self__), fullgraph=True, dynamic=False, options=options)
 
 
-def _rows(state: BatchState) -> BatchState:
-    """The state with each of its matrices as a tuple of rows (B,), the form in which everything is computed."""
-    return BatchState(*(part.unbind(0) if part.ndim == 2 else part for part in state))
+def _rows(state: BatchState) -> _Rows:
+    parts: Any = (part.unbind(0) if part.ndim == 2 else part for part in state)
+    return _Rows(*parts)
 
 
-def _select(mask: torch.Tensor, new: BatchState, old: BatchState) -> BatchState:
-    """The new state where the mask (B,) holds, else the old, both in rows."""
+def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
+    """The new state where the mask (B,) holds, else the old."""
 
     def chosen(a: Any, b: Any) -> Any:
         if isinstance(a, tuple):
             return tuple(map(chosen, a, b))
         return a if a is b else torch.where(mask, a, b)
 
-    return BatchState(*map(chosen, new, old))
+    return _Rows(*map(chosen, new, old))
 
 
 def all_of(conditions: Any) -> torch.Tensor:
@@ -447,11 +461,11 @@ def tilt_of(x: tuple) -> torch.Tensor:
 
 def _seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
     """One seed per env."""
-    if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-        seed = [int(seed) + i for i in range(num_envs)]
-    if len(seed) != num_envs:
-        raise ValueError(f"seed has {len(seed)} entries for {num_envs} envs")
-    for value in seed:
+    one = isinstance(seed, int | np.integer)
+    seeds: list[int | None] = [int(seed) + i for i in range(num_envs)] if one else list(seed)
+    if len(seeds) != num_envs:
+        raise ValueError(f"seed has {len(seeds)} entries for {num_envs} envs")
+    for value in seeds:
         if value is not None and not 0 <= value < 2**63:
             raise ValueError(f"seeds must be in [0, 2^63), not {value}")
-    return list(seed)
+    return seeds

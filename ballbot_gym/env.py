@@ -13,7 +13,7 @@ from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.scene import Scene
-from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.simulator import PHYSICS, State
 from ballbot_gym.tasks import TASKS, Task
 
 
@@ -67,8 +67,7 @@ class BallbotEnv(gymnasium.Env):
             ImportError: physics="bullet" without a usable PyBullet.
         """
         self._scene: Scene | None = None
-        self._simulator = None
-        self._state: tuple[float, ...] | None = None
+        self._state: State = ()  # until the first reset
         if physics not in PHYSICS:
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -135,7 +134,7 @@ class BallbotEnv(gymnasium.Env):
         if self._steps_left <= 0:
             self._check_open()
             raise gymnasium.error.ResetNeeded(
-                "step() before reset()" if self._state is None else "the episode has ended; call reset()"
+                "the episode has ended; call reset()" if self._state else "step() before reset()"
             )
         force, clipped = self._force(action)
         task, c, total = self.task, self._constants, force
@@ -174,7 +173,7 @@ class BallbotEnv(gymnasium.Env):
         if self.render_mode is None:
             gymnasium.logger.warn('render() without a render mode; make the environment with render_mode="rgb_array"')
             return None
-        if self._state is None:
+        if not self._state:
             raise gymnasium.error.ResetNeeded("render() before reset()")
         return self.render_state(self._state)
 
@@ -189,8 +188,7 @@ class BallbotEnv(gymnasium.Env):
         """Releases the physics client and the window; may be called again."""
         self._closed = True
         self._steps_left = 0
-        if self._simulator is not None:
-            self._simulator.close()
+        self._simulator.close()
         if self._scene is not None:
             self._scene.close()
             self._scene = None
@@ -231,7 +229,7 @@ class BallbotEnv(gymnasium.Env):
         unknown = sorted(set(named) - set(names))
         if unknown:
             raise ValueError(f"{self.task.id} has no constants {unknown}; it has {list(names)}")
-        return [named.get(name, value) for name, value in zip(names, c, strict=True)]
+        return [named.get(name, value) for name, value in zip(names, c.tolist(), strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
         if np.shape(action) != (2,):

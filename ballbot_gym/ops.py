@@ -100,8 +100,8 @@ def stack(parts: tuple[Any, ...], like: Vector) -> Vector:
     if _is_casadi(like):
         return library.vertcat(*parts)
     if library.__name__ == "torch":
-        parts = [library.as_tensor(part, dtype=like.dtype, device=like.device) for part in parts]
-        return library.stack(library.broadcast_tensors(*parts), dim=-1)
+        tensors = [library.as_tensor(part, dtype=like.dtype, device=like.device) for part in parts]
+        return library.stack(library.broadcast_tensors(*tensors), dim=-1)
     return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
 

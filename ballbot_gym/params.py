@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
-_PLACES = (Path(__file__).parent, Path(__file__).parent.parent)  # an installed wheel; a checkout
-URDF_PATH = next(
-    (path for place in _PLACES if (path := place / "urdf" / "ballbot.urdf").is_file()), Path("urdf/ballbot.urdf")
-)
-"""The paper's robot: `urdf/ballbot.urdf` of the checkout, which a wheel carries inside the package."""
+_PACKAGE = Path(__file__).parent
+_IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf" / "ballbot.urdf", _PACKAGE.parent / "urdf" / "ballbot.urdf"
+URDF_PATH = _IN_WHEEL if _IN_WHEEL.is_file() else _IN_CHECKOUT
+"""The URDF of the paper's robot. A wheel holds it inside the package, a checkout beside the package."""
 
 STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
 
@@ -237,10 +236,10 @@ class _Urdf:
         for name in ("ixy", "ixz", "iyz"):
             if inertia.get(name) is not None and self._number(inertia, name, where) != 0:
                 raise self.error(f"{where}: {name} must be 0")
-        moments = tuple(self._number(inertia, name, where) for name in ("ixx", "iyy", "izz"))
-        if min(moments) <= 0:
-            raise self.error(f"{where} must be positive, not {moments} kg·m²")
-        return moments
+        ixx, iyy, izz = (self._number(inertia, name, where) for name in ("ixx", "iyy", "izz"))
+        if min(ixx, iyy, izz) <= 0:
+            raise self.error(f"{where} must be positive, not {(ixx, iyy, izz)} kg·m²")
+        return ixx, iyy, izz
 
     def com_height(self, link: str) -> float:
         origin = self._child("link", link, "inertial/origin")

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium
 import numpy as np
@@ -29,6 +29,7 @@ class Controller(Protocol):
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         """Force (2,) N to hold until the next control step. What exceeds the limit is clipped by the robot."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def rollout(
     Raises:
         Exception: whatever the controller's `reset` raises, as a PlanError where no plan exists.
     """
-    ballbot: BallbotEnv = env.unwrapped
+    ballbot = cast(BallbotEnv, env.unwrapped)
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     _, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]

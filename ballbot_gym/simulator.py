@@ -30,6 +30,7 @@ class Simulator(Protocol):
 
     def step(self, u: tuple[float, float]) -> State:
         """Holds force u, N, for one control step and returns the state after it."""
+        ...
 
     def close(self) -> None:
         """Releases what the simulator holds; may be called again."""

@@ -121,13 +121,15 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
+        before = self.batch.state
+        if before is None:
+            raise gymnasium.error.ResetNeeded("step() before reset()")
         actions = np.asarray(actions, self._dtype, order="F")  # components contiguous, as everything in the batch
         if actions.shape != (self.num_envs, 2):
             raise ValueError(f"actions must have shape ({self.num_envs}, 2), not {actions.shape}")
         if not np.isfinite(actions).all():
             bad = np.flatnonzero(~np.isfinite(actions).all(1))
             raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
-        before = self.batch.state
         with torch.no_grad():
             result = self.batch.step(torch.from_numpy(actions).to(self.batch.device))
         reward = self._array(result.reward, np.float64)
@@ -149,7 +151,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             cost, force, clipped = cost.copy(), force.copy(), clipped.copy()
             cost[ended], force[:, ended], clipped[ended] = 0.0, 0.0, False
         never = np.zeros_like(done)
-        info = self._info(self.batch.state, cost, tilt, force.T, never, never.copy(), clipped)
+        state = self.batch.state
+        assert state is not None
+        info = self._info(state, cost, tilt, force.T, never, never.copy(), clipped)
         infos |= _masked(info, np.ones_like(done))
         return self._array(result.observation, np.float32), reward, terminated, truncated, infos
 
@@ -162,9 +166,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         return (getattr(self, name),) * self.num_envs
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """As `get_attr`, or what `render` gives for every env."""
+        """As `get_attr`, or what `render` gives for every env: None each where there is no render mode."""
         if name == "render":
-            return self.render()
+            return self.render() or (None,) * self.num_envs
         value = self.get_attr(name)
         return tuple(part(*args, **kwargs) if callable(part) else part for part in value)
 
