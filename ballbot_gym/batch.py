@@ -461,8 +461,8 @@ def tilt_of(x: tuple) -> torch.Tensor:
 
 def _seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
     """One seed per env."""
-    one = isinstance(seed, int | np.integer)
-    seeds: list[int | None] = [int(seed) + i for i in range(num_envs)] if one else list(seed)
+    seeds: list[int | None] = []
+    seeds += [int(seed) + i for i in range(num_envs)] if isinstance(seed, int | np.integer) else seed
     if len(seeds) != num_envs:
         raise ValueError(f"seed has {len(seeds)} entries for {num_envs} envs")
     for value in seeds:

@@ -223,13 +223,13 @@ class BallbotEnv(gymnasium.Env):
             )
         return x, c
 
-    def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[float]:
+    def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[Any]:
         """Drawn constants with some replaced by name."""
         names = self.task.constant_names
         unknown = sorted(set(named) - set(names))
         if unknown:
             raise ValueError(f"{self.task.id} has no constants {unknown}; it has {list(names)}")
-        return [named.get(name, value) for name, value in zip(names, c.tolist(), strict=True)]
+        return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
         if np.shape(action) != (2,):
