@@ -2,9 +2,9 @@
 
 Components come first: a batch of B states is a tensor (8, B), so that every operation runs over contiguous memory.
 
-Random numbers are those of `counter_rng`, not the numbers that `BallbotEnv` draws from NumPy's generator for the same seed.
-The same seed and actions give the same results bit by bit among eager batches, and among compiled ones of two or more envs.
-Eager, compiled, and a compiled batch of one, whose sine is another library's, agree to rounding.
+Random numbers come from `counter_rng`; `BallbotEnv` draws others, from NumPy's generator, for the same seed.
+Eager batches give bit-identical results for the same seed and actions, and so do compiled batches of two or more envs. Eager
+and compiled batches agree to rounding. So does a compiled batch of one env, which computes sines with another library.
 """
 
 import logging
@@ -26,7 +26,7 @@ from ballbot_gym.tasks import Task
 _log = logging.getLogger(__name__)
 
 COMPILE_FROM = 1024
-"""Batch size from which compile="auto" compiles: below, compiling for half a minute seldom pays."""
+"""Batch size from which compile="auto" compiles. For smaller batches half a minute of compiling seldom pays."""
 
 _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The fields of `BatchStep` that are bools."""
@@ -64,10 +64,10 @@ class _Rows(NamedTuple):
 
 
 class BatchStep(NamedTuple):
-    """What one control step of B environments gave. Environments whose episode ended have started the next one."""
+    """The result of one control step of B environments. Environments whose episode ended have started the next one."""
 
     observation: torch.Tensor
-    """(B, no) observations; of ended episodes, the next one's first."""
+    """(B, no) observations. Where an episode ended, the first one of the next episode."""
     reward: torch.Tensor
     """(B,) −cost of the step."""
     terminated: torch.Tensor
@@ -89,7 +89,7 @@ class BatchStep(NamedTuple):
     final_tilt: torch.Tensor
     """(B,) rad, of `final_x`; carries no gradient."""
     tilt: torch.Tensor
-    """(B,) rad, of the states that follow: `final_x`, or where an episode ended the next one's start; no gradient."""
+    """(B,) rad, of `final_x`, or where an episode ended of the next one's initial state; carries no gradient."""
 
 
 class BatchEpisodes(NamedTuple):
@@ -110,7 +110,10 @@ class BatchEpisodes(NamedTuple):
 
 
 class _Robot(NamedTuple):
-    """What `dynamics` reads of `BallbotParams`, whose cached properties take a lock that torch.compile cannot."""
+    """The parameters that `dynamics` reads, as plain values.
+
+    torch.compile cannot trace the cached properties of `BallbotParams`, because they take a lock.
+    """
 
     total_mass: Any
     first_moment: Any
@@ -150,9 +153,9 @@ class BallbotBatch:
             task: a name in `TASKS`, or a Task.
             num_envs: B.
             device, dtype: of all tensors; torch.float32 or torch.float64.
-            compile: True compiles `transition` at the first step, for half a minute or so, and raises where that fails;
-                "auto" does so for batches of at least `COMPILE_FROM` where a compiler is found, and falls back to eager
-                execution with a warning in the log; False never compiles.
+            compile: True compiles `transition` at the first step, for half a minute or so, and raises if that fails.
+                "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
+                warning and runs eagerly. False never compiles.
             params: the nominal robot; default, the paper's.
             randomization: what varies; default, nothing.
             **task_fields: fields of the task that replace its defaults.
@@ -184,7 +187,7 @@ class BallbotBatch:
 
     @property
     def compiled(self) -> bool:
-        """Whether `step` runs compiled code; settled after the first step."""
+        """Whether `step` runs compiled code. It can change once, at the first step, where compiling fails."""
         return self._run != self.transition
 
     def reset(
@@ -197,10 +200,11 @@ class BallbotBatch:
         """Starts episodes.
 
         Args:
-            seed: an int seeds env i with seed + i, a sequence env i with seed[i], where it is not None. Without one, each
-                env goes on to its next episode, or is seeded at random the first time.
-            mask: (B,) bool, the envs to reset; default, all. All are reset the first time.
-            x: (8, B) initial states and c: (nc, B) constants; default, drawn. They are not checked.
+            seed: an int seeds env i with seed + i; a sequence seeds env i with seed[i]. An env without a seed starts its
+                next episode; the first time it is seeded at random.
+            mask: (B,) bool, the envs to reset; default, all. The first time all are reset.
+            x: (8, B) initial states; default, drawn. They are not checked.
+            c: (nc, B) constants; default, drawn. They are not checked.
 
         Returns:
             (B, no) observations of all envs.
@@ -231,7 +235,7 @@ class BallbotBatch:
         return self._stacked(new if old is None else _select(mask, new, _rows(old)))
 
     def observe(self, state: BatchState) -> torch.Tensor:
-        """(B, no) observations of a state: a pure function, the sensors' noise included."""
+        """(B, no) observations of a state, with the sensors' noise. A pure function."""
         return self._observe(_rows(state))
 
     def step(self, actions: torch.Tensor) -> BatchStep:
@@ -252,7 +256,7 @@ class BallbotBatch:
         return result._replace(**{name: getattr(result, name).bool() for name in _FLAGS}) if self.compiled else result
 
     def detach(self) -> None:
-        """Cuts the gradient: later steps do not reach back behind this point."""
+        """Cuts the gradient: gradients of later steps do not flow into earlier ones."""
         if self.state is not None:
             self.state = BatchState(*(part.detach() for part in self.state))
 
@@ -261,7 +265,8 @@ class BallbotBatch:
 
         Args:
             state: of the batch.
-            actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1]. They are taken to be finite.
+            actions: (B, 2) forces in units of the robot's force limit, clipped to [−1, 1]. That they are finite is not
+                checked.
         """
         task, noise = self.task, self.randomization
         now = _rows(state)
@@ -412,12 +417,14 @@ def _has_compiler(device: torch.device) -> bool:
 
 
 def _compiled(transition: Any) -> Any:
-    """The bound method compiled, from a copy of its code: PyTorch limits recompilations per code object, and here every
-    batch size and task is one.
+    """The bound method, compiled.
+
+    A copy of its code is compiled, because PyTorch limits the recompilations of a code object, and each batch size and task
+    needs one.
     """
     function = transition.__func__
     own = types.FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
-    # By default no loop takes more than 64 operations, and what crosses from one loop to the next goes through memory.
+    # By default a loop holds at most 64 operations, and results pass from one loop to the next through memory.
     options: dict[str, Any] = {"max_fusion_size": 1000}
     return torch.compile(types.MethodType(own, transition.__self__), fullgraph=True, dynamic=False, options=options)
 

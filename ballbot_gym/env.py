@@ -1,4 +1,4 @@
-"""BallbotEnv: Gymnasium's interface over a task and a simulator, and nothing else."""
+"""BallbotEnv: Gymnasium's interface to a task and a simulator."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from ballbot_gym.tasks import TASKS, Task
 
 
 class BallbotEnv(gymnasium.Env):
-    """A ballbot that does one task. Observation, action, cost and ends are tabulated in the task's docstring.
+    """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
     The reward of a step is −cost rate · control_dt, less the task's failure cost when a margin is violated, so an
     episode's return is exactly minus its cost.
@@ -57,8 +57,8 @@ class BallbotEnv(gymnasium.Env):
             render_mode: None, "rgb_array" or "human".
             params: the robot; default, the paper's.
             physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
-            randomization: what varies; default, nothing. In Bullet each new `com_height` is a URDF loaded anew, for which
-                PyBullet takes 2 ms and 5 kB that it never gives back.
+            randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
+                and 5 kB of memory that PyBullet never frees.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -98,7 +98,7 @@ class BallbotEnv(gymnasium.Env):
         Args:
             seed: seeds the draw of this and the following episodes.
             options: may hold "state", the (8,) initial state, and "constants", the (nc,) constants of the episode or a
-                dict of some of them by name; what is not given is drawn.
+                dict of some of them by name. Everything else is drawn.
 
         Raises:
             ValueError: an unknown option, or a state or constants of the wrong shape, not finite, or unsafe.
@@ -178,7 +178,7 @@ class BallbotEnv(gymnasium.Env):
         return self.render_state(self._state)
 
     def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
-        """As `render`, but of any state x (8,): to draw a recorded trajectory among this episode's markers."""
+        """Draws any state x (8,) with this episode's markers, for instance one of a recorded trajectory."""
         if self._scene is None:
             self._scene = Scene(self.params, human=self.render_mode == "human")
             self._scene.set_markers(self.task.markers(self._constants_array))
@@ -198,7 +198,7 @@ class BallbotEnv(gymnasium.Env):
             raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
 
     def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Initial state and constants: drawn, where the options do not give them."""
+        """Initial state and constants. Those that the options do not give are drawn."""
         state, constants = options.pop("state", None), options.pop("constants", None)
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; known: 'state', 'constants'")
@@ -224,7 +224,7 @@ class BallbotEnv(gymnasium.Env):
         return x, c
 
     def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[Any]:
-        """Drawn constants with some replaced by name."""
+        """The drawn constants c, of which some are replaced by name."""
         names = self.task.constant_names
         unknown = sorted(set(named) - set(names))
         if unknown:

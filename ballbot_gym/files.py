@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Writes files so that a reader never sees half of one."""
 
 import csv
 import io

@@ -1,8 +1,8 @@
-"""The few functions that robot and tasks are written in: one source for floats, NumPy, CasADi and torch.
+"""Elementary functions for robot and tasks, which then work with floats, NumPy, CasADi and torch alike.
 
 A vector is an array whose last axis holds the components (NumPy, torch), a column (CasADi), or a tuple of components.
-A tuple's components may themselves be floats, arrays of any one shape, tensors or symbols, which is the fast layout for
-one robot in pure Python and for a batch on an accelerator alike.
+A tuple's components may be floats, arrays of one shape, tensors or symbols. This layout is fast both for one robot in pure
+Python and for a batch on an accelerator.
 """
 
 import functools
@@ -18,7 +18,7 @@ Vector = Any
 
 
 def _library(a: Any) -> ModuleType:
-    """The module that computes with `a`: already imported, because `a` exists."""
+    """The library of `a`. It is already imported, because `a` exists."""
     return sys.modules.get(type(a).__module__.partition(".")[0], np)
 
 
@@ -58,7 +58,7 @@ def clip(a: Any, low: float, high: float) -> Any:
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:
-    """a where the condition holds, else b, elementwise. Not for CasADi: what tasks ask of optimizers is smooth."""
+    """a where the condition holds, else b, elementwise. Not for CasADi, because optimizers need smooth functions."""
     if isinstance(condition, bool):
         return a if condition else b
     library = _library(condition)

@@ -13,7 +13,7 @@ URDF_PATH = _IN_WHEEL if _IN_WHEEL.is_file() else _IN_CHECKOUT
 
 STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
 
-# joint: type, axis, parent link, child link. The closed form holds for this chain and no other.
+# joint: type, axis, parent link, child link. The closed-form dynamics hold for this chain only.
 _CHAIN = {
     "x": ("prismatic", (1.0, 0.0, 0.0), "world", "slide"),
     "y": ("prismatic", (0.0, 1.0, 0.0), "slide", "ball"),
@@ -103,14 +103,16 @@ class BallbotParams:
         )
 
     def to_urdf(self) -> str:
-        """The URDF text of this robot: the packaged file with this object's numbers; `from_urdf` reads them back."""
+        """The URDF text of this robot: the packaged file with this robot's numbers. `from_urdf` reads it back exactly."""
         urdf = _Urdf(URDF_PATH)
         urdf.find("link[@name='ball']/inertial/mass").set("value", repr(self.ball_mass))
         urdf.find("link[@name='body']/inertial/mass").set("value", repr(self.body_mass))
         body_inertia = urdf.find("link[@name='body']/inertial/inertia")
         for name, value in (("ixx", self.inertia), ("iyy", self.inertia), ("izz", self.axial_inertia)):
             body_inertia.set(name, repr(value))
-        ball_inertia = 0.4 * self.ball_mass * self.ball_radius**2  # solid sphere; it has no effect, the ball translates
+        ball_inertia = (
+            0.4 * self.ball_mass * self.ball_radius**2
+        )  # of a solid sphere; has no effect: the ball does not roll
         for name in ("ixx", "iyy", "izz"):
             urdf.find("link[@name='ball']/inertial/inertia").set(name, repr(ball_inertia))
         for place in ("inertial", "visual"):
@@ -132,7 +134,7 @@ def default_params() -> BallbotParams:
 
 
 class _Urdf:
-    """A parsed URDF whose look-ups raise a `UrdfError` that names what is missing."""
+    """A parsed URDF. Its methods raise a `UrdfError` that names what is missing."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -18,7 +18,7 @@ from ballbot_gym.trajectory import Trajectory
 
 
 class PlanError(RuntimeError):
-    """A controller found no plan for the episode; the message gives each try's solver, status and constraint violation."""
+    """A controller found no plan for the episode. The message gives each attempt's solver, status and violation."""
 
 
 class Controller(Protocol):
@@ -28,7 +28,7 @@ class Controller(Protocol):
         """Starts an episode at time t, s, in state x (8,) with constants c (nc,)."""
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        """Force (2,) N to hold until the next control step. What exceeds the limit is clipped by the robot."""
+        """Force (2,) N to hold until the next control step. The robot clips it to its limit."""
         ...
 
 
@@ -46,7 +46,7 @@ class FunctionController:
 
 
 class DelayedController:
-    """Another controller whose forces act a number of control steps late, as a slow computer's do; before the first, 0."""
+    """Another controller whose forces are applied some control steps late, like those of a slow computer; at first 0."""
 
     def __init__(self, controller: Controller, steps: int):
         self._controller, self._steps = controller, steps
@@ -92,8 +92,9 @@ class ActionController:
 class Episode:
     """One episode under one controller.
 
-    `trajectory` holds the applied forces; `cost` is minus the return; `settle_time` the time from which on the goal held
-    until the end, s, or NaN; `act_seconds` the median wall time of `act`.
+    `trajectory` holds the applied forces. `cost` is minus the return. From `settle_time`, s, the goal held until the end; it
+    is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`, `act_seconds` its
+    median wall time in `act`.
     """
 
     trajectory: Trajectory
@@ -118,12 +119,12 @@ def rollout(
 
     Args:
         env: a BallbotEnv, wrapped or not; its wrappers are bypassed.
-        controller: gets the state as the env's sensors report it: the true one, unless its randomization has noise.
+        controller: gets the state as the env's sensors report it. Without sensor noise this is the true state.
         seed: as for `env.reset`.
         options: as for `env.reset`.
 
     Raises:
-        Exception: whatever the controller's `reset` raises, as a PlanError where no plan exists.
+        Exception: what the controller's `reset` raises, for instance a PlanError where it found no plan.
     """
     ballbot = cast(BallbotEnv, env.unwrapped)
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
@@ -160,7 +161,7 @@ def rollout(
 
 
 def _sensed(env: BallbotEnv, x: np.ndarray) -> np.ndarray:
-    """State x (8,) with the noise of the env's sensors, drawn from the env's generator, anew at each call."""
+    """State x (8,) with the noise of the env's sensors. Each call draws new noise from the env's generator."""
     if not env.randomization.is_noisy:
         return x
     z = tuple(env.np_random.random(Randomization.NOISE_DRAWS).tolist())
@@ -175,7 +176,7 @@ def simulate(
     control_dt: float = 0.02,
     physics: str = "bullet",
 ) -> Trajectory:
-    """Runs a controller without a task: from state x0 (8,) for duration s, forces clipped to the robot's limit."""
+    """Runs a controller without a task, from state x0 (8,) for `duration` s. Forces are clipped to the robot's limit."""
     simulator = PHYSICS[physics](params, control_dt)
     x = np.asarray(x0, np.float64)
     simulator.reset(tuple(x.tolist()))

@@ -1,4 +1,4 @@
-"""What a task is: one finite-horizon optimal-control problem that env, experts, optimizer and leaderboard all read."""
+"""Task: the one definition of an optimal-control problem that env, experts, optimizer and leaderboard use."""
 
 import math
 from abc import ABC, abstractmethod
@@ -15,10 +15,10 @@ from ballbot_gym.tasks.marker import Marker
 
 @dataclass(frozen=True)
 class Reference:
-    """A steady motion that linear control regulates towards, one point per control step: x (n, 8) and u (n, 2).
+    """A steady motion that linear control tracks, one point per control step: x (n, 8) and u (n, 2).
 
-    An open reference is followed in time and its last point kept; a single point is an equilibrium. A closed one repeats
-    for ever, and whoever follows it may join at any point.
+    An open reference is tracked in time, and after its end its last point. A single point is an equilibrium. A closed
+    reference repeats for ever, and a controller may begin at any of its points.
     """
 
     x: np.ndarray
