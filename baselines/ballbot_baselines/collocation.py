@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver, no_final_path
 from ballbot_baselines.optimum import FEASIBLE
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
@@ -138,7 +138,7 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
         cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
         equalities=lambda s, w, p: casadi.vertcat(defect(s, w), path(problem.equalities, s)),
         inequalities=lambda s, w, p: path(problem.inequalities, s),
-        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else None,
+        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_final_path,
         final_inequalities=lambda s, p: path(problem.inequalities, s),
         initial_matrix=initial,
     )
