@@ -3,9 +3,9 @@
     minimize    Σ_j cost(x_j, u_j, c)·h_j + ρ Σ_j s_j + V(x_N)        over u_j, |u_j| ≤ limit, and slacks s_j ≥ 0
     subject to  x_{j+1} = step(x_j, u_j, h_j),   margins(x_j, c) + s_j ≥ back-off,   x_0 the (predicted) state
 
-The plan of the whole episode, found at `reset`, supplies what lies beyond the horizon: V(x) ≈ λᵀ(x − x̄) + (x − x̄)ᵀP(x − x̄)
-about the plan's state x̄ at the horizon's end, with λ the plan's costate (the multiplier of its dynamics) and P the TVLQR
-cost-to-go along it. So on the plan the horizon changes nothing, whatever the task, and off it the step is a Newton step.
+`reset` plans the whole episode. The plan gives the cost beyond the horizon: V(x) ≈ λᵀ(x − x̄) + (x − x̄)ᵀP(x − x̄) about the
+plan's state x̄ at the horizon's end. λ is the plan's costate (the multiplier of its dynamics), and P is TVLQR's cost-to-go
+along the plan. So a robot on the plan stays on it, and a robot off the plan takes a Newton step.
 
 Every iteration linearizes dynamics and margins about the last solution, shifted by one control step, and solves one
 quadratic program by HPIPM: the sequential quadratic programming of Diehl et al., "A real-time iteration scheme for nonlinear
@@ -33,11 +33,11 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan: half of TrajoptController's for the goal
-_SLACK_PRICE = 100.0  # per unit of a violated margin and node: above what any violation gains
-_MARGINS = 2  # per node, the nearest to being violated: the others are far off, and each costs time
+_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan; for the goal it is half of TrajoptController's
+_SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
+_MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
-_LEAST_CURVATURE = 1e-6  # of inputs whose interval has shrunk to nothing
+_LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
 _QP_ITERATIONS = 30
 
@@ -141,8 +141,8 @@ class HorizonQp:
     """The quadratic program of one iteration, for N intervals; arrays are allocated once and filled in place.
 
     Variables are changes δa_0, δx_1, δa_1, s_1, … δx_N: x_0 is known and no variable, inputs a are fractions of the force
-    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins; x_N, at which
-    CasADi's interface allows no slack, has none.
+    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins. The last stage
+    has no margins, because CasADi's interface allows no slack there.
     """
 
     def __init__(self, task: Task, params: BallbotParams, nodes: int):
@@ -254,7 +254,7 @@ class HorizonQp:
         """Linearizes about (x, a), solves, and puts the solution into x[1:] and a, if there is one.
 
         Args:
-            margin: what margins keep from 0, in their own units.
+            margin: least value of the task's margins, in their own units.
         """
         x, a = self.x, self.a
         self._stage()
@@ -391,7 +391,7 @@ class NmpcController:
         return u
 
     def _missed_goal(self, t: float, x: np.ndarray) -> bool:
-        """Whether the plan's time is over before a first-exit goal was reached, and there is a plan that still does."""
+        """Whether the plan is over, the first-exit goal is not reached, and a new plan to it was found."""
         if not self._task.first_exit or self._lost:
             return False
         self.counts.replans += 1
@@ -412,7 +412,7 @@ class NmpcController:
         return np.asarray(x, np.float64)
 
     def _advance(self, elapsed: int) -> None:
-        """Shifts the last solution to now. It is kept as a deviation from the plan, which stays small and smooth."""
+        """Shifts the last solution to now. It is stored as its deviation from the plan, which is small and smooth."""
         for _ in range(elapsed - self._step):
             self._dx, self._da = self._shift_states @ self._dx, self._shift_inputs @ self._da
         self._step = elapsed
@@ -425,7 +425,7 @@ class NmpcController:
         self._a_plan = (self._sums[at[1:]] - self._sums[at[:-1]]) / np.maximum(self._lengths, 1)[:, None]
 
     def _solve(self, x: np.ndarray, began: float) -> bool:
-        """Whether a solution for state x is there in time; it is then in the program's x and a."""
+        """Whether a solution for state x was found in time. It is then in the program's x and a."""
         qp, counts = self._qp, self.counts
         counts.steps += 1
         self._load(x)
@@ -439,7 +439,7 @@ class NmpcController:
             found = True
             if self._iterations == 1 or np.abs(qp.a - before).max() < self._tolerance:
                 break
-            # after the first, one more iteration takes at most as long as all so far
+            # One more iteration takes at most as long as all iterations so far.
             if self._deadline is not None and time.perf_counter() - began > 0.5 * self._deadline:
                 counts.cut += 1
                 break
@@ -449,7 +449,7 @@ class NmpcController:
         if not found:
             counts.failed += 1
             return False
-        # A late solution is no use to this step, but it is the next one's start.
+        # A late solution is not used in this step, but the next step starts from it.
         self._dx, self._da = qp.x - self._x_plan, qp.a[:-1] - self._a_plan
         if self._deadline is not None and time.perf_counter() - began > self._deadline:
             counts.late += 1
@@ -533,7 +533,7 @@ def _stages(array: np.ndarray, first: int, count: int, width: int) -> tuple[np.n
 
 
 class _InPlace:
-    """A function that reads and writes given arrays: a call through `casadi.DM` costs as much as its work."""
+    """A function that reads and writes given arrays. A call through `casadi.DM` would take twice as long."""
 
     def __init__(self, function: casadi.Function, inputs: list[np.ndarray], outputs: list[np.ndarray]):
         self._buffer = function.buffer()[0]

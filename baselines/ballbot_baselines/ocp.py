@@ -6,8 +6,8 @@
                 bounds on s_k and w_k
 
 Every problem of this package has this form: shooting on the env's discretization, and Hermite–Simpson collocation with
-the next knot as input. The solvers see only stage functions and their derivatives, compiled once (`compiled.py`), so time
-and memory grow linearly with N.
+the next knot as input. `nlp.py` builds the nonlinear program and its derivatives from stage functions, which are compiled
+once (`compiled.py`). So time and memory grow linearly with N.
 """
 
 import time
@@ -24,7 +24,9 @@ from ballbot_baselines.nlp import Stage, StagedNlp
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
 
-_DAMPING = 1e-8  # of the Newton step toward consistency, where constraints repeat each other or have nothing to move
+_DAMPING = (
+    1e-8  # of the Newton step toward consistency, for constraints that repeat each other or have no free variables
+)
 
 
 def no_path(s: casadi.SX, w: casadi.SX, p: casadi.SX) -> casadi.SX:
@@ -70,7 +72,7 @@ class Ocp:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lower and upper bounds: states (N+1, ns) and inputs (N, nw); ±inf where there is none."""
+    """Lower and upper bounds of states (N+1, ns) and inputs (N, nw); ±inf means no bound."""
 
     state_lower: np.ndarray
     state_upper: np.ndarray
@@ -88,9 +90,9 @@ class Bounds:
 class OcpSolution:
     """What a solver returned. Look at `success` before anything else.
 
-    `states` is (N+1, ns), `inputs` (N, nw), `violation` the largest amount by which a constraint or bound is missed, in
-    the constraint's unit, and `seconds` the wall time of this solve. `costates` (N, ns) are the slopes of the optimal cost
-    with respect to s_1 … s_N, had the episode begun there: the multipliers of the dynamics.
+    `states` is (N+1, ns) and `inputs` is (N, nw). `violation` is the largest amount by which a constraint or bound is
+    missed, in the constraint's unit. `seconds` is the wall time of this solve. `costates` (N, ns) are the multipliers of the
+    dynamics: row k is the slope, with respect to s_{k+1}, of the optimal cost from stage k+1 on.
     """
 
     success: bool
@@ -206,17 +208,16 @@ class OcpSolver:
     def toward_consistency(
         self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A guess moved by the shortest Newton step toward all equality constraints, the dynamics first of all.
+        """A guess moved by the shortest Newton step toward all equality constraints.
 
-        For guesses that are consistent with nothing, as a straight line between two states: the step bends them into about
-        the nearest motion. Guesses that obey the constraints stay where they are. The step takes about as long as one or two
-        iterations.
+        Use it for guesses that violate the dynamics, such as a straight line between two states: the step bends them toward
+        the nearest motion. Guesses that obey the constraints do not change. The step takes as long as one or two iterations.
 
         Args:
             states: as `solve` takes them.
             inputs: as `solve` takes them.
             p: as `solve` takes them.
-            bounds: variables whose bounds are equal do not move from them; the others end within theirs.
+            bounds: as `solve` takes them; variables with equal bounds do not change.
 
         Returns:
             states (N+1, ns) and inputs (N, nw).
@@ -238,7 +239,7 @@ class OcpSolver:
         return np.vstack([stages[:, :ns], z[self.intervals * width :]]), stages[:, ns:].copy()
 
     def _costates(self, multipliers: np.ndarray) -> np.ndarray:
-        # Constraints are s_{k+1} − next_k = 0: raising their right-hand side moves s_{k+1}, and costs minus the multiplier.
+        # Constraints are s_{k+1} − next_k = 0. The cost's slope with respect to the right-hand side is minus the multiplier.
         first = self._rows + self._initials + self._rows * np.arange(-1, self.intervals - 1)
         first[0] = 0
         return -multipliers[first[:, None] + np.arange(self.ocp.states)]
@@ -250,7 +251,7 @@ def _equality(equalities: int, constraints: int) -> list[bool]:
 
 
 def _least_norm(matrix: scipy.sparse.csr_array, right: np.ndarray) -> np.ndarray:
-    """The shortest v with matrix v = right, but for `_DAMPING`; stage-wise rows make matrix·matrixᵀ a band."""
+    """The shortest v with matrix v = right, up to `_DAMPING`. Rows stand stage by stage, so matrix·matrixᵀ is banded."""
     normal = (matrix @ matrix.T).tocoo()
     below = normal.row >= normal.col
     row, col, values = normal.row[below], normal.col[below], normal.data[below]
