@@ -5,7 +5,6 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from ballbot_baselines import certification
-from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
@@ -34,26 +33,21 @@ def certify(
     with progress_bar() as progress, get_context("spawn").Pool(workers) as pool:
         for name in tasks:
             bar = progress.add_task(name, total=episodes)
-            optima = []
+            entries = []
             for index, result in enumerate(pool.imap(_certify_one, [(name, i) for i in range(episodes)], chunksize=5)):
                 progress.advance(bar)
-                if isinstance(result, str):
-                    failed.append(f"{name} episode {index}: {result}")
+                if "error" in result:
+                    failed.append(f"{name} episode {index}: {result['error']}")
                 else:
-                    optima.append(result)
-            if len(optima) == episodes:
+                    entries.append(result)
+            if len(entries) == episodes:
                 task = make_task(name)
                 path = certified.path_of(task) if out is None else out / certified.path_of(task).name
-                certification.evaluation_set(task, default_params(), optima).save(task, path)
+                certification.evaluation_set(task, default_params(), entries).save(task, path)
                 progress.console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     if failed:
         raise PlanError("no optimum for\n" + "\n".join(failed))
 
 
-def _certify_one(job: tuple[str, int]) -> Optimum | str:
-    """The optimum, or the message of why there is none: an exception would end the pool."""
-    task, params = make_task(job[0]), default_params()
-    try:
-        return find_optimum(task, params, *certification.episode(task, params, job[1]))
-    except PlanError as error:
-        return str(error)
+def _certify_one(job: tuple[str, int]) -> certification.Entry:
+    return next(certification.entries(job[0], [job[1]]))

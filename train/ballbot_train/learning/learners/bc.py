@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning.demonstrations import load_demos
-from ballbot_train.learning.learners.shac import equilibrium_gain
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 

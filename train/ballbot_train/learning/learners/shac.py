@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
-from ballbot_baselines.lqr import discrete_lqr
+from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -118,20 +117,6 @@ class Critic(torch.nn.Module):
             error = observation[..., :8]
             scale = ((error @ self.p) * error).sum(-1) + 1e-3
         return torch.nn.functional.softplus(self.mlp(observation)[..., 0] + _SOFTPLUS_ONE) * scale
-
-
-def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:
-    """LQR's action per observation (2, 8) and cost-to-go per squared observation (8, 8), or None.
-
-    None where the task has no equilibrium to rest at, whose errors are the first eight observations.
-    """
-    x, c = task.sample(np.random.default_rng(0), params)
-    reference = task.reference(x, c, params)
-    if task.first_exit or len(reference.x) > 1 or np.abs(np.asarray(task.observe(reference.x[0], c))[:8]).max() > 0:
-        return None
-    k, p = discrete_lqr(task, params, reference.x[0], reference.u[0], c)
-    scale = np.array(task.observation_scale[:8])
-    return -k * scale / params.force_limit, p * np.outer(scale, scale)
 
 
 class Shac:
