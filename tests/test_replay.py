@@ -12,17 +12,9 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
+from ballbot_train.report.film import film_frames, film_times, write_film
 from ballbot_train.report.perspective import Camera, body_axis
-from ballbot_train.report.replay import (
-    Replay,
-    Take,
-    certified_replay,
-    file_replay,
-    film_frames,
-    film_times,
-    with_ghosts,
-)
-from ballbot_train.report.replay import write_film as write
+from ballbot_train.report.replay import Replay, Take, certified_replay, file_replay, with_ghosts
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
 
@@ -81,7 +73,7 @@ def test_a_film_is_drawn_the_same_whatever_came_before(two_takes):
 
 @pytest.mark.parametrize("ending", ["mp4", "gif"])
 def test_a_film_is_read_back_with_its_frames_and_duration(two_takes, tmp_path, ending):
-    path = write(two_takes, tmp_path / f"film.{ending}", seconds=1.0, fps=10, width=320)
+    path = write_film(two_takes, tmp_path / f"film.{ending}", seconds=1.0, fps=10, width=320)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     with imageio.get_reader(path) as reader:
         frames = list(reader.iter_data())
@@ -96,7 +88,7 @@ def test_a_film_that_is_interrupted_leaves_nothing(two_takes, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write(two_takes, tmp_path / "film.mp4", seconds=1.0, width=320, on_frame=interrupt)
+        write_film(two_takes, tmp_path / "film.mp4", seconds=1.0, width=320, on_frame=interrupt)
     assert list(tmp_path.iterdir()) == []
 
 
