@@ -5,7 +5,7 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import imageio.v2 as imageio
 import numpy as np
@@ -92,7 +92,7 @@ def _mp4(pictures: Iterator[np.ndarray], fps: int, path: Path) -> bytes:
         try:
             with imageio.get_writer(unfinished, **options) as writer:
                 for picture in pictures:
-                    writer.append_data(picture)
+                    writer.append_data(picture)  # pyright: ignore[reportAttributeAccessIssue]
         except RuntimeError as error:  # imageio-ffmpeg raises it if its wheel brought no ffmpeg
             raise OSError(f"{path}: cannot encode: {error}") from error
         return unfinished.read_bytes()
@@ -107,7 +107,7 @@ def _animation(pictures: Iterator[np.ndarray], fps: int, ending: str) -> bytes:
         # One palette without dithering: pixels that do not move stay equal from frame to frame, which keeps the file small.
         palette = images[-1].quantize(_GIF_COLORS)
         images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-        options: dict[str, object] = {"format": "GIF", "optimize": True}
+        options: dict[str, Any] = {"format": "GIF", "optimize": True}
     else:
         options = {"format": "WEBP", "quality": 75, "method": 4}
     buffer = io.BytesIO()

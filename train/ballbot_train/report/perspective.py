@@ -7,6 +7,7 @@ first.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,6 +32,9 @@ _BALL = (0.16, 0.18, 0.23)
 _FORCE = (0.85, 0.1, 0.55)
 _FORCE_SCALE = 1 / 400  # m/N of the arrow
 _ANGLES = np.linspace(0, 2 * math.pi, 28, endpoint=False)
+
+Rgb = tuple[float, float, float]
+Rgba = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -81,9 +85,11 @@ class PerspectiveView:
         axis.set_facecolor("#fbfbfa")
         for spine in axis.spines.values():
             spine.set_color("0.85")
-        self._floor = axis.add_collection(PolyCollection([], lw=0))
-        self._lines = axis.add_collection(LineCollection([], capstyle="round"))
-        self._solids = axis.add_collection(PolyCollection([], lw=0.3))
+        self._floor = PolyCollection([], lw=0)
+        self._lines = LineCollection([], capstyle="round")
+        self._solids = PolyCollection([], lw=0.3)
+        for collection in (self._floor, self._lines, self._solids):
+            axis.add_collection(collection)
         self._solids.set_snap(False)  # snapping makes the edges of thin upright bodies wavy
         self.artists = (self._floor, self._lines, self._solids)
 
@@ -119,11 +125,13 @@ class PerspectiveView:
         places, depth = camera.project(corners)
         seen = (depth > _NEAR).all(axis=1)
         fade = np.clip(1 - depth[seen].mean(axis=1) / (_FLOOR_REACH + 2), 0, 1)
-        self._floor.set_verts(places[seen])
+        self._floor.set_verts(list(places[seen]))
         self._floor.set_facecolor([(0.80, 0.83, 0.88, 0.8 * share) for share in fade])
 
     def _draw_lines(self, camera: Camera, paths: Sequence[GroundPath]) -> None:
-        lines = [(path.points, to_rgb(path.color), "--" if path.dashed else "-", 2.2) for path in paths]
+        lines: list[tuple[np.ndarray, Sequence[float], Any, float]] = [
+            (path.points, to_rgb(path.color), "--" if path.dashed else "-", 2.2) for path in paths
+        ]
         for marker in self._markers:
             if marker.ring:
                 around = marker.radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
@@ -144,7 +152,7 @@ class PerspectiveView:
         self._lines.set_linewidth(widths)
 
 
-Face = tuple[np.ndarray, tuple[float, ...]]
+Face = tuple[np.ndarray, Rgba]
 """A polygon (n, 2) of the picture and its colour, RGBA."""
 
 
@@ -215,10 +223,10 @@ def _cylinder(
             normal = normals[k] + normals[after]
             if normal @ (camera.eye - low) > 2 * radius:
                 side = np.array([rings[0][k], rings[0][after], rings[1][after], rings[1][k]])
-                faces.append((side, (*_shaded(color, normal @ _LIGHT / np.linalg.norm(normal)), 1.0)))
+                faces.append((side, (*_shaded(color, float(normal @ _LIGHT / np.linalg.norm(normal))), 1.0)))
     for end, ring, outward in ((low, rings[0], -axis), (high, rings[1], axis)):
         if outward @ (camera.eye - end) > 0:
-            faces.append((ring, (*_shaded(color, 0.3 + outward @ _LIGHT), alpha)))
+            faces.append((ring, (*_shaded(color, float(0.3 + outward @ _LIGHT)), alpha)))
     return depth, faces
 
 
@@ -247,12 +255,13 @@ def _hull(points: np.ndarray) -> np.ndarray:
     return points[ConvexHull(points, qhull_options="QJ").vertices]
 
 
-def _shaded(color: Sequence[float], light: float) -> tuple[float, ...]:
+def _shaded(color: Sequence[float], light: float) -> Rgb:
     """The colour, darker or lighter by the `light` that falls on it, 0 to 1."""
     return _lighter(color, -0.2 + 0.45 * min(max(light, 0.0), 1.0))
 
 
-def _lighter(color: Sequence[float], share: float) -> tuple[float, ...]:
+def _lighter(color: Sequence[float], share: float) -> Rgb:
     """The colour mixed with white, or with black if share < 0."""
     target = 1.0 if share > 0 else 0.0
-    return tuple(float(value + abs(share) * (target - value)) for value in color)
+    red, green, blue = (float(value + abs(share) * (target - value)) for value in color)
+    return red, green, blue

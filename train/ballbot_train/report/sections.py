@@ -105,7 +105,7 @@ def learning_section(runs: Path) -> Section | None:
         learner = str(described.get("learner"))
         again = any(line.label.startswith(f"{learner}:") for line in lines)
         shade = labels.color("" if again else learner, len(lines))
-        lines.append(Line(f"{learner}: {path.parent.name}", *finite.T, shade))
+        lines.append(Line(f"{learner}: {path.parent.name}", finite[:, 0], finite[:, 1], shade))
     panels = [
         Panel(task, "training, s", "regret, %", [line for line in lines if len(line.x)], log_y=True)
         for task, lines in tasks.items()
