@@ -10,13 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import NmpcController
@@ -130,7 +126,8 @@ def _csv(pushes: list[Push]) -> str:
 
 
 def _figure(pushes: list[Push], path: Path) -> None:
-    figure, axis = plt.subplots(figsize=(6, 6), layout="constrained", subplot_kw={"projection": "polar"})
+    figure = Figure(figsize=(6, 6), layout="constrained")
+    axis = figure.subplots(subplot_kw={"projection": "polar"})
     for name, (color, _) in CONTROLLERS.items():
         mine = [push for push in pushes if push.controller == name]
         bearings = np.radians([push.bearing for push in [*mine, mine[0]]])
@@ -139,7 +136,6 @@ def _figure(pushes: list[Push], path: Path) -> None:
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

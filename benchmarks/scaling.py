@@ -5,13 +5,9 @@ import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from ballbot_baselines.collocation import Guess, solve
 from ballbot_baselines.guess import along_path, cubic_hermite
@@ -102,7 +98,8 @@ def _csv(points: list[Point]) -> str:
 
 
 def _figure(points: list[Point], path: Path) -> None:
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots(1, 2)
     for name in dict.fromkeys(point.problem for point in points):
         chosen = [point for point in points if point.problem == name]
         n = [point.intervals for point in chosen]
@@ -117,7 +114,6 @@ def _figure(points: list[Point], path: Path) -> None:
     axes[0].legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

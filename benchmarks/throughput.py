@@ -16,12 +16,9 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import gymnasium
-import matplotlib
 import numpy as np
 import tyro
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 from ballbot_gym import TASKS, BallbotEnv
 from ballbot_gym.params import default_params
@@ -226,7 +223,8 @@ def _resident() -> float:
 
 
 def _plot(rows: list[Row], path: Path) -> None:
-    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
     curves: dict[str, list[Row]] = {}
     for row in rows:
         if row.what != "soak" and row.steps_per_second > 0:
@@ -239,7 +237,6 @@ def _plot(rows: list[Row], path: Path) -> None:
     axes.grid(which="major", alpha=0.3)
     axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
     figure.savefig(path, dpi=150)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

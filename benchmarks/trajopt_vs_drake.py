@@ -14,13 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.planning import DirectCollocation
@@ -224,7 +220,8 @@ def _csv(rows: list[Timing]) -> str:
 
 def _figure(rows: list[Timing], path: Path) -> None:
     problems = list(dict.fromkeys(row.problem for row in rows))
-    figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
     groups = list(dict.fromkeys((row.program, row.guess) for row in rows))
     colors = ("#c0392b", "#1f6fb2", "#e6a9a0", "#93bfe0")
     for i, group in enumerate(groups):
@@ -236,7 +233,6 @@ def _figure(rows: list[Timing], path: Path) -> None:
     axis.grid(axis="y", alpha=0.3)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":
