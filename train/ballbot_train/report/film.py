@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from ballbot_gym import files
+from ballbot_gym import dynamics, files
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
 from ballbot_train.report.perspective import GroundPath, PerspectiveView, Robot
@@ -257,4 +257,4 @@ def _drawstyle(trajectory: Trajectory) -> str:
 
 def _tilt(x: np.ndarray) -> float:
     """In degrees."""
-    return math.degrees(math.acos(min(1.0, math.cos(x[2]) * math.cos(x[3]))))
+    return math.degrees(dynamics.tilt(x))

@@ -1,7 +1,7 @@
 """Episodes to look at: the same episode under several controllers, as trajectories with labels. `film` draws them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +55,7 @@ class Replay:
     title: str
     takes: tuple[Take, ...]
     markers: tuple[Marker, ...] = ()
-    params: BallbotParams = default_params()
+    params: BallbotParams = field(default_factory=default_params)
 
     @property
     def duration(self) -> float:
