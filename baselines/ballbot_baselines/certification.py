@@ -1,15 +1,18 @@
 """Computes the certified evaluation sets that `ballbot_gym.certified` loads."""
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import Optimum, find_optimum
+from ballbot_baselines.optimum import find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
 
 
 def episode(task: Task, params: BallbotParams, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -17,25 +20,44 @@ def episode(task: Task, params: BallbotParams, index: int) -> tuple[np.ndarray, 
     return task.sample(np.random.default_rng([zlib.crc32(task.id.encode()), index]), params)
 
 
-def solve_episodes(task: Task, params: BallbotParams, indices: range) -> Iterator[tuple[int, Optimum | PlanError]]:
-    """The optimum of each episode, or the error that says why there is none."""
+def entries(task_name: str, indices: Sequence[int]) -> Iterator[dict[str, Any]]:
+    """The optimum of each episode as one JSON entry, or {"error": why there is none}.
+
+    The entries of the first `TRAJECTORIES` episodes hold the whole trajectory under "x" and "u".
+    """
+    task, params = make_task(task_name), default_params()
     for index in indices:
         x0, c = episode(task, params, index)
         try:
-            yield index, find_optimum(task, params, x0, c)
+            optimum = find_optimum(task, params, x0, c)
         except PlanError as error:
-            yield index, error
+            yield {"error": str(error)}
+            continue
+        entry = {
+            "cost": optimum.cost,
+            "duration": optimum.trajectory.duration,
+            "violation": optimum.violation,
+            "status": f"{optimum.solver}: {optimum.status}",
+        }
+        if index < TRAJECTORIES:
+            entry |= {"x": optimum.trajectory.x.tolist(), "u": optimum.trajectory.u.tolist()}
+        yield entry
 
 
-def evaluation_set(task: Task, params: BallbotParams, optima: list[Optimum]) -> EvaluationSet:
-    """The set of the first episodes, given all their optima in order."""
-    episodes = [episode(task, params, index) for index in range(len(optima))]
+def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Mapping[str, Any]]) -> EvaluationSet:
+    """The set of the first episodes, given the entries of all of them in order."""
+    episodes = [episode(task, params, index) for index in range(len(entries))]
+
+    def trajectory(entry: Mapping[str, Any]) -> Trajectory:
+        x, u = np.array(entry["x"]), np.array(entry["u"])
+        return Trajectory(task.control_dt * np.arange(len(x)), x, u)
+
     return EvaluationSet(
         states=np.array([x for x, _ in episodes]),
         constants=np.array([c for _, c in episodes]),
-        costs=np.array([optimum.cost for optimum in optima]),
-        durations=np.array([optimum.trajectory.duration for optimum in optima]),
-        violations=np.array([optimum.violation for optimum in optima]),
-        statuses=np.array([f"{optimum.solver}: {optimum.status}" for optimum in optima]),
-        trajectories=tuple(optimum.trajectory for optimum in optima[:TRAJECTORIES]),
+        costs=np.array([entry["cost"] for entry in entries]),
+        durations=np.array([entry["duration"] for entry in entries]),
+        violations=np.array([entry["violation"] for entry in entries]),
+        statuses=np.array([entry["status"] for entry in entries]),
+        trajectories=tuple(trajectory(entry) for entry in entries[:TRAJECTORIES]),
     )

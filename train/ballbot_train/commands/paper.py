@@ -12,8 +12,7 @@ from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import rollout, simulate
-from ballbot_train.console import console, print_table
-from ballbot_train.evaluation import evaluate
+from ballbot_train.console import check_names, console, print_table
 from ballbot_train.report import figures
 
 _PAPER_CONTROL_DT = 0.01  # s, at which the paper's plans are tracked
@@ -27,7 +26,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         out: folder of the figures and plans.
         only: names of some of the problems; default all.
     """
-    evaluate.check_names("problem", list(only), PAPER_PROBLEMS)
+    check_names("problem", list(only), PAPER_PROBLEMS)
     params = default_params()
     rows = []
     for name in only or PAPER_PROBLEMS:
