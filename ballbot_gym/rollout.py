@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium
 import numpy as np
@@ -13,6 +13,7 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 
@@ -28,6 +29,7 @@ class Controller(Protocol):
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         """Force (2,) N to hold until the next control step. What exceeds the limit is clipped by the robot."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,34 @@ class DelayedController:
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         self._pending.append(self._controller.act(t, x))
         return self._pending.pop(0)
+
+
+class ActionController:
+    """A function from observation to action as a Controller. It gets the observations that the env would show.
+
+    This is the one place where an observation is turned into a force.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray]):
+        """Wraps a function.
+
+        Args:
+            task: what is observed.
+            params: the robot, whose force limit is the unit of actions.
+            action: gets an observation (no,) float32 and whether an episode begins; returns an action (2,) in [−1, 1].
+        """
+        self._task, self._params, self._action = task, params, action
+        self._c: tuple[float, ...] = ()
+        self._begins = True
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
+        action = np.asarray(self._action(observation, self._begins), np.float64)
+        self._begins = False
+        return self._params.force_limit * action
 
 
 @dataclass(frozen=True)
@@ -95,7 +125,7 @@ def rollout(
     Raises:
         Exception: whatever the controller's `reset` raises, as a PlanError where no plan exists.
     """
-    ballbot: BallbotEnv = env.unwrapped
+    ballbot = cast(BallbotEnv, env.unwrapped)
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     _, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]

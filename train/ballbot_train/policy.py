@@ -19,6 +19,7 @@ import torch
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.policy_files import (
     OBSERVATION_VERSION,
@@ -48,7 +49,7 @@ _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.S
 
 
 class PolicyNetwork(torch.nn.Module):
-    """action = squash(W o + MLP(o)): a linear part, which LQR can start, and a network that bends it.
+    """action = squash(W o + MLP(o)): the sum of a linear part, which LQR's gain can initialize, and a network.
 
     Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit.
     """
@@ -73,23 +74,16 @@ class PolicyNetwork(torch.nn.Module):
 
     def raw(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 2) before it is squashed."""
-        bent = self.mlp(observation)
-        return bent if self.linear is None else bent + self.linear(observation)
+        output = self.mlp(observation)
+        return output if self.linear is None else output + self.linear(observation)
 
 
-class PolicyController:
+class PolicyController(ActionController):
     """A policy as a Controller of forces, and with Stable-Baselines3's `predict` of actions."""
 
     def __init__(self, task: Task, params: BallbotParams, network: PolicyNetwork):
-        self._task, self._params, self._network = task, params, network.eval()
-        self._c: tuple[float, ...] = ()
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._c = tuple(np.asarray(c, np.float64).tolist())
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
-        return self._params.force_limit * self.predict(observation)[0].astype(np.float64)
+        super().__init__(task, params, lambda observation, begins: self.predict(observation)[0])
+        self._network = network.eval()
 
     def predict(
         self,

@@ -5,7 +5,7 @@ Importing this module is light: torch is imported for policy files, CasADi for e
 
 import math
 import numbers
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,31 +15,10 @@ from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.rollout import Controller, PlanError, rollout
+from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.results import Result, Row, summarize
-
-
-class ActionController:
-    """What maps observations to actions in [−1, 1]² as a Controller: it sees what the env would show it.
-
-    `act` of the wrapped function gets (observation, whether the episode begins).
-    """
-
-    def __init__(self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray]):
-        self._task, self._params, self._action = task, params, action
-        self._c: tuple[float, ...] = ()
-        self._begins = True
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
-        action = np.asarray(self._action(observation, self._begins), np.float64)
-        self._begins = False
-        return self._params.force_limit * action
 
 
 def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
@@ -69,7 +48,7 @@ def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
 
 
 class _Predictor:
-    """An SB3 model's deterministic action, with its recurrent state and the normalization that it was trained with."""
+    """An SB3 model's deterministic action. It keeps the recurrent state, and normalizes observations as in training."""
 
     def __init__(self, model: Any):
         self._model, self._state = model, None
