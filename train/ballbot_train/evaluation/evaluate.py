@@ -5,9 +5,9 @@ Importing this module is light: torch is imported for policy files, CasADi for e
 
 import math
 import numbers
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -41,7 +41,8 @@ def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
     if callable(getattr(policy, "predict", None)):
         return ActionController(task, params, _Predictor(policy))
     if callable(policy):
-        return ActionController(task, params, lambda observation, begins: policy(observation))
+        function = cast(Callable[[np.ndarray], np.ndarray], policy)
+        return ActionController(task, params, lambda observation, begins: function(observation))
     raise TypeError(
         f"{policy!r} is no policy: give a Controller, a model with predict, a function of the observation, a name or a file"
     )
@@ -110,9 +111,10 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
         TypeError: they are no whole numbers.
     """
     if isinstance(episodes, numbers.Integral):
-        if not 1 <= episodes <= available:
-            raise ValueError(f"episodes must be 1 to {available}, or a list of indices, not {episodes}")
-        return list(range(int(episodes)))
+        count = int(episodes)
+        if not 1 <= count <= available:
+            raise ValueError(f"episodes must be 1 to {available}, or a list of indices, not {count}")
+        return list(range(count))
     if not isinstance(episodes, Iterable):
         raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
     indices = list(episodes)
@@ -160,12 +162,25 @@ def iterate_episodes(
     episode_set = certified.load(env.task)
     for i in episodes:
         optimum = float(episode_set.costs[i])
-        common = {"task": task, "controller": name, "episode": i, "physics": env.physics, "optimum": optimum}
+        common: dict[str, Any] = {
+            "task": task,
+            "controller": name,
+            "episode": i,
+            "physics": env.physics,
+            "optimum": optimum,
+        }
         try:
             run = rollout(env, controller, seed=seed + i, options=episode_set.options(i))
         except PlanError as error:
-            outcome = {"cost": env.task.failure_cost, "success": False, "failure": True, "note": str(error)}
-            measures = dict.fromkeys(("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), math.nan)
+            outcome: dict[str, Any] = {
+                "cost": env.task.failure_cost,
+                "success": False,
+                "failure": True,
+                "note": str(error),
+            }
+            measures: dict[str, Any] = dict.fromkeys(
+                ("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), math.nan
+            )
         else:
             outcome = {"cost": run.cost, "success": run.success, "failure": run.failure}
             measures = {

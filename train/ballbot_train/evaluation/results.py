@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -137,17 +137,18 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
 
 
 def _from_json(entry: Mapping[str, Any]) -> Result:
-    result = Result(**{key: math.nan if value is None else value for key, value in entry.items()})
+    values: dict[str, Any] = {key: math.nan if value is None else value for key, value in entry.items()}
+    result = Result(**values)
     for field in fields(Result):
-        value = getattr(result, field.name)
-        if not isinstance(value, (int, float) if field.type is float else field.type):
+        value, kind = getattr(result, field.name), cast(Any, field.type)
+        if not isinstance(value, (int, float) if kind is float else kind):
             raise TypeError(f"{field.name} of an episode is {value!r}")
     return result
 
 
 def _from_csv(entry: Mapping[str, str]) -> Result:
     truths = {"True": True, "False": False}
-    read = {str: str, int: int, float: float, bool: truths.__getitem__}
+    read: dict[Any, Any] = {str: str, int: int, float: float, bool: truths.__getitem__}
     kinds = {field.name: read[field.type] for field in fields(Result)}
     return Result(**{key: kinds[key](value) for key, value in entry.items()})
 
