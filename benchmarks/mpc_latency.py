@@ -4,11 +4,9 @@ Times are of one process, and include everything between state and force. Run it
 busy one are the scheduler's.
 """
 
-import csv
-import io
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -130,17 +128,9 @@ def main(
             f"regret {row.regret_percent:+.2f} %, {row.failed} failed, {row.falls} falls",
             flush=True,
         )
-    files.write(out / "mpc_latency.csv", _csv(rows))
+    files.write_csv(out / "mpc_latency.csv", [asdict(row) for row in rows])
     _figure(rows, out / "mpc_latency.png")
     print(f"written to {out}")
-
-
-def _csv(rows: list[Latency]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(rows[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(row) for row in rows)
-    return text.getvalue()
 
 
 def _figure(rows: list[Latency], path: Path) -> None:

@@ -4,10 +4,8 @@ At rest, the body is hit at its centre of mass by a horizontal impulse. LQR and 
 still. Re-planning knows the pushed state and takes the time it takes.
 """
 
-import csv
-import io
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -112,17 +110,9 @@ def main(out: Path = Path("runs/push_sweep"), bearings: int = 24, resolution: fl
             pushes.append(Push(name, float(np.degrees(bearing)), near))
         mine = [push.impulse for push in pushes if push.controller == name]
         print(f"{name:16s} survives {min(mine):.0f} to {max(mine):.0f} N·s, median {np.median(mine):.0f}", flush=True)
-    files.write(out / "push_sweep.csv", _csv(pushes))
+    files.write_csv(out / "push_sweep.csv", [asdict(push) for push in pushes])
     _figure(pushes, out / "push_sweep.png")
     print(f"written to {out}")
-
-
-def _csv(pushes: list[Push]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(pushes[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(push) for push in pushes)
-    return text.getvalue()
 
 
 def _figure(pushes: list[Push], path: Path) -> None:

@@ -1,8 +1,6 @@
 """Solve time against the number of intervals, 20 to 640: with stage-wise structure it grows linearly."""
 
-import csv
-import io
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +75,7 @@ def main(out: Path = Path("runs/scaling"), repeats: int = 5, quick: bool = False
             )
     for name in dict.fromkeys(point.problem for point in points):
         print(f"{name}: time per iteration grows as intervals^{exponent(points, name):.2f}")
-    files.write(out / "scaling.csv", _csv(points))
+    files.write_csv(out / "scaling.csv", [asdict(point) for point in points])
     _figure(points, out / "scaling.png")
     print(f"written to {out}")
 
@@ -87,14 +85,6 @@ def exponent(points: list[Point], problem: str) -> float:
     chosen = [point for point in points if point.problem == problem]
     logs = np.log([(point.intervals, point.per_iteration) for point in chosen])
     return float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0])
-
-
-def _csv(points: list[Point]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(points[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(point) for point in points)
-    return text.getvalue()
 
 
 def _figure(points: list[Point], path: Path) -> None:

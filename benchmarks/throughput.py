@@ -4,7 +4,6 @@ Random actions, resets included, one measurement after another, each in a proces
 the extra `[bench]`; what is not installed is said so in the table.
 """
 
-import csv
 import importlib.util
 import os
 import resource
@@ -20,7 +19,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballbot_gym import TASKS, BallbotEnv
+from ballbot_gym import TASKS, BallbotEnv, files
 from ballbot_gym.params import default_params
 from ballbot_gym.simulator import BulletSimulator
 
@@ -75,10 +74,7 @@ def main(
             f" {row.first_step_seconds:7.2f} s to the first step  {row.note}",
             flush=True,
         )
-        with (out / "throughput.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(asdict(rows[0])))
-            writer.writeheader()
-            writer.writerows(asdict(row) for row in rows)
+        files.write_csv(out / "throughput.csv", [asdict(row) for row in rows])
     _plot(rows, out / "throughput.png")
     print(f"written: {out / 'throughput.csv'}, {out / 'throughput.png'}")
 

@@ -5,13 +5,11 @@ cost summed over knots), from the same guesses. Equal optima are asserted. Build
 solving, for both. Needs the [bench] extra: `pip install -e ".[bench]"`.
 """
 
-import csv
-import io
 import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +70,7 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
     summary = ratios(rows)
     for line in summary:
         print(line)
-    files.write(out / "trajopt_vs_drake.csv", _csv(rows))
+    files.write_csv(out / "trajopt_vs_drake.csv", [asdict(row) for row in rows])
     files.write(out / "trajopt_vs_drake.txt", "\n".join([*map(_line, rows), *summary]) + "\n")
     _figure(rows, out / "trajopt_vs_drake.png")
     print(f"written to {out}")
@@ -208,14 +206,6 @@ def _line(row: Timing) -> str:
         f"{row.problem:12s} {row.guess:14s} {row.program:16s} J* {row.cost:9.4f}  build {1e3 * row.build_s:7.1f} ms  "
         f"cold {1e3 * row.cold_s:8.2f} ms  warm {1e3 * row.warm_s:8.2f} ms"
     )
-
-
-def _csv(rows: list[Timing]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(rows[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(row) for row in rows)
-    return text.getvalue()
 
 
 def _figure(rows: list[Timing], path: Path) -> None:

@@ -11,8 +11,7 @@ import numpy as np
 from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import console, progress_bar
-from ballbot_train.evaluation import evaluate
+from ballbot_train.console import check_names, console, progress_bar
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
 
@@ -43,7 +42,7 @@ def demos(
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
         workers: processes.
     """
-    evaluate.check_names("task", [task], TASKS)
+    check_names("task", [task], TASKS)
     config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed)
     out = Path("runs") / "demos" / f"{task}-{expert}-v0" if out is None else out
     with progress_bar() as progress:

@@ -9,8 +9,7 @@ from ballbot_baselines.collocation import Plan
 from ballbot_baselines.paper import PAPER_PROBLEMS, PaperProblem
 from ballbot_baselines.paper_experiments import TRACKING_DT, compare_stabilization, track_plan
 from ballbot_gym.params import default_params
-from ballbot_train.console import console, print_table
-from ballbot_train.evaluation import evaluate
+from ballbot_train.console import check_names, console, print_table
 from ballbot_train.report import figures
 
 
@@ -21,7 +20,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         out: folder of the figures and plans.
         only: names of some of the problems; default all.
     """
-    evaluate.check_names("problem", list(only), PAPER_PROBLEMS)
+    check_names("problem", list(only), PAPER_PROBLEMS)
     params = default_params()
     rows = []
     for name in only or PAPER_PROBLEMS:

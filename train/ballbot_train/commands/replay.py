@@ -6,8 +6,7 @@ from typing import Literal
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import console, progress_bar
-from ballbot_train.evaluation import evaluate
+from ballbot_train.console import check_names, console, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
 from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_ghosts
 
@@ -80,8 +79,8 @@ def _read(
         return file_replay(paths), "-".join(path.stem for path in paths)
     _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
     task = source[0]
-    evaluate.check_names("task", [task], TASKS)
-    evaluate.check_names("expert", [ghost_by], CONTROLLERS)
+    check_names("task", [task], TASKS)
+    check_names("expert", [ghost_by], CONTROLLERS)
     _check(bool(controllers), "give at least one controller")
     shown = certified_replay(task, controllers, episode, physics)
     name = f"{task}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"

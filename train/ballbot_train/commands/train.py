@@ -12,12 +12,11 @@ import torch
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import console
-from ballbot_train.evaluation import evaluate
+from ballbot_train.console import check_names, console
 from ballbot_train.learning import training
 from ballbot_train.learning.demonstrations import command_of
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy import load_network, read_about
+from ballbot_train.policy import load_network, read_description
 
 
 def train(
@@ -45,8 +44,8 @@ def train(
         out: folder of the run; default runs/train/TASK-LEARNER.
         resume: continue the run in this folder, if there is one.
     """
-    evaluate.check_names("learner", [learner], LEARNERS)
-    evaluate.check_names("task", [task], TASKS)
+    check_names("learner", [learner], LEARNERS)
+    check_names("task", [task], TASKS)
     algorithm, problem = LEARNERS[learner], make_task(task)
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
@@ -59,7 +58,7 @@ def train(
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
     if start is not None:
-        command = f"{read_about(start)['training']['command']} && {command}"
+        command = f"{read_description(start)['training']['command']} && {command}"
     config = {
         "learner": learner,
         "task": task,
@@ -88,7 +87,7 @@ def _changed(settings: Any, changes: dict[str, str]) -> Any:
         ValueError: a setting of that name does not exist, or cannot take that value.
     """
     kinds = typing.get_type_hints(type(settings))
-    evaluate.check_names("setting", list(changes), [field.name for field in fields(settings)])
+    check_names("setting", list(changes), [field.name for field in fields(settings)])
     typed = {}
     for name, text in changes.items():
         kind = kinds[name]

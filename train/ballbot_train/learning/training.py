@@ -33,9 +33,10 @@ from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import Task
-from ballbot_train.console import about, console, progress_bar
+from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
+from ballbot_train.provenance import provenance
 
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
 
@@ -154,7 +155,7 @@ class _Run:
             differing = [key for key in self.config if old.get(key) != json.loads(json.dumps(self.config[key]))]
             if differing:
                 raise ValueError(f"{out} holds a run with another {', '.join(differing)}; give another --out")
-        files.write(written, json.dumps(self.config | {"about": about()}, indent=1) + "\n")
+        files.write(written, json.dumps(self.config | {"about": provenance()}, indent=1) + "\n")
         if (out / "checkpoint.pt").exists():
             # weights_only: tensors and plain values, nothing that runs
             state = torch.load(out / "checkpoint.pt", weights_only=True)

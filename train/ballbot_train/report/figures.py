@@ -17,7 +17,7 @@ from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.basins import AXES, BasinMap
-from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.robustness import NONE, STRESSES, StressRow, curve_of
 from ballbot_train.report.labels import COLORS as COLORS
 from ballbot_train.report.labels import LABELS, color, label

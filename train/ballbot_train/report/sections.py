@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.results import Result
 from ballbot_train.report import figures, labels
 from ballbot_train.report.page import (
     Line,
