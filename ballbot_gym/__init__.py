@@ -23,4 +23,5 @@ for _name, _task in TASKS.items():
         # imported, with torch, when first used
         vector_entry_point="ballbot_gym.vector:BallbotVectorEnv",
         kwargs={"task": _name},
+        reward_threshold=_task.reward_threshold,
     )

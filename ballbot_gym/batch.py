@@ -69,7 +69,9 @@ class BatchStep(NamedTuple):
     observation: torch.Tensor
     """(B, no) observations. Where an episode ended, the first one of the next episode."""
     reward: torch.Tensor
-    """(B,) −cost of the step."""
+    """(B,) of the step: survival_reward · control_dt less the running cost, and the pay of a first exit; see `Task`."""
+    cost: torch.Tensor
+    """(B,) of the step, a failure's price included."""
     terminated: torch.Tensor
     """(B,) bool."""
     truncated: torch.Tensor
@@ -81,7 +83,9 @@ class BatchStep(NamedTuple):
     success: torch.Tensor
     """(B,) bool: the episode ended in the goal."""
     failure: torch.Tensor
-    """(B,) bool: the episode ended at a violated margin."""
+    """(B,) bool: the episode ended at a violated limit."""
+    violated: torch.Tensor
+    """(B,) int64 index in `task.limit_names` of the first limit violated, else −1."""
     force: torch.Tensor
     """(2, B) N, what the actuator applied."""
     clipped: torch.Tensor
@@ -253,7 +257,10 @@ class BallbotBatch:
             self._run = self.transition
             self.state, result = self._run(state, actions)
         self._proven = True
-        return result._replace(**{name: getattr(result, name).bool() for name in _FLAGS}) if self.compiled else result
+        if self.compiled:
+            flags = {name: getattr(result, name).bool() for name in _FLAGS}
+            result = result._replace(violated=result.violated.long(), **flags)
+        return result
 
     def detach(self) -> None:
         """Cuts the gradient: gradients of later steps do not flow into earlier ones."""
@@ -268,6 +275,11 @@ class BallbotBatch:
             actions: (B, 2) forces in units of the robot's force limit, clipped to [−1, 1]. That they are finite is not
                 checked.
         """
+        state, result = self._transition(state, actions)
+        return state, result._replace(violated=result.violated.long())
+
+    def _transition(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
+        """`transition` with `violated` as a number of the batch's dtype."""
         task, noise = self.task, self.randomization
         now = _rows(state)
         x, c = now.x, now.c
@@ -286,27 +298,34 @@ class BallbotBatch:
 
         rate = task.cost(x, force, c)
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
-        safe, reached = all_of(m >= 0 for m in task.margins(end, c)), all_of(g <= 0 for g in task.goal(end, c))
-        failure = ~safe  # so that a state that is not finite fails
+        violated = first_below_zero(task.limits(end, c))
+        failure, reached = violated >= 0, all_of(g <= 0 for g in task.goal(end, c))
+        safe = ~failure
         steps = state.steps + 1
         last = steps >= task.steps
         success = safe & reached if task.first_exit else safe & reached & last
         terminated = failure | success if task.first_exit else failure
         truncated = last & ~terminated
         done = terminated | truncated
-        cost = rate * task.control_dt + task.failure_cost * failure
+        running, survive = rate * task.control_dt, task.survival_reward * task.control_dt
+        ahead = survive * (task.steps - steps).to(self.dtype)  # for the time that remains
+        reward = survive - running
+        if task.first_exit:
+            reward = reward + ahead * success
 
         after = now._replace(x=end, steps=steps, actuator=actuator)
         new = _select(done, self._start(state.seed, state.episode + 1), after)
         result = BatchStep(
             observation=self._observe(new),
-            reward=-cost,
+            reward=reward,
+            cost=running + ahead * failure,
             terminated=terminated,
             truncated=truncated,
             final_observation=self._observe(after),
             final_x=torch.stack(end),
             success=success,
             failure=failure,
+            violated=violated,
             force=torch.stack(force),
             clipped=any_of(part.abs() > 1.0 for part in asked),
             final_tilt=tilt_of(end),
@@ -316,7 +335,7 @@ class BallbotBatch:
 
     def _compilable(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
         """`transition` with its flags as numbers 0 and 1: torch's CPU code generator stores bools one by one."""
-        state, result = self.transition(state, actions)
+        state, result = self._transition(state, actions)
         numbers = {name: torch.where(getattr(result, name), 1.0, 0.0) for name in _FLAGS}
         return state, result._replace(**numbers)
 
@@ -450,6 +469,14 @@ def all_of(conditions: Any) -> torch.Tensor:
     first, *others = conditions
     for condition in others:
         first = first & condition
+    return first
+
+
+def first_below_zero(values: tuple) -> torch.Tensor:
+    """(B,) index of the first value that is not ≥ 0, so of NaN too, in the values' dtype; −1 where all are."""
+    first = torch.full_like(values[0], -1.0)
+    for i in reversed(range(len(values))):
+        first = torch.where(values[i] >= 0, first, float(i))
     return first
 
 

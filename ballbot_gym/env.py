@@ -1,13 +1,14 @@
 """BallbotEnv: Gymnasium's interface to a task and a simulator."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams, default_params
@@ -20,18 +21,23 @@ from ballbot_gym.tasks import TASKS, Task
 class BallbotEnv(gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
-    The reward of a step is −cost rate · control_dt, less the task's failure cost when a margin is violated, so an
-    episode's return is exactly minus its cost.
+    The reward of a step is `task.survival_reward` · control_dt less what the step cost. A failure ends the episode, and its
+    last step costs survival_reward for every second not lived. So for every episode return + cost = `task.survival_pay`,
+    and the best return is the least cost; see `Task`.
 
     `info` has, after `reset` and each `step`:
 
     | key | meaning |
     |---|---|
     | state | (8,) float64 state x; order and units in `dynamics.STATE` |
-    | cost | what this step cost: −reward (0 after `reset`) |
+    | cost | what this step cost, a failure's price included (0 after `reset`) |
+    | reward_survive | part of the reward: survival_reward · control_dt |
+    | reward_cost | part of the reward: −cost rate · control_dt |
+    | reward_goal | part of the reward: survival_reward for every second that remained at the first exit, else 0 |
     | tilt | rad, between the body's axis and the vertical |
     | success | the task's goal holds at the end of the episode |
-    | failure | a margin is violated: the robot fell or touched something |
+    | failure | a limit is violated: the robot fell, touched something or left the arena |
+    | violated | the name of that limit, one of `task.limit_names`, as "tilt", "arena" or "obstacle 2"; else "" |
     | force | (2,) N, applied in this step (0 after `reset`) |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
@@ -66,6 +72,7 @@ class BallbotEnv(gymnasium.Env):
             TypeError: a keyword that is no field of the task.
             ImportError: physics="bullet" without a usable PyBullet.
         """
+        self._spec: EnvSpec | None = None
         self._scene: Scene | None = None
         self._state: State = ()  # until the first reset
         if physics not in PHYSICS:
@@ -78,12 +85,11 @@ class BallbotEnv(gymnasium.Env):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        limit = self.task.OBSERVATION_LIMIT
         self.randomization = Randomization() if randomization is None else randomization
         self._disturbance = (
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )
-        self.observation_space = spaces.Box(-limit, limit, (len(self.task.observation_scale),), np.float32)
+        self.observation_space = observation_space(self.task, self.params)
         self._simulator = PHYSICS[physics](self.params, self.task.control_dt, physics_dt)
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
@@ -118,7 +124,7 @@ class BallbotEnv(gymnasium.Env):
             self._scene.set_markers(self.task.markers(self._constants_array))
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._info(0.0, (0.0, 0.0), False, False, False)
+        return self._observation(), self._info(0.0, _NO_REWARD, (0.0, 0.0), False, "", False)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -141,26 +147,37 @@ class BallbotEnv(gymnasium.Env):
         if self._disturbance is not None:
             force = self._disturbance.actuate(force)
             total = self._disturbance.pushed(force, self.np_random)
-        cost = task.cost(self._state, force, c) * task.control_dt
+        running = task.cost(self._state, force, c) * task.control_dt
         self._state = x = self._simulator.step(total)
         self._steps_left -= 1
-        failure = not task.is_safe(x, c)
-        if failure:
-            cost += task.failure_cost
+        violated = task.violated(x, c)
+        failure = violated != ""
         last = self._steps_left == 0
         success = not failure and (last or task.first_exit) and task.is_goal(x, c)
         terminated = failure or (success and task.first_exit)
+        survive = task.survival_reward * task.control_dt
+        ahead = survive * self._steps_left  # for the time that remains
+        reward = (survive, -running, ahead if terminated and success else 0.0)
         if terminated:
             self._steps_left = 0
         if self.render_mode == "human":
             self.render()
         return (
             self._observation(),
-            -cost,
+            sum(reward),
             terminated,
             last and not terminated,
-            self._info(cost, force, success, failure, clipped),
+            self._info(running + ahead * failure, reward, force, success, violated, clipped),
         )
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The registered spec, with the number of control steps of this env's episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec_of(spec, self.task)
 
     @property
     def episode_params(self) -> BallbotParams:
@@ -213,8 +230,8 @@ class BallbotEnv(gymnasium.Env):
         x = np.array(task.draw_state(tuple(draws[task.constant_draws :]), tuple(c.tolist()), self.params), np.float64)
         if state is not None:
             x = _finite_vector(state, 8, "state")
-        margins = task.margins(tuple(x.tolist()), tuple(c.tolist()))
-        violated = [name for name, margin in zip(task.margin_names, margins, strict=True) if not margin >= 0]
+        limits = task.limits(tuple(x.tolist()), tuple(c.tolist()))
+        violated = [name for name, limit in zip(task.limit_names, limits, strict=True) if not limit >= 0]
         if violated:
             values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
             raise ValueError(
@@ -250,18 +267,58 @@ class BallbotEnv(gymnasium.Env):
         return np.array(self.task.observe(x, self._constants), np.float32)
 
     def _info(
-        self, cost: float, force: tuple[float, float], success: bool, failure: bool, clipped: bool
+        self,
+        cost: float,
+        reward: tuple[float, float, float],
+        force: tuple[float, float],
+        success: bool,
+        violated: str,
+        clipped: bool,
     ) -> dict[str, Any]:
+        """`reward` holds its parts."""
         return {
             "state": np.array(self._state),
             "cost": cost,
+            **dict(zip(REWARD_PARTS, reward, strict=True)),
             "tilt": dynamics.tilt(self._state),
             "success": success,
-            "failure": failure,
+            "failure": violated != "",
+            "violated": violated,
             "force": np.array(force),
             "clipped": clipped,
             "constants": self._constants_array.copy(),
         }
+
+
+REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
+"""Keys of `info` whose values add up to the reward."""
+
+_NO_REWARD = (0.0, 0.0, 0.0)
+
+_REPLACED = {
+    "failure_cost": "a failure now costs survival_reward for every second not lived: give survival_reward (1/s) instead"
+}
+"""Arguments that are no more, and what to do."""
+
+
+def observation_space(task: Task, params: BallbotParams) -> spaces.Box:
+    """What a robot can observe in a task."""
+    bounds = np.array(task.observation_bounds(params), np.float32)
+    return spaces.Box(-bounds, bounds, dtype=np.float32)
+
+
+def spec_of(spec: EnvSpec | None, task: Task) -> EnvSpec | None:
+    """A registered spec as tools shall read it of an env: with the env's own number of control steps, whatever duration
+    was asked for, and without a reward threshold where another problem or another pay makes it meaningless.
+
+    Episodes are truncated by the envs themselves, so no `TimeLimit` is registered: it would cut longer durations.
+    """
+    if spec is None:
+        return None
+    kind = type(task)()
+    usual = task.problem() == kind.problem() and task.survival_reward == kind.survival_reward
+    threshold = spec.reward_threshold if usual else None
+    return dataclasses.replace(spec, max_episode_steps=task.steps, reward_threshold=threshold)
 
 
 def make_task(task: str | Task, **task_fields: Any) -> Task:
@@ -277,7 +334,9 @@ def make_task(task: str | Task, **task_fields: Any) -> Task:
         return task
     if task not in TASKS:
         raise ValueError(f"unknown task {task!r}; known: {', '.join(map(repr, TASKS))}")
-    known = {field.name for field in fields(TASKS[task])}
+    known = {field.name for field in dataclasses.fields(TASKS[task])}
+    for name in task_fields.keys() & _REPLACED.keys():
+        raise TypeError(f"{TASKS[task].id} has no argument {name}; {_REPLACED[name]}")
     unknown = sorted(set(task_fields) - known)
     if unknown:
         raise TypeError(f"{TASKS[task].id} has no argument {', '.join(unknown)}; it has {', '.join(sorted(known))}")

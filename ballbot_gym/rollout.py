@@ -92,7 +92,7 @@ class ActionController:
 class Episode:
     """One episode under one controller.
 
-    `trajectory` holds the applied forces. `cost` is minus the return. From `settle_time`, s, the goal held until the end; it
+    `trajectory` holds the applied forces. `cost` includes a failure's price. From `settle_time`, s, the goal held until the end; it
     is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`, `act_seconds` its
     median wall time in `act`.
     """
@@ -140,10 +140,10 @@ def rollout(
         start = time.perf_counter()
         u = controller.act(len(forces) * dt, seen)
         act_seconds.append(time.perf_counter() - start)
-        _, reward, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
+        _, _, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
         x, done = info["state"], terminated or truncated
         seen = _sensed(ballbot, x)
-        cost -= reward
+        cost += info["cost"]
         states.append(x)
         forces.append(info["force"])
         settled.append(task.is_goal(tuple(x), tuple(c)))

@@ -8,10 +8,12 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ballbot_gym.batch import BallbotBatch, BatchState, all_of, tilt_of
+from ballbot_gym.env import REWARD_PARTS, observation_space, spec_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.scene import Scene
@@ -54,16 +56,27 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'rgb_array'")
+        self._spec: EnvSpec | None = None
         self.batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, **task_fields)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
-        limit = self.task.OBSERVATION_LIMIT
         self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.single_observation_space = spaces.Box(-limit, limit, (len(self.task.observation_scale),), np.float32)
+        self.single_observation_space = observation_space(self.task, self.params)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._limit_names = np.array(("", *self.task.limit_names), dtype=object)
+        self._survive = self.task.survival_reward * self.task.control_dt
         self._scene: Scene | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The registered spec, with the number of control steps of these envs' episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec_of(spec, self.task)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -103,9 +116,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         infos = self._info(
             state,
             np.zeros(size),
+            np.zeros((3, size)),
             self._array(tilt_of(state.x.unbind(0))),
             np.zeros((size, 2)),
-            *np.zeros((3, size), bool),
+            np.zeros(size, bool),
+            np.full(size, -1),
+            np.zeros(size, bool),
         )
         return self._array(observation, np.float32), _masked(infos, mask)
 
@@ -136,24 +152,29 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         terminated, truncated = self._array(result.terminated), self._array(result.truncated)
         done = terminated | truncated
         ended = np.flatnonzero(done)
-        cost, tilt = -reward, self._array(result.tilt)
+        cost, tilt = self._array(result.cost, np.float64), self._array(result.tilt)
+        parts = np.stack([np.full(self.num_envs, self._survive), -cost, np.zeros(self.num_envs)])
         force, clipped = self._array(result.force), self._array(result.clipped)
         infos: dict[str, Any] = {}
         if ended.size:
-            success, failure = self._array(result.success), self._array(result.failure)
+            success, violated = self._array(result.success), self._array(result.violated)
+            failed = np.flatnonzero(violated >= 0)
+            parts[1, failed] = reward[failed] - self._survive  # the cost has a failure's price too
+            if self.task.first_exit:
+                parts[2, ended] = (reward - parts[0] - parts[1])[ended] * success[ended]
             final = before._replace(x=result.final_x)
             final_tilt = self._array(result.final_tilt)
-            final_info = self._info(final, cost, final_tilt, force.T, success, failure, clipped)
+            final_info = self._info(final, cost, parts, final_tilt, force.T, success, violated, clipped)
             infos["final_info"] = _masked(final_info, done)
             infos["final_obs"] = _some_rows(self._array(result.final_observation, np.float32), ended)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
-            cost, force, clipped = cost.copy(), force.copy(), clipped.copy()
-            cost[ended], force[:, ended], clipped[ended] = 0.0, 0.0, False
-        never = np.zeros_like(done)
+            cost, parts, force, clipped = cost.copy(), parts.copy(), force.copy(), clipped.copy()
+            cost[ended], parts[:, ended], force[:, ended], clipped[ended] = 0.0, 0.0, 0.0, False
+        running = np.full(self.num_envs, -1)
         state = self.batch.state
         assert state is not None
-        info = self._info(state, cost, tilt, force.T, never, never.copy(), clipped)
+        info = self._info(state, cost, parts, tilt, force.T, np.zeros_like(done), running, clipped)
         infos |= _masked(info, np.ones_like(done))
         return self._array(result.observation, np.float32), reward, terminated, truncated, infos
 
@@ -226,10 +247,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self,
         state: BatchState,
         cost: np.ndarray,
+        reward_parts: np.ndarray,
         tilt: np.ndarray,
         force: np.ndarray,
         success: np.ndarray,
-        failure: np.ndarray,
+        violated: np.ndarray,
         clipped: np.ndarray,
     ) -> dict[str, Any]:
         """An info with the keys of `BallbotEnv`'s, in the same order. Arrays that share the batch's memory are read-only."""
@@ -238,9 +260,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         return {
             "state": x,
             "cost": cost,
+            **dict(zip(REWARD_PARTS, reward_parts, strict=True)),
             "tilt": tilt,
             "success": success,
-            "failure": failure,
+            "failure": violated >= 0,
+            "violated": self._limit_names[violated + 1],
             "force": force,
             "clipped": clipped,
             "constants": c,
@@ -266,10 +290,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
         x = torch.as_tensor(_finite(given, (self.num_envs, 8), "state").T.astype(self._dtype, order="C"))
         x = torch.where(torch.from_numpy(mask), x, state.x.cpu()).to(self.batch.device)
-        safe = self._array(all_of(m >= 0 for m in self.task.margins(x.unbind(0), state.c.unbind(0))))
+        safe = self._array(all_of(m >= 0 for m in self.task.limits(x.unbind(0), state.c.unbind(0))))
         if not safe[mask].all():
             bad = np.flatnonzero(mask & ~safe)
-            raise ValueError(f"start states of envs {bad[:8].tolist()} violate a margin of {self.task.id}")
+            raise ValueError(f"start states of envs {bad[:8].tolist()} violate a limit of {self.task.id}")
         return state._replace(x=x)
 
 

@@ -39,7 +39,7 @@ def test_every_episode_can_be_started_and_is_certified(task, evaluation, make_en
     assert evaluation.violations.max() < 1e-6
     assert all(status.endswith("Solve_Succeeded") for status in evaluation.statuses)
     assert (evaluation.costs > 0).all()
-    assert (evaluation.costs < task.failure_cost).all()
+    assert (evaluation.costs < task.survival_pay).all()
     assert (evaluation.durations <= task.duration + 1e-9).all()
 
 
@@ -124,7 +124,7 @@ def test_set_survives_saving(task, evaluation, tmp_path):
 
 
 def test_set_of_other_fields_is_refused(task):
-    other = replace(task, failure_cost=2 * task.failure_cost)
+    other = replace(task, duration=2 * task.duration)
     with pytest.raises(certified.CertificateError, match=rf"{task.id}\.npz was computed for"):
         certified.load(other)
 

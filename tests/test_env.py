@@ -13,6 +13,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ballbot_gym import BallbotEnv
+from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.scene import Scene
 from ballbot_gym.simulator import PHYSICS
@@ -82,21 +83,27 @@ def test_stable_baselines3_checker_has_no_complaint(task, physics):
         env.close()
 
 
-# --- the return is minus the cost ---
+# --- return and cost ---
 
 
-def test_return_is_minus_the_cost_recomputed_from_states_and_forces(task, physics, make_env, rng):
+def test_return_and_cost_recomputed_from_states_and_forces_add_up_to_the_survival_pay(task, physics, make_env, rng):
     env = make_env(task, physics=physics)
     for seed in range(3):
         _, info = env.reset(seed=seed)
-        x, c, cost, total = info["state"], info["constants"], 0.0, 0.0
+        x, c, cost, total, lived = info["state"], info["constants"], 0.0, 0.0, 0.0
         for reward, *_, info in play(env, rng.uniform(-1.2, 1.2, (task.steps, 2))):
-            cost += task.cost(x, info["force"], c) * task.control_dt + task.failure_cost * info["failure"]
-            total -= reward
-            assert reward == -info["cost"]
+            running = task.cost(x, info["force"], c) * task.control_dt
+            assert info["reward_cost"] == -running
+            assert reward == sum(info[name] for name in REWARD_PARTS)
+            cost += info["cost"]
+            total += reward
+            lived += task.control_dt
             x = info["state"]
-        assert info["failure"]  # random forces topple it, so that the failure cost is among what was summed
-        assert total == pytest.approx(cost, rel=1e-12)  # the order of additions differs
+            if not info["failure"]:
+                assert info["cost"] == running
+        # random forces topple it, so that a failure's price is among what was summed
+        assert info["cost"] == pytest.approx(running + task.survival_reward * (task.duration - lived))
+        assert total + cost == pytest.approx(task.survival_pay, rel=1e-12)  # the order of additions differs
 
 
 def test_reset_costs_nothing_and_reports_the_start(task, physics, make_env):
@@ -204,15 +211,16 @@ def test_own_robot_is_simulated(physics, make_env, params):
 # --- ends ---
 
 
-def test_falling_terminates_and_charges_the_failure_cost(task, physics, make_env):
+def test_falling_terminates_and_costs_the_time_not_lived(task, physics, make_env):
     env = make_env(task, physics=physics, render_mode=None)
     env.reset(seed=0, options={"state": leaning(1.0)})
     steps = play(env, [[0.0, 0.0]] * task.steps)
     reward, terminated, truncated, info = steps[-1]
     assert (terminated, truncated, info["failure"], info["success"]) == (True, False, True, False)
     assert info["tilt"] > task.max_tilt
-    assert reward < -task.failure_cost
-    assert all(step[0] > -task.failure_cost and not step[-1]["failure"] for step in steps[:-1])
+    assert info["violated"] == "tilt"
+    assert info["cost"] > task.survival_reward * (task.duration - len(steps) * task.control_dt)
+    assert all(not step[-1]["failure"] and step[-1]["violated"] == "" for step in steps[:-1])
 
 
 def test_episode_is_truncated_at_its_duration(task, physics):

@@ -93,7 +93,7 @@ def test_demonstrations_of_another_task_are_refused(name, demos):
 def test_every_task_has_settings_of_ppo_and_sac(task, name):
     key = type(task).__name__.lower()
     settings = LEARNERS[name].tuned[key]
-    TrainingEnv(task, default_params(), 2, settings.episode, settings.fall_price, settings.reward_scale)
+    TrainingEnv(task, default_params(), 2, settings.episode, settings.reward_scale)
 
 
 def test_with_demonstrations_it_first_imitates_and_then_teaches_its_critic_alone(name, demos):

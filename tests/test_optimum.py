@@ -100,7 +100,7 @@ def test_optimum_costs_no_more_than_lqr(task, seed, optimum_of, make_env, params
 
 
 def test_optimum_is_cheaper_than_a_fall(task, seed, optimum_of):
-    assert optimum_of(task, seed).cost < task.failure_cost
+    assert optimum_of(task, seed).cost < task.survival_pay
 
 
 def test_perturbed_guess_leads_back_to_the_same_optimum(task, seed, optimum_of, params):

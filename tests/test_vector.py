@@ -20,7 +20,7 @@ from ballbot_gym.simulator import BulletSimulator
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.vector import BallbotVectorEnv
 
-INFO = ("state", "cost", "tilt", "success", "failure", "force", "clipped", "constants")
+INFO = ("state", "cost", *REWARD_PARTS, "tilt", "success", "failure", "violated", "force", "clipped", "constants")
 
 
 @pytest.fixture

@@ -52,9 +52,9 @@ class EvaluationSet:
         return {"state": self.states[i], "constants": self.constants[i]}
 
     def save(self, task: Task, path: Path) -> Path:
-        """Writes the set and the task's fields. `load` refuses it for a task with other fields."""
+        """Writes the set, with the fields that define its optima, so that it is never read for another problem."""
         arrays = {
-            "task": np.array(repr(task)),
+            "task": np.array(task.problem()),
             **{name: getattr(self, name) for name in _PER_EPISODE},
             "lengths": np.array([len(trajectory.u) for trajectory in self.trajectories]),
             "x": np.concatenate([trajectory.x for trajectory in self.trajectories]),
@@ -75,7 +75,7 @@ def load(task: Task, path: Path | None = None) -> EvaluationSet:
     """The evaluation set of a task.
 
     Args:
-        task: must have the fields for which the set was computed.
+        task: must be the very problem the set was computed for; its pay and its arena may differ.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
 
     Raises:
@@ -85,9 +85,9 @@ def load(task: Task, path: Path | None = None) -> EvaluationSet:
     if not path.exists():
         raise CertificateError(f'{path}: no evaluation set of {task.id}; compute it with "ballbot certify"')
     with np.load(path, allow_pickle=False) as arrays:
-        if str(arrays["task"]) != repr(task):
+        if str(arrays["task"]) != task.problem():
             raise CertificateError(
-                f'{path} was computed for {arrays["task"]}, not for {task!r}; compute another with "ballbot certify"'
+                f'{path} was computed for {arrays["task"]}, not for {task.problem()}; compute another with "ballbot certify"'
             )
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])

@@ -28,7 +28,13 @@ class Reference:
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """A finite-horizon optimal-control problem, from which the episode's reward is −cost.
+    """A finite-horizon optimal-control problem, and the rewards that follow from it.
+
+    Staying alive pays and motion costs: the reward of a step is (survival_reward − cost rate) · control_dt. Whoever violates
+    a limit fails, which ends the episode and costs survival_reward for every second not lived. Whoever reaches the goal of
+    a first-exit task is paid survival_reward for every remaining second at once, so that dawdling never pays more than
+    arriving. For every episode, however it ends, return + cost = `survival_pay`. So the greatest return is the least cost,
+    whatever survival_reward is.
 
     x is a state (..., 8), u a force (..., 2) in N, c the episode's constants (..., nc). Cost, margins, goal and observation
     are written with `ops`, so that NumPy, CasADi and torch evaluate the same lines; they are smooth in x and u.
@@ -42,9 +48,8 @@ class Task(ABC):
     """How long each force is held, s."""
     max_tilt: float = math.radians(80)
     """Tilt beyond which the robot has fallen, rad."""
-    failure_cost: float = 1000.0
-    """Charged when a margin is violated: ten times what the dearest of thousands of drawn episodes costs at its optimum,
-    and more than surviving costs LQR. It bounds what a policy that tries costs, not one that drives away for ever."""
+    survival_reward: float = 100.0
+    """Paid for every second lived, 1/s: more than nearly every motion in the arena costs."""
 
     id: ClassVar[str]
     """Gymnasium id."""
@@ -53,7 +58,11 @@ class Task(ABC):
     constant_names: ClassVar[tuple[str, ...]] = ()
     """Names of the episode's constants c, in order."""
     margin_names: ClassVar[tuple[str, ...]] = ("tilt",)
-    """What each of `margins` keeps, for messages."""
+    """What each of `margins` keeps."""
+    reward_threshold: ClassVar[float]
+    """Mean return on the certified episodes, with default fields, at a mean regret of 10 %."""
+    NOT_THE_PROBLEM: ClassVar[frozenset[str]] = frozenset({"survival_reward", "arena_radius", "arena_factor"})
+    """Fields that move no optimum: they shape rewards, or bound where no optimum goes."""
     constant_draws: ClassVar[int] = 0
     """Uniform numbers that `draw_constants` takes."""
     state_draws: ClassVar[int] = 0
@@ -61,8 +70,8 @@ class Task(ABC):
     first_exit: ClassVar[bool] = False
     """Whether reaching the goal ends the episode."""
 
-    OBSERVATION_LIMIT: ClassVar[float] = 1e6
-    """Bound of the observation space. What 350 N can reach within 8 s, 700 m away, stays below it in every task."""
+    LARGEST_CONSTANT: ClassVar[float] = 100.0
+    """Bounds of observations and rewards hold while no constant of the episode exceeds this, m or m/s."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -80,6 +89,21 @@ class Task(ABC):
     def steps(self) -> int:
         """Control steps in the longest episode."""
         return round(self.duration / self.control_dt)
+
+    @property
+    def survival_pay(self) -> float:
+        """What return and cost of every episode add up to: survival_reward · duration. Failing at once costs as much."""
+        return self.survival_reward * self.duration
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """What each of `limits` keeps."""
+        return (*self.margin_names, "arena")
+
+    def problem(self) -> str:
+        """The task's name and the fields that define its optima: tells whether an optimum or a policy belongs to a task."""
+        named = (f.name for f in fields(self) if f.name not in self.NOT_THE_PROBLEM)
+        return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in named)})"
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         """The constants (nc) that `constant_draws` uniform numbers z in [0, 1) stand for; z may hold batches."""
@@ -122,16 +146,67 @@ class Task(ABC):
         """Observation (..., no), each quantity divided by its `observation_scale`; no running statistics."""
 
     def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        """Safe iff every entry ≥ 0. Every task has the tilt limit; obstacles add theirs."""
+        """What optimizers keep ≥ 0. Every task has the tilt limit; obstacles add theirs."""
         return (dynamics.cos_tilt(x) - math.cos(self.max_tilt),)
+
+    @abstractmethod
+    def arena(self, c: Vector) -> tuple[Any, Any, Any]:
+        """Centre x, y and radius of the circle that the ball must not leave, m."""
+
+    def limits(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        """Safe iff every entry ≥ 0: the margins, then the arena's, about the distance to its edge, m.
+
+        The arena is no margin, because it is far from every optimum: optimizers need not know it.
+        """
+        px, py, *_ = ops.components(x)
+        x_centre, y_centre, radius = self.arena(c)
+        return (*self.margins(x, c), (radius * radius - squared(px - x_centre, py - y_centre)) / (2 * radius))
+
+    def violated(self, x: Vector, c: Vector) -> str:
+        """The name of the first limit that one state violates, or "". A state that is not finite violates one."""
+        names = zip(self.limit_names, self.limits(x, c), strict=True)
+        return next((name for name, limit in names if not limit >= 0), "")
+
+    def state_bounds(self, params: BallbotParams) -> tuple[float, float, float, float]:
+        """Bounds of what an episode can show: distance from the arena's centre, |γ| and |θ|, speed, lean rate; SI units.
+
+        They follow from energy. Let F be the largest force, µ = m_total − h²/J the least mass that the ball can feel, with
+        h = ml and J the body's inertia about the ball. The kinetic energy T is at least ½µ|v|² and gains F|v| per second at
+        most, so √(2T/µ) grows by F/µ per second at most. It is also at least ½κ(γ̇² + θ̇²) with κ = min(J − h²/m_total,
+        axial inertia). The start may bring 100 m/s. The step that leaves the arena or the tilt limit goes on for one
+        control step. Everything is doubled, for randomized robots, for sensor noise and for the integrator's error.
+        """
+        h, inertia = params.first_moment, params.pivot_inertia
+        felt = params.total_mass - h * h / inertia
+        least_inertia = min(inertia - h * h / params.total_mass, params.axial_inertia)
+        speed = 2 * (100.0 + math.sqrt(2) * params.force_limit * self.duration / felt)
+        rate = speed * math.sqrt(felt / least_inertia)
+        *_, radius = self.arena((self.LARGEST_CONSTANT,) * len(self.constant_names))
+        return radius + speed * self.control_dt, self.max_tilt + rate * self.control_dt, speed, rate
+
+    @abstractmethod
+    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
+        """(no) bounds of the absolute values of the observation, scaled as it is; they hold as `state_bounds` do."""
+
+    def reward_bounds(self, params: BallbotParams) -> tuple[float, float]:
+        """Least and greatest reward of a step; they hold as `state_bounds` do."""
+        most = self.survival_pay if self.first_exit else self.survival_reward * self.control_dt
+        return (self.survival_reward - self.greatest_cost(params)) * self.control_dt, most
+
+    def greatest_cost(self, params: BallbotParams) -> float:
+        """Bound of the cost rate, 1/s; it holds as `state_bounds` do."""
+        distance, lean, speed, rate = self.state_bounds(params)
+        x = (distance, distance, lean, lean, speed, speed, rate, rate)
+        force = (2 * params.force_limit,) * 2  # twice, for randomized actuators
+        return self.cost(x, force, (0.0,) * len(self.constant_names))
 
     def markers(self, c: np.ndarray) -> list[Marker]:
         """What to draw besides the robot."""
         return []
 
     def is_safe(self, x: Vector, c: Vector) -> bool:
-        """Whether one state violates no margin; a state that is not finite does."""
-        return all(margin >= 0 for margin in self.margins(x, c))
+        """Whether one state violates no limit; a state that is not finite does."""
+        return not self.violated(x, c)
 
     def is_goal(self, x: Vector, c: Vector) -> bool:
         """Whether one state is in the goal."""

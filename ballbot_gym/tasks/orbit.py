@@ -45,7 +45,7 @@ class Orbit(Task):
 
     Cost rate: 10 e_r² + 2 |e_v|² + 0.02 (γ̇² + θ̇²) + 2e-5 (Fx² + Fy²), with e_r and e_v the errors observed.
 
-    Ends: tilt beyond `max_tilt` fails; after `duration` the episode is truncated, a success if the ball is then within
+    Ends: tilt beyond `max_tilt` fails, and so does leaving the arena; after `duration` the episode is truncated, a success if the ball is then within
     0.2 m of the circle and a fifth of v of its velocity.
 
     Arguments, each a keyword of `gymnasium.make`:
@@ -63,7 +63,8 @@ class Orbit(Task):
     | duration | longest episode | s | 8 |
     | control_dt | how long each force is held | s | 0.02 |
     | max_tilt | tilt of a fall | rad | 80° |
-    | failure_cost | price of a fall | | 1000 |
+    | survival_reward | paid for every second lived | 1/s | 100 |
+    | arena_factor | how far from the origin the ball may go | r | 2 |
     """
 
     radius_weight: float = 10.0
@@ -82,12 +83,20 @@ class Orbit(Task):
     """rad."""
     max_steady_tilt: float = math.radians(45)
     """rad."""
+    arena_factor: float = 2.0
+    """How far from the origin the ball may go, in radii of the circle; above 1."""
 
     id = "BallbotOrbit-v0"
     observation_scale = (3.0, 3.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 1.0, 5.0, 5.0, 3.0, 5.0)
     constant_names = ("radius", "speed")
     constant_draws = 3
+    reward_threshold = 782.9
     state_draws = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.arena_factor <= 1:
+            raise ValueError(f"Orbit: arena_factor must exceed 1, so that the circle lies inside, not {self.arena_factor}")
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         radius = between(z[0], self.min_radius, self.max_radius)
@@ -115,6 +124,35 @@ class Orbit(Task):
             + self.lean_rate_weight * squared(gamma_dot, theta_dot)
             + self.effort_weight * squared(*ops.components(u))
         )
+
+    def arena(self, c: Vector) -> tuple[Any, Any, Any]:
+        radius, _ = ops.components(c)
+        return 0.0, 0.0, self.arena_factor * radius
+
+    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
+        distance, lean, speed, rate = self.state_bounds(params)
+        constant = self.LARGEST_CONSTANT
+        bounds = (distance, distance, lean, lean, speed, speed, rate, rate, *self._error_bounds(params), constant, constant)
+        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
+
+    def greatest_cost(self, params: BallbotParams) -> float:
+        *_, rate = self.state_bounds(params)
+        radius_error, *velocity_error = self._error_bounds(params)
+        return (
+            self.radius_weight * squared(radius_error)
+            + self.velocity_weight * squared(*velocity_error)
+            + self.lean_rate_weight * squared(rate, rate)
+            + self.effort_weight * 2 * squared(2 * params.force_limit)
+        )
+
+    def _error_bounds(self, params: BallbotParams) -> tuple[float, float, float]:
+        """Of the radius error, m, and of both velocity errors, m/s, for every radius that `check_constants` allows."""
+        _, _, speed, _ = self.state_bounds(params)
+        travel = speed * self.control_dt
+        smallest, largest = params.pivot_inertia / params.first_moment, self.LARGEST_CONSTANT
+        radius_error = max((self.arena_factor * r + travel) ** 2 / (2 * r) + r / 2 for r in (smallest, largest))
+        velocity_error = speed + self.LARGEST_CONSTANT * (self.arena_factor + travel / smallest)
+        return radius_error, velocity_error, velocity_error
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         radius_error, vx_error, vy_error = self._errors(x, c)

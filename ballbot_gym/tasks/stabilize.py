@@ -36,7 +36,7 @@ class Stabilize(Task):
 
     Cost rate: x² + y² + ½(γ² + θ² + ẋ² + ẏ² + γ̇² + θ̇²) + 5e-4 (Fx² + Fy²), the paper's shape of weights.
 
-    Ends: tilt beyond `max_tilt` fails; after `duration` the episode is truncated, a success if the robot then stands
+    Ends: tilt beyond `max_tilt` fails, and so does leaving the arena; after `duration` the episode is truncated, a success if the robot then stands
     within 0.1 m of the origin, slower than 0.1 m/s, leaning less than 2° and turning slower than 0.1 rad/s.
 
     Arguments, each a keyword of `gymnasium.make`:
@@ -53,7 +53,8 @@ class Stabilize(Task):
     | duration | longest episode | s | 8 |
     | control_dt | how long each force is held | s | 0.02 |
     | max_tilt | tilt of a fall | rad | 80° |
-    | failure_cost | price of a fall | | 1000 |
+    | survival_reward | paid for every second lived | 1/s | 100 |
+    | arena_radius | how far from the origin the ball may go | m | 10 |
     """
 
     position_weight: float = 1.0
@@ -70,10 +71,13 @@ class Stabilize(Task):
     """rad."""
     start_lean_rate: float = 1.0
     """rad/s."""
+    arena_radius: float = 10.0
+    """How far from the origin the ball may go, m."""
 
     state_draws = 8
     id = "BallbotStabilize-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0)
+    reward_threshold = 771.5
 
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         limits = (self.start_position, self.start_lean, self.start_speed, self.start_lean_rate)
@@ -86,6 +90,13 @@ class Stabilize(Task):
             + self.rest_weight * squared(*rest)
             + self.effort_weight * squared(*ops.components(u))
         )
+
+    def arena(self, c: Vector) -> tuple[Any, Any, Any]:
+        return 0.0, 0.0, self.arena_radius
+
+    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
+        bounds = (part for part in self.state_bounds(params) for _ in range(2))
+        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         return at_rest(x)

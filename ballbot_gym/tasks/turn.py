@@ -42,7 +42,7 @@ class Turn(Task):
     Cost rate: 5 + ½(γ² + θ² + γ̇² + θ̇²) + 2e-4 (Fx² + Fy²): time, lean and effort, as in the paper's problem 1.
 
     Ends: within 0.2 m of the gate, 0.5 m/s of its velocity, tilt < 10° and lean rate < 1 rad/s at once: success, and no
-    further cost. Tilt beyond `max_tilt` fails. After `duration` the episode is truncated.
+    further cost. Tilt beyond `max_tilt` fails, and so does leaving the arena. After `duration` the episode is truncated.
 
     Arguments, each a keyword of `gymnasium.make`:
 
@@ -56,7 +56,8 @@ class Turn(Task):
     | duration | longest episode | s | 8 |
     | control_dt | how long each force is held | s | 0.02 |
     | max_tilt | tilt of a fall | rad | 80° |
-    | failure_cost | price of a fall | | 1000 |
+    | survival_reward | paid for every second lived | 1/s | 100 |
+    | arena_radius | how far from the gate the ball may go | m | 20 |
     """
 
     time_weight: float = 5.0
@@ -69,12 +70,15 @@ class Turn(Task):
     """m/s."""
     max_speed: float = 10.0
     """m/s."""
+    arena_radius: float = 20.0
+    """How far from the gate the ball may go, m."""
 
     id = "BallbotTurn-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 5.0)
     constant_names = ("speed",)
     constant_draws = 1
     first_exit = True
+    reward_threshold = 780.1
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         return (between(z[0], self.min_speed, self.max_speed),)
@@ -95,6 +99,15 @@ class Turn(Task):
             + self.lean_weight * squared(gamma, theta, gamma_dot, theta_dot)
             + self.effort_weight * squared(*ops.components(u))
         )
+
+    def arena(self, c: Vector) -> tuple[Any, Any, Any]:
+        return float(_GATE[0]), float(_GATE[1]), self.arena_radius
+
+    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
+        distance, lean, speed, rate = self.state_bounds(params)
+        off = speed + self.LARGEST_CONSTANT
+        bounds = (distance, distance, lean, lean, off, off, rate, rate, self.LARGEST_CONSTANT)
+        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)

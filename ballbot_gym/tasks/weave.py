@@ -51,7 +51,7 @@ class Weave(Task):
 
     Cost rate: as Stabilize's, about the goal.
 
-    Ends: touching an obstacle with the ball, or tilt beyond `max_tilt`, fails; after `duration` the episode is truncated,
+    Ends: touching an obstacle with the ball, tilt beyond `max_tilt` or leaving the arena fails; after `duration` the episode is truncated,
     a success if the robot then rests at the goal by Stabilize's tolerances.
 
     Arguments, each a keyword of `gymnasium.make`:
@@ -65,7 +65,8 @@ class Weave(Task):
     | duration | longest episode | s | 8 |
     | control_dt | how long each force is held | s | 0.02 |
     | max_tilt | tilt of a fall | rad | 80° |
-    | failure_cost | price of a fall or a touch | | 1000 |
+    | survival_reward | paid for every second lived | 1/s | 100 |
+    | arena_radius | how far from the goal the ball may go | m | 12 |
     """
 
     position_weight: float = 1.0
@@ -76,6 +77,8 @@ class Weave(Task):
     """Of Fx² + Fy², 1/(N² s)."""
     ball_radius: float = 0.1
     """The robot's, m."""
+    arena_radius: float = 12.0
+    """How far from the goal the ball may go, m."""
 
     id = "BallbotWeave-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0) + (5.0, 5.0, 1.0) * MAX_OBSTACLES
@@ -86,6 +89,7 @@ class Weave(Task):
 
     constant_draws = 4 + 3 * MAX_OBSTACLES
     state_draws = 1
+    reward_threshold = 708.4
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         which, length, first_side, *shared = z
@@ -139,6 +143,18 @@ class Weave(Task):
             # about the distance to contact, m, and smooth everywhere
             clearances.append((squared(px - ox, py - oy) - reach * reach) / (2 * reach))
         return (*super().margins(x, c), *clearances)
+
+    def arena(self, c: Vector) -> tuple[Any, Any, Any]:
+        x_goal, y_goal, *_ = ops.components(c)
+        return x_goal, y_goal, self.arena_radius
+
+    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
+        distance, lean, speed, rate = self.state_bounds(params)
+        constant = self.LARGEST_CONSTANT
+        to_obstacle = distance + 2 * constant  # over the goal, which is within `constant` of the origin, as the obstacle is
+        obstacles = (to_obstacle, to_obstacle, constant) * MAX_OBSTACLES
+        bounds = (distance, distance, lean, lean, speed, speed, rate, rate, *obstacles)
+        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         x_goal, y_goal, *_ = ops.components(c)

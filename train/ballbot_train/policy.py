@@ -127,8 +127,8 @@ def load_network(path: str | Path, task: Task) -> PolicyNetwork:
         weights = safetensors.torch.load(weights_path.read_bytes())
     except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
         raise PolicyError(f"{description_path} is not a policy: {error}") from error
-    if spec.task != repr(task):
-        raise PolicyError(f"{description_path} was trained on {spec.task}, not on {task!r}")
+    if spec.task != task.problem():
+        raise PolicyError(f"{description_path} was trained on {spec.task}, not on {task.problem()}")
     if spec.observation_version != OBSERVATION_VERSION:
         raise PolicyError(
             f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
@@ -161,7 +161,7 @@ def load_policy(
     """
     if task is None:
         trained_on = read_description(path)["spec"]["task"]
-        task = next((kind() for kind in TASKS.values() if repr(kind()) == trained_on), None)
+        task = next((kind() for kind in TASKS.values() if kind().problem() == trained_on), None)
         if task is None:
             raise PolicyError(f"{path} was trained on {trained_on}: give that Task as load_policy(path, task)")
     task = make_task(task)

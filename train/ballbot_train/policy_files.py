@@ -27,7 +27,7 @@ class PolicySpec:
     """What a policy was made for and how its network is built; the JSON file holds it."""
 
     task: str
-    """`repr` of the Task."""
+    """`Task.problem()` of what it was trained on."""
     observations: int
     """Size of an observation."""
     hidden: tuple[int, ...] = (128, 128)
@@ -45,7 +45,7 @@ class PolicySpec:
     @classmethod
     def of(cls, task: Task, **fields: Any) -> "PolicySpec":
         """The spec for a task; fields are the others."""
-        return cls(task=repr(task), observations=len(task.observation_scale), **fields)
+        return cls(task=task.problem(), observations=len(task.observation_scale), **fields)
 
 
 def read_description(path: str | Path) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str,
         task: [
             name
             for name in names
-            if (made_for[name] == repr(make_task(task)) if name in made_for else name in known[task])
+            if (made_for[name] == make_task(task).problem() if name in made_for else name in known[task])
         ]
         for task in tasks
     }

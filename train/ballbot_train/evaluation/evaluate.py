@@ -173,7 +173,7 @@ def iterate_episodes(
             run = rollout(env, controller, seed=seed + i, options=episode_set.options(i))
         except PlanError as error:
             outcome: dict[str, Any] = {
-                "cost": env.task.failure_cost,
+                "cost": env.task.survival_pay,
                 "success": False,
                 "failure": True,
                 "note": str(error),

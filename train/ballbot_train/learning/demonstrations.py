@@ -371,7 +371,7 @@ def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) 
             "expert": config.expert,
             "physics": config.physics,
             **_optimum(env, recording.states[0], info["constants"]),
-            "cost": -float(recording.rewards.sum()),
+            "cost": env.task.survival_pay - float(recording.rewards.sum()),
             "success": bool(info["success"]),
             "failure": bool(info["failure"]),
             "plans": expert.plans,

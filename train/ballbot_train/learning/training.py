@@ -73,7 +73,7 @@ class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
 
     cost_ratio: float
-    """Mean of cost / optimum, an episode without success costing at least a failure's price; the best policy has least."""
+    """Mean of cost / optimum, an episode without success costing at least what failing at once costs; the best policy has least."""
     regret_mean: float
     """Of the episodes that did not fail."""
     regret_median: float
@@ -87,7 +87,7 @@ def score(network: PolicyNetwork, task: Task) -> Score:
     batch = BallbotBatch(task, len(episodes), compile=False)
     run = run_episodes(batch, network, episodes.states, episodes.constants)
     ratio = run.cost.numpy() / episodes.costs
-    priced = np.where(run.success.numpy(), ratio, np.maximum(ratio, task.failure_cost / episodes.costs))
+    priced = np.where(run.success.numpy(), ratio, np.maximum(ratio, task.survival_pay / episodes.costs))
     standing = ratio[~run.failure.numpy()] - 1
     return Score(
         cost_ratio=float(priced.mean()),

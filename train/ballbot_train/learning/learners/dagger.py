@@ -318,12 +318,12 @@ def make(task: Task, params: BallbotParams, config: DaggerConfig, seed: int, dem
     samples = None
     if demos is not None:
         loaded = load_demos(demos, task)
-        weights = np.full(len(loaded), 1 / max(_median_cost(loaded), config.least_cost))
+        weights = np.full(len(loaded), 1 / max(_median_cost(loaded, task), config.least_cost))
         samples = Samples.of(loaded.observations, loaded.actions, weights)
     return Dagger(task, params, config, seed, samples)
 
 
-def _median_cost(demos: Demos) -> float:
+def _median_cost(demos: Demos, task: Task) -> float:
     """Of the episodes."""
     starts = np.flatnonzero(np.roll(demos.terminations | demos.truncations, 1))
-    return float(np.median(-np.add.reduceat(demos.rewards, starts)))
+    return float(task.survival_pay - np.median(np.add.reduceat(demos.rewards, starts, dtype=np.float64)))

@@ -30,11 +30,10 @@ class ModelFreeConfig:
     envs: int
     steps: int
     """Control steps of each env per iteration."""
-    fall_price: float
     evaluations: int = 20
     episode: float = 4.0
     """s, after which episodes start anew in training."""
-    reward_scale: float = 0.1
+    reward_scale: float = 0.02
     discount: float = 0.995
     """Per control step."""
     hidden: tuple[int, ...] = (128, 128)
@@ -67,7 +66,7 @@ class ModelFree(ABC):
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._critic_iterations = 0 if demos is None else config.critic_iterations
         self.iterations, self.evaluations = config.iterations + self._clone_iterations, config.evaluations
-        self._env = TrainingEnv(task, params, config.envs, config.episode, config.fall_price, config.reward_scale)
+        self._env = TrainingEnv(task, params, config.envs, config.episode, config.reward_scale)
 
     def _begin(self, model: BaseAlgorithm, actor: nn.Sequential, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
@@ -146,17 +145,17 @@ class ModelFree(ABC):
 
 
 class TrainingEnv(VecEnvWrapper):
-    """A task's batched envs for learning: shorter episodes, cheaper falls and scaled rewards change no optimum.
+    """A task's batched envs for learning: shorter episodes and scaled rewards change no optimum.
 
     An episode that runs out of time is truncated, and the learners count the value of where it stopped; so shorter
-    episodes only leave out rest, of which there is little to learn. A fall still costs more than any sensible episode.
+    episodes only leave out rest, of which there is little to learn.
     """
 
     def __init__(
-        self, task: Task, params: BallbotParams, envs: int, episode: float, fall_price: float, reward_scale: float
+        self, task: Task, params: BallbotParams, envs: int, episode: float, reward_scale: float
     ):
-        """Args: episode: s; fall_price: in place of the task's; reward_scale: what every reward is multiplied by."""
-        shorter = replace(task, duration=episode, failure_cost=fall_price)
+        """Args: episode: s; reward_scale: what every reward is multiplied by."""
+        shorter = replace(task, duration=episode)
         self._vector = BallbotVectorEnv(envs, shorter, params=params, compile=False)
         self._scale = np.float32(reward_scale)
         super().__init__(BallbotVecEnv(self._vector))

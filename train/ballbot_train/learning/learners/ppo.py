@@ -27,7 +27,6 @@ class PpoConfig(ModelFreeConfig):
     iterations: int = 400
     envs: int = 256
     steps: int = 64
-    fall_price: float = 300.0
     imitation: float = 0.3
     """Of the expert's negative log-probability."""
     gae_lambda: float = 0.95

@@ -30,7 +30,6 @@ class SacConfig(ModelFreeConfig):
     iterations: int = 200
     envs: int = 16
     steps: int = 63
-    fall_price: float = 200.0
     clone_iterations: int = 15
     imitation: float = 300.0
     gradient_steps: int = 4

@@ -57,6 +57,8 @@ class ShacConfig:
     """Share by which the target critic moves to the critic after each iteration."""
     max_gradient: float = 1.0
     """Norm to which the policy's gradient is clipped."""
+    failure_price: float = 1000.0
+    """What a failure costs in training, whenever it comes."""
     clearance: float = 0.0
     """How far from the margins the penalty begins, in the margins' units."""
     margin_price: float = 0.0
@@ -238,7 +240,8 @@ class Shac:
         observation = self._batch.observe(state)
         new, result = self._batch.transition(state, self._network(observation))
         x, c = result.final_x.unbind(0), state.c.unbind(0)
-        cost = -result.reward
+        cost = task.cost(state.x.unbind(0), result.force.unbind(0), c) * task.control_dt
+        cost = cost + config.failure_price * result.failure
         shaped = cost
         if config.margin_price:
             for margin in task.margins(x, c):
