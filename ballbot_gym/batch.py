@@ -133,7 +133,7 @@ class _Robot(NamedTuple):
 
 
 class BallbotBatch:
-    """B ballbots that do one task, in torch, differentiable from actions and states to rewards and observations.
+    """B ballbots that do one task, in torch, differentiable from actions and states to rewards, costs and observations.
 
     `transition` is a pure function of state and actions; `reset` and `step` apply it to `self.state`. Gradients flow
     through `step` into earlier actions until an episode ends; `detach` cuts them. The physics is the closed form of
@@ -418,7 +418,7 @@ def run_episodes(
     for _ in range(batch.task.steps):
         result = batch.step(policy(observation))
         observation = result.observation
-        cost -= torch.where(running, result.reward, 0.0)
+        cost += torch.where(running, result.cost, 0.0)
         steps += running
         success |= running & result.success
         failure |= running & result.failure

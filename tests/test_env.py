@@ -231,7 +231,8 @@ def test_episode_is_truncated_at_its_duration(task, physics):
     assert len(steps) == round(1.0 / task.control_dt)
     reward, terminated, truncated, info = steps[-1]
     assert (terminated, truncated, info["failure"]) == (False, True, False)
-    assert reward > -task.failure_cost
+    assert info["reward_goal"] == 0
+    assert reward == sum(info[name] for name in REWARD_PARTS)
     assert not any(step[1] or step[2] for step in steps[:-1])
 
 
@@ -252,7 +253,9 @@ def test_turn_ends_in_success_at_the_gate_at_no_further_cost(make_env, physics):
     assert (terminated, truncated, info["success"], info["failure"]) == (True, False, True, False)
     # 0.05 m at 3 m/s, upright and without force: a step is 0.06 m, and costs its time alone
     assert len(steps) == 1
-    assert reward == pytest.approx(-env.task.time_weight * env.task.control_dt)
+    assert info["cost"] == pytest.approx(env.task.time_weight * env.task.control_dt)
+    assert info["reward_goal"] == pytest.approx(env.task.survival_reward * (env.task.duration - env.task.control_dt))
+    assert reward == pytest.approx(env.task.survival_pay - info["cost"])
 
 
 def test_turn_is_no_success_at_the_gate_in_the_wrong_direction(make_env):

@@ -14,6 +14,7 @@ import torch
 from ballbot_gym import BallbotEnv, BallbotParams, counter_rng, dynamics
 from ballbot_gym import batch as batch_module
 from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.simulator import BulletSimulator
@@ -44,7 +45,8 @@ def column(infos, i):
 
 
 def assert_same_info(got, expected, tolerance):
-    for key in INFO:
+    assert got["violated"] == expected["violated"]
+    for key in set(INFO) - {"violated"}:
         np.testing.assert_allclose(got[key], expected[key], rtol=tolerance, atol=tolerance, err_msg=key)
 
 
@@ -152,7 +154,9 @@ def test_reaching_turns_goal_ends_the_episode_as_a_success_without_further_cost(
     assert not truncations.any()
     assert infos["final_info"]["success"].tolist() == [True, False]
     assert not infos["final_info"]["failure"].any()
-    assert -rewards[0] == pytest.approx(vec.task.cost(tuple(gate), (0.0, 0.0), (3.0,)) * 0.02)
+    cost = vec.task.cost(tuple(gate), (0.0, 0.0), (3.0,)) * 0.02
+    assert infos["final_info"]["cost"][0] == pytest.approx(cost)
+    assert rewards[0] == pytest.approx(vec.task.survival_pay - cost)
 
 
 def test_resting_at_the_origin_to_the_end_is_a_success(make_vec):
@@ -365,15 +369,15 @@ def test_what_a_step_returned_is_never_written_to_again(make_vec, rng):
         infos["state"][0] = 0
 
 
-def test_gymnasiums_episode_statistics_are_minus_the_cost(make_vec, rng):
+def test_gymnasiums_episode_statistics_are_the_sum_of_rewards(make_vec, rng):
     vec = RecordEpisodeStatistics(make_vec(4, duration=0.3))
     vec.reset(seed=0)
     total, seen = np.zeros(4), 0
     for _ in range(40):
         _, rewards, terminations, truncations, infos = vec.step(rng.uniform(-1, 1, (4, 2)))
-        total -= rewards
+        total += rewards
         for i in np.flatnonzero(terminations | truncations):
-            assert infos["episode"]["r"][i] == pytest.approx(-total[i])
+            assert infos["episode"]["r"][i] == pytest.approx(total[i])
             total[i], seen = 0, seen + 1
     assert seen > 6
 
@@ -462,7 +466,7 @@ def rollout_cost(batch, x0, gain, forces):
         action = (added - batch.state.x.T @ gain.T) / limit
         assert action.abs().max() < 1  # a clipped force would have no gradient
         result = batch.step(action)
-        cost = cost - result.reward
+        cost = cost + result.cost
     return cost
 
 
