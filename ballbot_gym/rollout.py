@@ -92,9 +92,9 @@ class ActionController:
 class Episode:
     """One episode under one controller.
 
-    `trajectory` holds the applied forces. `cost` includes a failure's price. From `settle_time`, s, the goal held until the end; it
-    is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`, `act_seconds` its
-    median wall time in `act`.
+    `trajectory` holds the applied forces. `cost` includes a failure's price. From `settle_time`, s, the goal held until the
+    end; it is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`,
+    `act_seconds` its median wall time in `act`.
     """
 
     trajectory: Trajectory

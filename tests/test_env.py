@@ -215,7 +215,7 @@ def test_falling_terminates_and_costs_the_time_not_lived(task, physics, make_env
     env = make_env(task, physics=physics, render_mode=None)
     env.reset(seed=0, options={"state": leaning(1.0)})
     steps = play(env, [[0.0, 0.0]] * task.steps)
-    reward, terminated, truncated, info = steps[-1]
+    _, terminated, truncated, info = steps[-1]
     assert (terminated, truncated, info["failure"], info["success"]) == (True, False, True, False)
     assert info["tilt"] > task.max_tilt
     assert info["violated"] == "tilt"

@@ -45,7 +45,8 @@ class Orbit(Task):
 
     Cost rate: 10 e_r² + 2 |e_v|² + 0.02 (γ̇² + θ̇²) + 2e-5 (Fx² + Fy²), with e_r and e_v the errors observed.
 
-    Ends: tilt beyond `max_tilt` fails, and so does leaving the arena; after `duration` the episode is truncated, a success if the ball is then within
+    Ends: tilt beyond `max_tilt` fails, and so does leaving the arena.
+    After `duration` the episode is truncated, a success if the ball is then within
     0.2 m of the circle and a fifth of v of its velocity.
 
     Arguments, each a keyword of `gymnasium.make`:
@@ -96,7 +97,9 @@ class Orbit(Task):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.arena_factor <= 1:
-            raise ValueError(f"Orbit: arena_factor must exceed 1, so that the circle lies inside, not {self.arena_factor}")
+            raise ValueError(
+                f"Orbit: arena_factor must exceed 1, so that the circle lies inside, not {self.arena_factor}"
+            )
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         radius = between(z[0], self.min_radius, self.max_radius)
@@ -132,7 +135,19 @@ class Orbit(Task):
     def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
         distance, lean, speed, rate = self.state_bounds(params)
         constant = self.LARGEST_CONSTANT
-        bounds = (distance, distance, lean, lean, speed, speed, rate, rate, *self._error_bounds(params), constant, constant)
+        bounds = (
+            distance,
+            distance,
+            lean,
+            lean,
+            speed,
+            speed,
+            rate,
+            rate,
+            *self._error_bounds(params),
+            constant,
+            constant,
+        )
         return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
 
     def greatest_cost(self, params: BallbotParams) -> float:

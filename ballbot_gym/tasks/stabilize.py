@@ -36,7 +36,8 @@ class Stabilize(Task):
 
     Cost rate: x² + y² + ½(γ² + θ² + ẋ² + ẏ² + γ̇² + θ̇²) + 5e-4 (Fx² + Fy²), the paper's shape of weights.
 
-    Ends: tilt beyond `max_tilt` fails, and so does leaving the arena; after `duration` the episode is truncated, a success if the robot then stands
+    Ends: tilt beyond `max_tilt` fails, and so does leaving the arena.
+    After `duration` the episode is truncated, a success if the robot then stands
     within 0.1 m of the origin, slower than 0.1 m/s, leaning less than 2° and turning slower than 0.1 rad/s.
 
     Arguments, each a keyword of `gymnasium.make`:

@@ -51,7 +51,8 @@ class Weave(Task):
 
     Cost rate: as Stabilize's, about the goal.
 
-    Ends: touching an obstacle with the ball, tilt beyond `max_tilt` or leaving the arena fails; after `duration` the episode is truncated,
+    Ends: touching an obstacle with the ball, tilt beyond `max_tilt` or leaving the arena fails.
+    After `duration` the episode is truncated,
     a success if the robot then rests at the goal by Stabilize's tolerances.
 
     Arguments, each a keyword of `gymnasium.make`:
@@ -151,7 +152,9 @@ class Weave(Task):
     def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
         distance, lean, speed, rate = self.state_bounds(params)
         constant = self.LARGEST_CONSTANT
-        to_obstacle = distance + 2 * constant  # over the goal, which is within `constant` of the origin, as the obstacle is
+        to_obstacle = (
+            distance + 2 * constant
+        )  # over the goal, which is within `constant` of the origin, as the obstacle is
         obstacles = (to_obstacle, to_obstacle, constant) * MAX_OBSTACLES
         bounds = (distance, distance, lean, lean, speed, speed, rate, rate, *obstacles)
         return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))

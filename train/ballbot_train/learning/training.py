@@ -73,7 +73,9 @@ class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
 
     cost_ratio: float
-    """Mean of cost / optimum, an episode without success costing at least what failing at once costs; the best policy has least."""
+    """Mean of cost / optimum, an episode without success costing at least what failing at once costs.
+
+    The best policy has the least."""
     regret_mean: float
     """Of the episodes that did not fail."""
     regret_median: float

@@ -151,9 +151,7 @@ class TrainingEnv(VecEnvWrapper):
     episodes only leave out rest, of which there is little to learn.
     """
 
-    def __init__(
-        self, task: Task, params: BallbotParams, envs: int, episode: float, reward_scale: float
-    ):
+    def __init__(self, task: Task, params: BallbotParams, envs: int, episode: float, reward_scale: float):
         """Args: episode: s; reward_scale: what every reward is multiplied by."""
         shorter = replace(task, duration=episode)
         self._vector = BallbotVectorEnv(envs, shorter, params=params, compile=False)
