@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ballbot_gym import dynamics
-from ballbot_gym.ops import Vector
+from ballbot_gym import dynamics, ops
+from ballbot_gym.ops import Vector, squared
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 
