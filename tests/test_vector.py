@@ -141,7 +141,7 @@ def test_one_step_in_float32_is_within_its_rounding(task, make_env, rng):
             observation, reward, terminated, _, info = env.step(actions[i])
             np.testing.assert_allclose(result.final_x[:, i], info["state"], rtol=5e-6, atol=5e-6)
             np.testing.assert_allclose(result.final_observation[i], observation, rtol=5e-6, atol=5e-6)
-            assert result.reward[i].item() == pytest.approx(reward, rel=5e-6)
+            assert result.reward[i].item() == pytest.approx(reward, rel=5e-6, abs=2e-5)  # pay less cost may be near 0
             assert result.terminated[i] == terminated
 
 
