@@ -48,6 +48,22 @@ def discrete_lqr(
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 
 
+def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:
+    """LQR in units of observations and actions, for tasks that end at rest in an equilibrium.
+
+    Returns:
+        The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first eight observations
+        of such a task are the scaled errors of the state. None for every other task.
+    """
+    x, c = task.sample(np.random.default_rng(0), params)
+    reference = task.reference(x, c, params)
+    if task.first_exit or len(reference.x) > 1 or np.abs(np.asarray(task.observe(reference.x[0], c))[:8]).max() > 0:
+        return None
+    k, p = discrete_lqr(task, params, reference.x[0], reference.u[0], c)
+    scale = np.array(task.observation_scale[:8])
+    return -k * scale / params.force_limit, p * np.outer(scale, scale)
+
+
 def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
     """Whether state x (8,) stays where it is under force u (2,), to 1e-6."""
     return bool(np.abs(dynamics.derivative(params, np.asarray(x), np.asarray(u))).max() < 1e-6)
