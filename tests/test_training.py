@@ -19,7 +19,19 @@ from ballbot_train.learning import training
 from ballbot_train.learning.learners import LEARNERS, shac
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
-SETTINGS = ["iterations", "6", "evaluations", "3", "envs", "4", "window", "3", "hidden", "8", "compile", "false"]
+SETTINGS = [
+    "--total-iterations",
+    "6",
+    "--evaluations",
+    "3",
+    "--num-envs",
+    "4",
+    "--horizon",
+    "3",
+    "--hidden",
+    "8",
+    "--no-compile",
+]
 
 
 def parameters(learner):
@@ -40,7 +52,9 @@ def finishes(*arguments):
 @pytest.mark.parametrize("name", TASKS)
 def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
     task, params = TASKS[name](), default_params()
-    config = replace(shac.TUNED[name], iterations=4, envs=4, window=3, hidden=(8,), compile=False)
+    config = replace(
+        LEARNERS["shac"].settings(name), total_iterations=4, num_envs=4, horizon=3, hidden=(8,), compile=False
+    )
     whole = shac.Shac(task, params, config)
     for _ in range(4):
         whole.iterate()
@@ -58,32 +72,43 @@ def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
 def test_shac_starts_at_lqr_and_lowers_the_cost():
     """From LQR's start a few iterations of small envs already save cost on the certified episodes."""
     task, params = TASKS["stabilize"](), default_params()
-    config = replace(shac.TUNED["stabilize"], iterations=30, envs=64, window=25, hidden=(32,), compile=False)
+    config = replace(
+        LEARNERS["shac"].settings("stabilize"),
+        total_iterations=30,
+        num_envs=64,
+        horizon=25,
+        hidden=(32,),
+        compile=False,
+    )
     learner = shac.Shac(task, params, config)
     before = training.score(learner.network, task)
     assert before.success > 0.5  # LQR within the limits of tanh
-    for _ in range(config.iterations):
+    for _ in range(config.total_iterations):
         learner.iterate()
     assert training.score(learner.network, task).cost_ratio < 0.7 * before.cost_ratio
 
 
 def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
     task, params = TASKS["turn"](), default_params()
-    config = shac.ShacConfig(iterations=2, envs=4, window=3, hidden=(8,), critic_first=1, compile=False)
+    config = shac.ShacConfig(
+        total_iterations=2, num_envs=4, horizon=3, hidden=(8,), critic_warmup_iterations=1, compile=False
+    )
     donor, learner = (shac.Shac(task, params, config, seed) for seed in (1, 2))
-    learner.begin(donor.network)
+    learner.start_from(donor.network)
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()  # only the critic learns
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()
     assert not torch.equal(parameters(learner), parameters(donor))
     with pytest.raises(ValueError, match="cannot start"):
-        shac.Shac(task, params, replace(config, hidden=(9,))).begin(donor.network)
+        shac.Shac(task, params, replace(config, hidden=(9,))).start_from(donor.network)
 
 
 def test_a_critic_that_does_not_learn_stays_lqr_s_cost():
     task, params = TASKS["stabilize"](), default_params()
-    learner = shac.Shac(task, params, shac.ShacConfig(envs=4, window=3, hidden=(8,), critic_steps=0, compile=False))
+    learner = shac.Shac(
+        task, params, shac.ShacConfig(num_envs=4, horizon=3, hidden=(8,), critic_gradient_steps=0, compile=False)
+    )
     learner.iterate()
     x = 0.01 * torch.arange(8.0)
     _, p = discrete_lqr(task, params, np.zeros(8), np.zeros(2), np.zeros(0))
@@ -101,7 +126,7 @@ def test_odd_policies_are_odd():
 
 def test_a_killed_run_resumes_to_the_same_result(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    common = ["shac", "--threads", 1, "--set", *SETTINGS]
+    common = ["shac", "--threads", 1, *SETTINGS]
     finishes(*common, "--out", whole)
     process = run(*common, "--out", killed, env=os.environ | {"BALLBOT_CHECKPOINT_SECONDS": "0"})
     while not (killed / "checkpoint.pt").exists() and process.poll() is None:

@@ -7,11 +7,15 @@ from rich.console import Console
 
 from ballbot_gym.rollout import PlanError
 from ballbot_train.commands import COMMANDS
+from ballbot_train.commands.train import command_line
 
 
 def main() -> None:
     """Runs the command line; errors a user can cause end with one line and exit status 1."""
     try:
+        if sys.argv[1:2] == ["train"]:  # its options depend on the learner and the task
+            command_line(sys.argv[2:])
+            return
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="ballbot", description="Ballbot control, by its regret.")
     except (ValueError, TypeError, ImportError, PlanError, OSError) as error:
         Console(stderr=True).print(f"ballbot: {error}", style="red", markup=False)

@@ -223,10 +223,8 @@ class Dagger:
             met = history[:, i][~over[:, i]]
             distance, nearest = KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD)
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
-            off = met - plan.trajectory.x[nearest]
-            forces = plan.trajectory.u[nearest] - np.einsum(
-                "tij,tj->ti", gains[i // config.tracked_rollouts_per_plan][nearest], off
-            )
+            off, k = met - plan.trajectory.x[nearest], gains[i // config.tracked_rollouts_per_plan]
+            forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", k[nearest], off)
             self._samples.add(self._samples_of(met, forces, c, plan.cost))
 
     def _optimum(self, x: np.ndarray, c: np.ndarray, path: np.ndarray) -> Optimum | None:

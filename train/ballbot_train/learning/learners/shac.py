@@ -257,10 +257,8 @@ class Shac:
         shaped = cost
         if config.margin_penalty:
             for margin in task.margins(x, c):
-                shaped = (
-                    shaped
-                    + config.margin_penalty * task.control_dt * (config.margin_clearance - margin).clamp(min=0) ** 2
-                )
+                shortfall = (config.margin_clearance - margin).clamp(min=0)
+                shaped = shaped + config.margin_penalty * task.control_dt * shortfall**2
         loss = loss + discount * alive * shaped
         if config.exit_softness:
             alive = alive * torch.sigmoid(torch.stack(task.goal(x, c)).amax(0) / config.exit_softness)
