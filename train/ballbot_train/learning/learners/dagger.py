@@ -221,7 +221,7 @@ class Dagger:
         history, over, _ = self._roll(x, np.array([c for _, c in tracked]), steps)
         for i, (plan, c) in enumerate(tracked):
             met = history[:, i][~over[:, i]]
-            distance, nearest = KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD)
+            distance, nearest = map(np.asarray, KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD))
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
             off, k = met - plan.trajectory.x[nearest], gains[i // config.tracked_rollouts_per_plan]
             forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", k[nearest], off)
