@@ -25,7 +25,7 @@ ROOMS = ("ballbot_gym", "ballbot_baselines", "ground floor", "evaluation", "lear
 def modules(path, only_top_level=False):
     """Dotted names that the import statements of a file name, anywhere in it or at its top level only.
 
-    `from a import b` counts as a.b, because b may be a module. Imports for the type checker only do not count: they never run.
+    `from a import b` counts as a.b, because b may be a module. Imports for type checkers never run and do not count.
     """
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
