@@ -224,10 +224,14 @@ def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path):
     runs = tmp_path / "runs"
     (runs / "basins").mkdir(parents=True)
     (runs / "basins" / "basins.json").write_text("{")
+    (runs / "train").mkdir()
+    (runs / "train" / "config.json").write_text("{")
+    (runs / "train" / "evaluations.csv").write_text("seconds,regret_mean\n1,2\n")
     arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
     run = ballbot(*arguments, "--workers", 1, cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert "skipped: runs/basins/basins.json is damaged" in run.stdout
+    assert "skipped: runs/train/config.json" in run.stdout
     assert (runs / "benchmark" / "leaderboard.csv").exists()
 
 
