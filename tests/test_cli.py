@@ -202,7 +202,7 @@ def test_only_the_command_that_is_called_is_imported():
         (["--version"], 0, "ballbot 0."),
         (["trian"], 2, "no command 'trian'; did you mean train?"),
         (["[red]x"], 2, "no command '[red]x'; the commands are benchmark, compare"),
-        (["compare"], 2, "usage: ballbot compare"),
+        (["compare"], 2, "ballbot compare"),
     ],
 )
 def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, message, tmp_path):
