@@ -1,5 +1,5 @@
 # make demo   install into .venv and run the benchmark on an eighth of the episodes: LQR, trajectory optimization, NMPC
-# make test   install into .venv, then lint and test
+# make test   install into .venv, then lint, check types and test
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,6 +12,7 @@ demo: $(VENV)/installed
 test: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/pytest -m "not slow"
 
 test-slow: $(VENV)/installed
@@ -29,9 +30,17 @@ docs: $(VENV)/installed
 certify: $(VENV)/installed
 	$(BIN)/ballbot certify
 
+# PyBullet has no wheels for newer Pythons than 3.11. Where it is missing, uv fetches it.
 $(VENV)/installed: pyproject.toml constraints.txt
-	command -v $(PYTHON) >/dev/null || { echo "ballbot-gym needs Python 3.11 (PyBullet has no newer wheels): make PYTHON=/path/to/python3.11"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@if command -v $(PYTHON) >/dev/null; then \
+		$(PYTHON) -m venv $(VENV); \
+	elif command -v uv >/dev/null; then \
+		uv venv --allow-existing --seed --python 3.11 $(VENV); \
+	else \
+		echo "ballbot-gym needs Python 3.11, and $(PYTHON) is not a command here."; \
+		echo "Install Python 3.11 or uv, or name your interpreter: make PYTHON=/path/to/python3.11"; \
+		exit 1; \
+	fi
 	$(BIN)/pip install -c constraints.txt "torch==2.13.0"
 	$(BIN)/pip install -c constraints.txt -e ".[all,dev,docs]"
 	touch $@

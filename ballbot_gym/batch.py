@@ -2,15 +2,15 @@
 
 Components come first: a batch of B states is a tensor (8, B), so that every operation runs over contiguous memory.
 
-Random numbers are those of `counter_rng`, not the numbers that `BallbotEnv` draws from NumPy's generator for the same seed.
-The same seed and actions give the same results bit by bit among eager batches, and among compiled ones of two or more envs.
-Eager, compiled, and a compiled batch of one, whose sine is another library's, agree to rounding.
+Random numbers come from `counter_rng`; `BallbotEnv` draws others, from NumPy's generator, for the same seed.
+Eager batches give bit-identical results for the same seed and actions, and so do compiled batches of two or more envs. Eager
+and compiled batches agree to rounding. So does a compiled batch of one env, which computes sines with another library.
 """
 
 import logging
 import shutil
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -26,7 +26,7 @@ from ballbot_gym.tasks import Task
 _log = logging.getLogger(__name__)
 
 COMPILE_FROM = 1024
-"""Batch size from which compile="auto" compiles: below, compiling for half a minute seldom pays."""
+"""Batch size from which compile="auto" compiles. For smaller batches half a minute of compiling seldom pays."""
 
 _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The fields of `BatchStep` that are bools."""
@@ -51,11 +51,23 @@ class BatchState(NamedTuple):
     """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
 
 
+class _Rows(NamedTuple):
+    """A `BatchState` in which each matrix is a tuple of its rows (B,). Everything is computed in this form."""
+
+    x: tuple[torch.Tensor, ...]
+    c: tuple[torch.Tensor, ...]
+    steps: torch.Tensor
+    episode: torch.Tensor
+    seed: torch.Tensor
+    drawn: tuple[torch.Tensor, ...]
+    actuator: tuple[torch.Tensor, ...]
+
+
 class BatchStep(NamedTuple):
-    """What one control step of B environments gave. Environments whose episode ended have started the next one."""
+    """The result of one control step of B environments. Environments whose episode ended have started the next one."""
 
     observation: torch.Tensor
-    """(B, no) observations; of ended episodes, the next one's first."""
+    """(B, no) observations. Where an episode ended, the first one of the next episode."""
     reward: torch.Tensor
     """(B,) −cost of the step."""
     terminated: torch.Tensor
@@ -77,11 +89,31 @@ class BatchStep(NamedTuple):
     final_tilt: torch.Tensor
     """(B,) rad, of `final_x`; carries no gradient."""
     tilt: torch.Tensor
-    """(B,) rad, of the states that follow: `final_x`, or where an episode ended the next one's start; no gradient."""
+    """(B,) rad, of `final_x`, or where an episode ended of the next one's initial state; carries no gradient."""
+
+
+class BatchEpisodes(NamedTuple):
+    """One episode of each of B environments."""
+
+    cost: torch.Tensor
+    """(B,) float64, minus the return."""
+    success: torch.Tensor
+    """(B,) bool: the episode ended in the goal."""
+    failure: torch.Tensor
+    """(B,) bool: the episode ended at a violated margin."""
+    terminated: torch.Tensor
+    """(B,) bool: the episode ended by success or failure, not because its time was over."""
+    steps: torch.Tensor
+    """(B,) int64, control steps taken."""
+    states: torch.Tensor | None
+    """(T, 8, B) states after each control step, where they were recorded. What follows the end of an episode is undefined."""
 
 
 class _Robot(NamedTuple):
-    """What `dynamics` reads of `BallbotParams`, whose cached properties take a lock that torch.compile cannot."""
+    """The parameters that `dynamics` reads, as plain values.
+
+    torch.compile cannot trace the cached properties of `BallbotParams`, because they take a lock.
+    """
 
     total_mass: Any
     first_moment: Any
@@ -92,7 +124,8 @@ class _Robot(NamedTuple):
     @classmethod
     def of(cls, params: BallbotParams) -> "_Robot":
         derived = (BallbotParams.total_mass, BallbotParams.first_moment, BallbotParams.pivot_inertia)
-        return cls(*(value.func(params) for value in derived), params.axial_inertia, params.gravity)
+        total_mass, first_moment, pivot_inertia = (value.func(params) for value in derived)
+        return cls(total_mass, first_moment, pivot_inertia, params.axial_inertia, params.gravity)
 
 
 class BallbotBatch:
@@ -120,9 +153,9 @@ class BallbotBatch:
             task: a name in `TASKS`, or a Task.
             num_envs: B.
             device, dtype: of all tensors; torch.float32 or torch.float64.
-            compile: True compiles `transition` at the first step, for half a minute or so, and raises where that fails;
-                "auto" does so for batches of at least `COMPILE_FROM` where a compiler is found, and falls back to eager
-                execution with a warning in the log; False never compiles.
+            compile: True compiles `transition` at the first step, for half a minute or so, and raises if that fails.
+                "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
+                warning and runs eagerly. False never compiles.
             params: the nominal robot; default, the paper's.
             randomization: what varies; default, nothing.
             **task_fields: fields of the task that replace its defaults.
@@ -154,7 +187,7 @@ class BallbotBatch:
 
     @property
     def compiled(self) -> bool:
-        """Whether `step` runs compiled code; settled after the first step."""
+        """Whether `step` runs compiled code. It can change once, at the first step, where compiling fails."""
         return self._run != self.transition
 
     def reset(
@@ -167,25 +200,26 @@ class BallbotBatch:
         """Starts episodes.
 
         Args:
-            seed: an int seeds env i with seed + i, a sequence env i with seed[i], where it is not None. Without one, each
-                env goes on to its next episode, or is seeded at random the first time.
-            mask: (B,) bool, the envs to reset; default, all. All are reset the first time.
-            x: (8, B) initial states and c: (nc, B) constants; default, drawn. They are not checked.
+            seed: an int seeds env i with seed + i; a sequence seeds env i with seed[i]. An env without a seed starts its
+                next episode; the first time it is seeded at random.
+            mask: (B,) bool, the envs to reset; default, all. The first time all are reset.
+            x: (8, B) initial states; default, drawn. They are not checked.
+            c: (nc, B) constants; default, drawn. They are not checked.
 
         Returns:
             (B, no) observations of all envs.
         """
-        self.state = self.begin(seed, mask, x, c)
+        self.state = self.initial_state(seed, mask, x, c)
         return self.observe(self.state)
 
-    def begin(
+    def initial_state(
         self,
         seed: int | Sequence[int | None] | None = None,
         mask: torch.Tensor | None = None,
         x: torch.Tensor | None = None,
         c: torch.Tensor | None = None,
     ) -> BatchState:
-        """The state that `reset` would go to; changes nothing."""
+        """The state in which `reset` with these arguments would start; changes nothing."""
         old = self.state
         if old is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -201,27 +235,28 @@ class BallbotBatch:
         return self._stacked(new if old is None else _select(mask, new, _rows(old)))
 
     def observe(self, state: BatchState) -> torch.Tensor:
-        """(B, no) observations of a state: a pure function, the sensors' noise included."""
+        """(B, no) observations of a state, with the sensors' noise. A pure function."""
         return self._observe(_rows(state))
 
     def step(self, actions: torch.Tensor) -> BatchStep:
         """Holds forces for one control step; see `transition`. Call `reset` first."""
-        if self.state is None:
+        state = self.state
+        if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         try:
-            self.state, result = self._run(self.state, actions)
+            self.state, result = self._run(state, actions)
         except Exception as error:
             if self._proven or self._compile is True:
                 raise
             reason = str(error).strip().splitlines()[:1]
             _log.warning("torch.compile failed, the batch runs eagerly: %s %s", type(error).__name__, reason)
             self._run = self.transition
-            self.state, result = self._run(self.state, actions)
+            self.state, result = self._run(state, actions)
         self._proven = True
         return result._replace(**{name: getattr(result, name).bool() for name in _FLAGS}) if self.compiled else result
 
     def detach(self) -> None:
-        """Cuts the gradient: later steps do not reach back behind this point."""
+        """Cuts the gradient: gradients of later steps do not flow into earlier ones."""
         if self.state is not None:
             self.state = BatchState(*(part.detach() for part in self.state))
 
@@ -230,7 +265,8 @@ class BallbotBatch:
 
         Args:
             state: of the batch.
-            actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1]. They are taken to be finite.
+            actions: (B, 2) forces in units of the robot's force limit, clipped to [−1, 1]. That they are finite is not
+                checked.
         """
         task, noise = self.task, self.randomization
         now = _rows(state)
@@ -244,7 +280,7 @@ class BallbotBatch:
                 counter_rng.key(state.seed, state.episode, state.steps + 1), Randomization.PUSH_DRAWS, self.dtype
             )
             total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
-        robot = self.params
+        robot: Any = self.params
         if noise.varies_robot:
             robot = _Robot.of(noise.robot(self.params, now.drawn[:4]))
 
@@ -294,8 +330,8 @@ class BallbotBatch:
 
     def _start(
         self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
-    ) -> BatchState:
-        """The beginnings of episodes, in rows; x and c are drawn where they are not given."""
+    ) -> _Rows:
+        """The starts of episodes; x and c are drawn where they are not given."""
         task, noise = self.task, self.randomization
         key = counter_rng.key(seed, episode, 0 * episode)
         varied = noise.varies_robot or noise.varies_actuator
@@ -308,10 +344,10 @@ class BallbotBatch:
         drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
         actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
-        return BatchState(state, constants, zero, episode, seed, drawn, actuator)
+        return _Rows(state, constants, zero, episode, seed, drawn, actuator)
 
-    def _actuate(self, now: BatchState, command: tuple) -> tuple[tuple, tuple]:
-        """Force (2) applied, and the actuator's new memory, of a state in rows."""
+    def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
+        """Force (2) that the actuator applies, and its new memory."""
         if not self.randomization.varies_actuator:
             return command, now.actuator
         pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
@@ -319,8 +355,8 @@ class BallbotBatch:
         kept = (command, *pairs[1:])[: self._past_steps]
         return force, tuple(part for pair in (force, *kept) for part in pair)
 
-    def _observe(self, now: BatchState) -> torch.Tensor:
-        """(B, no) of a state in rows with the sensors' noise, which is drawn for the episode's steps so far."""
+    def _observe(self, now: _Rows) -> torch.Tensor:
+        """(B, no) observations with the sensors' noise, which depends on the number of steps taken in the episode."""
         x = now.x
         if self.randomization.is_noisy:
             key = counter_rng.key(now.seed, now.episode, now.steps + 1)
@@ -328,12 +364,50 @@ class BallbotBatch:
             x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :])
         return torch.stack(self.task.observe(x, now.c)).T
 
-    def _stacked(self, rows: BatchState) -> BatchState:
-        """A state in rows as tensors."""
+    def _stacked(self, rows: _Rows) -> BatchState:
+        """The rows as tensors."""
         none = torch.zeros(0, *rows.seed.shape, dtype=self.dtype, device=rows.seed.device)
         return BatchState(
             *(part if isinstance(part, torch.Tensor) else torch.stack(part) if part else none for part in rows)
         )
+
+
+@torch.no_grad()
+def run_episodes(
+    batch: BallbotBatch,
+    policy: Callable[[torch.Tensor], torch.Tensor],
+    x: np.ndarray | torch.Tensor,
+    c: np.ndarray | torch.Tensor,
+    record: bool = False,
+) -> BatchEpisodes:
+    """Runs one episode of each environment, all at once and without gradients.
+
+    Args:
+        batch: where to run; it is reset with seed 0.
+        policy: from observations (B, no) to actions (B, 2).
+        x: (B, 8) initial states.
+        c: (B, nc) constants of the episodes.
+        record: whether to keep the states of all control steps.
+    """
+    start = (torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device) for part in (x, c))
+    observation = batch.reset(0, None, *start)
+    running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
+    success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
+    cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)
+    steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=batch.device)
+    states: list[torch.Tensor] = []
+    for _ in range(batch.task.steps):
+        result = batch.step(policy(observation))
+        observation = result.observation
+        cost -= torch.where(running, result.reward, 0.0)
+        steps += running
+        success |= running & result.success
+        failure |= running & result.failure
+        terminated |= running & result.terminated
+        running &= ~(result.terminated | result.truncated)
+        if record:
+            states.append(result.final_x)
+    return BatchEpisodes(cost, success, failure, terminated, steps, torch.stack(states) if record else None)
 
 
 def _has_compiler(device: torch.device) -> bool:
@@ -343,30 +417,32 @@ def _has_compiler(device: torch.device) -> bool:
 
 
 def _compiled(transition: Any) -> Any:
-    """The bound method compiled, from a copy of its code: PyTorch limits recompilations per code object, and here every
-    batch size and task is one.
+    """The bound method, compiled.
+
+    A copy of its code is compiled, because PyTorch limits the recompilations of a code object, and each batch size and task
+    needs one.
     """
     function = transition.__func__
     own = types.FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
-    # By default no loop takes more than 64 operations, and what crosses from one loop to the next goes through memory.
-    options = {"max_fusion_size": 1000}
+    # By default a loop holds at most 64 operations, and results pass from one loop to the next through memory.
+    options: dict[str, Any] = {"max_fusion_size": 1000}
     return torch.compile(types.MethodType(own, transition.__self__), fullgraph=True, dynamic=False, options=options)
 
 
-def _rows(state: BatchState) -> BatchState:
-    """The state with each of its matrices as a tuple of rows (B,), the form in which everything is computed."""
-    return BatchState(*(part.unbind(0) if part.ndim == 2 else part for part in state))
+def _rows(state: BatchState) -> _Rows:
+    parts: Any = (part.unbind(0) if part.ndim == 2 else part for part in state)
+    return _Rows(*parts)
 
 
-def _select(mask: torch.Tensor, new: BatchState, old: BatchState) -> BatchState:
-    """The new state where the mask (B,) holds, else the old, both in rows."""
+def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
+    """The new state where the mask (B,) holds, else the old."""
 
     def chosen(a: Any, b: Any) -> Any:
         if isinstance(a, tuple):
             return tuple(map(chosen, a, b))
         return a if a is b else torch.where(mask, a, b)
 
-    return BatchState(*map(chosen, new, old))
+    return _Rows(*map(chosen, new, old))
 
 
 def all_of(conditions: Any) -> torch.Tensor:
@@ -386,18 +462,17 @@ def any_of(conditions: Any) -> torch.Tensor:
 
 
 def tilt_of(x: tuple) -> torch.Tensor:
-    """(B,) rad of states of 8 rows, without gradient, which is infinite at upright."""
-    # float rounding can leave a cosine a hair above 1
-    return torch.acos(dynamics.cos_tilt(tuple(part.detach() for part in x)).clamp(max=1.0))
+    """(B,) tilt, rad, of states in 8 rows. It carries no gradient, because that is infinite where a robot is upright."""
+    return dynamics.tilt(tuple(part.detach() for part in x))
 
 
 def _seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
     """One seed per env."""
-    if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-        seed = [int(seed) + i for i in range(num_envs)]
-    if len(seed) != num_envs:
-        raise ValueError(f"seed has {len(seed)} entries for {num_envs} envs")
-    for value in seed:
+    seeds: list[int | None] = []
+    seeds += [int(seed) + i for i in range(num_envs)] if isinstance(seed, int | np.integer) else seed
+    if len(seeds) != num_envs:
+        raise ValueError(f"seed has {len(seeds)} entries for {num_envs} envs")
+    for value in seeds:
         if value is not None and not 0 <= value < 2**63:
             raise ValueError(f"seeds must be in [0, 2^63), not {value}")
-    return list(seed)
+    return seeds

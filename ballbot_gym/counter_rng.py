@@ -1,7 +1,7 @@
 """Random numbers for batches: a hash of (the env's seed, the episode's number, the step, an index), in torch.
 
-So the same seed and actions give the same results in every batch, wherever the env stands in it, and ended episodes are
-drawn anew without a loop.
+An env's random numbers therefore do not depend on the batch or on its position in it, and the starts of new episodes are
+drawn without a loop.
 """
 
 import torch
@@ -10,7 +10,7 @@ _WORD = 0xFFFFFFFF  # hashes are 32-bit words kept in int64, whose products then
 
 
 def key(seed: torch.Tensor, episode: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-    """(B,) words from which one step's random numbers follow; step 0 is the start of the episode."""
+    """(B,) words that determine the random numbers of one step. Step 0 is the start of the episode."""
     return _mix(_mix(_mix(_mix(seed & _WORD) ^ (seed >> 32)) ^ (episode & _WORD)) ^ (step & _WORD))
 
 
@@ -21,7 +21,7 @@ def uniforms(key: torch.Tensor, count: int, dtype: torch.dtype) -> tuple[torch.T
 
 
 def _mix(word: torch.Tensor) -> torch.Tensor:
-    """A bijection of 32-bit words that scatters them: the multiply and xor-shift rounds of murmur's finalizer."""
+    """A bijection that scatters 32-bit words. It has the multiply and xor-shift rounds of MurmurHash's finalizer."""
     word = ((word ^ (word >> 16)) * 0x21F0AAAD) & _WORD
     word = ((word ^ (word >> 15)) * 0x735A2D97) & _WORD
     return word ^ (word >> 15)

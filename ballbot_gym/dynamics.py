@@ -134,3 +134,12 @@ def cos_tilt(x: Vector) -> Any:
     """Cosine of the angle between the body's axis and the vertical: cos γ cos θ."""
     _, _, gamma, theta, *_ = ops.components(x)
     return ops.cos(gamma) * ops.cos(theta)
+
+
+def tilt(x: Vector) -> Any:
+    """Angle between the body's axis and the vertical, rad, of state x (..., 8). Not for CasADi; use `cos_tilt` there.
+
+    Its gradient is infinite where the robot stands upright.
+    """
+    # Libraries round cosines, so that one can lie just outside [−1, 1].
+    return ops.arccos(ops.clip(cos_tilt(x), -1.0, 1.0))

@@ -1,4 +1,4 @@
-"""BallbotEnv: Gymnasium's interface over a task and a simulator, and nothing else."""
+"""BallbotEnv: Gymnasium's interface to a task and a simulator."""
 
 import math
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.scene import Scene
-from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.simulator import PHYSICS, State
 from ballbot_gym.tasks import TASKS, Task
 
 
 class BallbotEnv(gymnasium.Env):
-    """A ballbot that does one task. Observation, action, cost and ends are tabulated in the task's docstring.
+    """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
     The reward of a step is −cost rate · control_dt, less the task's failure cost when a margin is violated, so an
     episode's return is exactly minus its cost.
@@ -57,8 +57,8 @@ class BallbotEnv(gymnasium.Env):
             render_mode: None, "rgb_array" or "human".
             params: the robot; default, the paper's.
             physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
-            randomization: what varies; default, nothing. In Bullet each new `com_height` is a URDF loaded anew, for which
-                PyBullet takes 2 ms and 5 kB that it never gives back.
+            randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
+                and 5 kB of memory that PyBullet never frees.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -67,8 +67,7 @@ class BallbotEnv(gymnasium.Env):
             ImportError: physics="bullet" without a usable PyBullet.
         """
         self._scene: Scene | None = None
-        self._simulator = None
-        self._state: tuple[float, ...] | None = None
+        self._state: State = ()  # until the first reset
         if physics not in PHYSICS:
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -99,7 +98,7 @@ class BallbotEnv(gymnasium.Env):
         Args:
             seed: seeds the draw of this and the following episodes.
             options: may hold "state", the (8,) initial state, and "constants", the (nc,) constants of the episode or a
-                dict of some of them by name; what is not given is drawn.
+                dict of some of them by name. Everything else is drawn.
 
         Raises:
             ValueError: an unknown option, or a state or constants of the wrong shape, not finite, or unsafe.
@@ -135,7 +134,7 @@ class BallbotEnv(gymnasium.Env):
         if self._steps_left <= 0:
             self._check_open()
             raise gymnasium.error.ResetNeeded(
-                "step() before reset()" if self._state is None else "the episode has ended; call reset()"
+                "the episode has ended; call reset()" if self._state else "step() before reset()"
             )
         force, clipped = self._force(action)
         task, c, total = self.task, self._constants, force
@@ -174,12 +173,12 @@ class BallbotEnv(gymnasium.Env):
         if self.render_mode is None:
             gymnasium.logger.warn('render() without a render mode; make the environment with render_mode="rgb_array"')
             return None
-        if self._state is None:
+        if not self._state:
             raise gymnasium.error.ResetNeeded("render() before reset()")
         return self.render_state(self._state)
 
     def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
-        """As `render`, but of any state x (8,): to draw a recorded trajectory among this episode's markers."""
+        """Draws any state x (8,) with this episode's markers, for instance one of a recorded trajectory."""
         if self._scene is None:
             self._scene = Scene(self.params, human=self.render_mode == "human")
             self._scene.set_markers(self.task.markers(self._constants_array))
@@ -189,8 +188,7 @@ class BallbotEnv(gymnasium.Env):
         """Releases the physics client and the window; may be called again."""
         self._closed = True
         self._steps_left = 0
-        if self._simulator is not None:
-            self._simulator.close()
+        self._simulator.close()
         if self._scene is not None:
             self._scene.close()
             self._scene = None
@@ -200,7 +198,7 @@ class BallbotEnv(gymnasium.Env):
             raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
 
     def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Initial state and constants: drawn, where the options do not give them."""
+        """Initial state and constants. Those that the options do not give are drawn."""
         state, constants = options.pop("state", None), options.pop("constants", None)
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; known: 'state', 'constants'")
@@ -221,12 +219,12 @@ class BallbotEnv(gymnasium.Env):
             values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
             raise ValueError(
                 f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
-                f"tilt {math.degrees(_tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
+                f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
             )
         return x, c
 
-    def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[float]:
-        """Drawn constants with some replaced by name."""
+    def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[Any]:
+        """The drawn constants c, of which some are replaced by name."""
         names = self.task.constant_names
         unknown = sorted(set(named) - set(names))
         if unknown:
@@ -257,7 +255,7 @@ class BallbotEnv(gymnasium.Env):
         return {
             "state": np.array(self._state),
             "cost": cost,
-            "tilt": _tilt(self._state),
+            "tilt": dynamics.tilt(self._state),
             "success": success,
             "failure": failure,
             "force": np.array(force),
@@ -294,8 +292,3 @@ def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:
     if vector.shape != (size,) or not np.isfinite(vector).all():
         raise ValueError(f"{what} must be {size} finite numbers, not {value!r}")
     return vector
-
-
-def _tilt(x: Sequence[float]) -> float:
-    # float rounding can leave a cosine a hair above 1
-    return math.acos(min(1.0, math.cos(x[2]) * math.cos(x[3])))

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Writes files so that a reader never sees half of one."""
 
 import csv
 import io
@@ -26,7 +26,7 @@ def write(path: str | Path, content: bytes | str) -> Path:
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
     """Writes arrays as a compressed .npz, the same bytes for the same arrays."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]  # no array is called allow_pickle
     return write(path, buffer.getvalue())
 
 

@@ -1,8 +1,8 @@
-"""The few functions that robot and tasks are written in: one source for floats, NumPy, CasADi and torch.
+"""Elementary functions for robot and tasks, which then work with floats, NumPy, CasADi and torch alike.
 
 A vector is an array whose last axis holds the components (NumPy, torch), a column (CasADi), or a tuple of components.
-A tuple's components may themselves be floats, arrays of any one shape, tensors or symbols, which is the fast layout for
-one robot in pure Python and for a batch on an accelerator alike.
+A tuple's components may be floats, arrays of one shape, tensors or symbols. This layout is fast both for one robot in pure
+Python and for a batch on an accelerator.
 """
 
 import functools
@@ -18,7 +18,7 @@ Vector = Any
 
 
 def _library(a: Any) -> ModuleType:
-    """The module that computes with `a`: already imported, because `a` exists."""
+    """The library of `a`. It is already imported, because `a` exists."""
     return sys.modules.get(type(a).__module__.partition(".")[0], np)
 
 
@@ -47,8 +47,18 @@ def log(a: Any) -> Any:
     return math.log(a) if isinstance(a, float) else _library(a).log(a)
 
 
+def arccos(a: Any) -> Any:
+    """Arc cosine, elementwise. Not for CasADi."""
+    return math.acos(a) if isinstance(a, float | int) else _library(a).arccos(a)
+
+
+def clip(a: Any, low: float, high: float) -> Any:
+    """The nearest number in [low, high], elementwise; NaN stays NaN. Not for CasADi."""
+    return max(min(a, high), low) if isinstance(a, float | int) else _library(a).clip(a, low, high)
+
+
 def where(condition: Any, a: Any, b: Any) -> Any:
-    """a where the condition holds, else b, elementwise. Not for CasADi: what tasks ask of optimizers is smooth."""
+    """a where the condition holds, else b, elementwise. Not for CasADi, because optimizers need smooth functions."""
     if isinstance(condition, bool):
         return a if condition else b
     library = _library(condition)
@@ -56,6 +66,21 @@ def where(condition: Any, a: Any, b: Any) -> Any:
         as_tensor = functools.partial(library.as_tensor, device=condition.device)
         return library.where(condition, as_tensor(a), as_tensor(b))
     return np.where(condition, a, b)
+
+
+def between(z: Any, low: Any, high: Any) -> Any:
+    """A uniform number z in [0, 1) as one in [low, high), elementwise."""
+    return low + (high - low) * z
+
+
+def squared(*parts: Any) -> Any:
+    """Sum of the squares of components."""
+    return sum(part * part for part in parts)
+
+
+def scaled(parts: tuple[Any, ...], scale: tuple[float, ...], like: Vector) -> Vector:
+    """A vector of the kind of `like` whose components are the parts, each divided by its scale."""
+    return stack(tuple(part / s for part, s in zip(parts, scale, strict=True)), like)
 
 
 def components(v: Vector) -> tuple[Any, ...]:
@@ -75,8 +100,8 @@ def stack(parts: tuple[Any, ...], like: Vector) -> Vector:
     if _is_casadi(like):
         return library.vertcat(*parts)
     if library.__name__ == "torch":
-        parts = [library.as_tensor(part, dtype=like.dtype, device=like.device) for part in parts]
-        return library.stack(library.broadcast_tensors(*parts), dim=-1)
+        tensors = [library.as_tensor(part, dtype=like.dtype, device=like.device) for part in parts]
+        return library.stack(library.broadcast_tensors(*tensors), dim=-1)
     return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
 

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
-_PLACES = (Path(__file__).parent, Path(__file__).parent.parent)  # an installed wheel; a checkout
-URDF_PATH = next(
-    (path for place in _PLACES if (path := place / "urdf" / "ballbot.urdf").is_file()), Path("urdf/ballbot.urdf")
-)
-"""The paper's robot: `urdf/ballbot.urdf` of the checkout, which a wheel carries inside the package."""
+_PACKAGE = Path(__file__).parent
+_IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf" / "ballbot.urdf", _PACKAGE.parent / "urdf" / "ballbot.urdf"
+URDF_PATH = _IN_WHEEL if _IN_WHEEL.is_file() else _IN_CHECKOUT
+"""The URDF of the paper's robot. A wheel holds it inside the package, a checkout beside the package."""
 
 STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
 
-# joint: type, axis, parent link, child link. The closed form holds for this chain and no other.
+# joint: type, axis, parent link, child link. The closed-form dynamics hold for this chain only.
 _CHAIN = {
     "x": ("prismatic", (1.0, 0.0, 0.0), "world", "slide"),
     "y": ("prismatic", (0.0, 1.0, 0.0), "slide", "ball"),
@@ -104,14 +103,16 @@ class BallbotParams:
         )
 
     def to_urdf(self) -> str:
-        """The URDF text of this robot: the packaged file with this object's numbers; `from_urdf` reads them back."""
+        """The URDF text of this robot: the packaged file with this robot's numbers. `from_urdf` reads it back exactly."""
         urdf = _Urdf(URDF_PATH)
         urdf.find("link[@name='ball']/inertial/mass").set("value", repr(self.ball_mass))
         urdf.find("link[@name='body']/inertial/mass").set("value", repr(self.body_mass))
         body_inertia = urdf.find("link[@name='body']/inertial/inertia")
         for name, value in (("ixx", self.inertia), ("iyy", self.inertia), ("izz", self.axial_inertia)):
             body_inertia.set(name, repr(value))
-        ball_inertia = 0.4 * self.ball_mass * self.ball_radius**2  # solid sphere; it has no effect, the ball translates
+        ball_inertia = (
+            0.4 * self.ball_mass * self.ball_radius**2
+        )  # of a solid sphere; has no effect: the ball does not roll
         for name in ("ixx", "iyy", "izz"):
             urdf.find("link[@name='ball']/inertial/inertia").set(name, repr(ball_inertia))
         for place in ("inertial", "visual"):
@@ -133,7 +134,7 @@ def default_params() -> BallbotParams:
 
 
 class _Urdf:
-    """A parsed URDF whose look-ups raise a `UrdfError` that names what is missing."""
+    """A parsed URDF. Its methods raise a `UrdfError` that names what is missing."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -237,10 +238,10 @@ class _Urdf:
         for name in ("ixy", "ixz", "iyz"):
             if inertia.get(name) is not None and self._number(inertia, name, where) != 0:
                 raise self.error(f"{where}: {name} must be 0")
-        moments = tuple(self._number(inertia, name, where) for name in ("ixx", "iyy", "izz"))
-        if min(moments) <= 0:
-            raise self.error(f"{where} must be positive, not {moments} kg·m²")
-        return moments
+        ixx, iyy, izz = (self._number(inertia, name, where) for name in ("ixx", "iyy", "izz"))
+        if min(ixx, iyy, izz) <= 0:
+            raise self.error(f"{where} must be positive, not {(ixx, iyy, izz)} kg·m²")
+        return ixx, iyy, izz
 
     def com_height(self, link: str) -> float:
         origin = self._child("link", link, "inertial/origin")

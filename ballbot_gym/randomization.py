@@ -1,7 +1,7 @@
-"""Domain randomization: robots, actuators, sensors and pushes that vary, for one environment and for batches alike.
+"""Domain randomization: robots, actuators, sensors and pushes that vary, for one environment and for batches.
 
-Nothing here draws: every function takes uniform numbers in [0, 1), as floats or as batches, so that `BallbotEnv` and the
-batched simulator follow the same lines.
+`Randomization` draws no random numbers itself. Its methods take uniform numbers in [0, 1), floats or batches, so that
+`BallbotEnv` and `BallbotBatch` use the same code.
 """
 
 import math
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import ops
+from ballbot_gym.ops import between
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import between
 
 Range = tuple[float, float]
 """(low, high), both included; drawn uniformly."""
@@ -20,10 +20,10 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Randomization:
-    """What varies, and how far. Everything is off by default. Ranges are (low, high), drawn uniformly.
+    """What varies, and how far. By default nothing varies. Ranges are (low, high), drawn uniformly.
 
-    Cost, margins, goal and `info["state"]` see the true state and the force that the actuator really applies; tasks draw
-    their episodes for the nominal robot. Pushes do not count as effort.
+    Cost, margins, goal and `info["state"]` use the true state and the force that the actuator applies. Tasks draw their
+    episodes for the nominal robot. Pushes do not count as effort.
 
     Raises:
         ValueError: a range that is reversed, not finite or out of its domain; the message names the field.
@@ -42,7 +42,7 @@ class Randomization:
     actuator_delay: Range = (0.0, 0.0)
     """Dead time before the force responds, s: whole control steps, drawn per episode."""
     position_noise: float = 0.0
-    """Standard deviation of observed x and y, m, anew at each observation."""
+    """Standard deviation of observed x and y, m. All noise is independent at each observation."""
     lean_noise: float = 0.0
     """Standard deviation of observed γ and θ, rad."""
     velocity_noise: float = 0.0
@@ -52,7 +52,7 @@ class Randomization:
     push_impulse: Range = (0.0, 0.0)
     """Horizontal impulse on the ball, N·s, in a random direction, spread over one control step."""
     push_interval: float = 1.0
-    """Mean time between pushes, s; in each control step one comes with probability control_dt / push_interval."""
+    """Mean time between pushes, s. In each control step there is one with probability control_dt / push_interval."""
 
     EPISODE_DRAWS = 6
     """Uniform numbers that `draw` takes."""
@@ -125,11 +125,10 @@ class Randomization:
         return low, high
 
     def draw(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
-        """What 6 uniform numbers stand for in an episode.
+        """An episode's robot and actuator from 6 uniform numbers.
 
         Returns:
-            Factors on body mass, ball mass, centre-of-mass height and inertia; then for `actuate` the share of the way
-            to its command that the force goes in one control step, and the delay in control steps.
+            Factors on body mass, ball mass, centre-of-mass height and inertia; then the gain and the delay of `actuate`.
         """
         ranges = (self.body_mass, self.ball_mass, self.com_height, self.inertia)
         factors = tuple(between(z[i], *ranges[i]) for i in range(4))
@@ -154,21 +153,21 @@ class Randomization:
         )
 
     def push(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, Any]:
-        """Push (2), N, in a control step for which 3 uniform numbers were drawn; mostly zero."""
+        """The push (2), N, of a control step from 3 uniform numbers; zero in most steps."""
         strength = between(z[1], *self.push_impulse) / control_dt
         force = ops.where(z[0] < control_dt / self.push_interval, strength, 0.0 * strength)
         bearing = 2 * math.pi * z[2]
         return force * ops.cos(bearing), force * ops.sin(bearing)
 
     def sensed(self, x: tuple[Any, ...], z: tuple[Any, ...]) -> tuple[Any, ...]:
-        """State (8) as the sensors report it, for 8 uniform numbers."""
+        """State (8) as the sensors report it, with noise from 8 uniform numbers."""
         return tuple(
             value + std * normal if std else value for value, std, normal in zip(x, self.noise, normals(z), strict=True)
         )
 
 
 class Disturbance:
-    """The randomization of one environment: what is drawn for its episode, and its actuator's memory."""
+    """The randomization of one environment: the robot and actuator of its episode, and the actuator's memory."""
 
     def __init__(self, randomization: Randomization, params: BallbotParams, control_dt: float):
         """Args: params: the nominal robot. control_dt: s."""
@@ -187,13 +186,13 @@ class Disturbance:
         self._past: tuple[tuple[float, float], ...] = ((0.0, 0.0),) * self._past_steps
 
     def actuate(self, command: tuple[float, float]) -> tuple[float, float]:
-        """Force, N, that the actuator applies in the control step of this command, N."""
+        """The force, N, that the actuator applies in the control step that begins with this command, N."""
         self._force = actuate(command, self._past, self._force, self._gain, self._delay)
         self._past = (command, *self._past)[: self._past_steps]
         return self._force
 
     def pushed(self, force: tuple[float, float], rng: np.random.Generator) -> tuple[float, float]:
-        """The force, N, with the push of this control step, if one comes."""
+        """The force, N, plus the push of this control step, if there is one."""
         if not self._randomization.pushes:
             return force
         push = self._randomization.push(tuple(rng.random(Randomization.PUSH_DRAWS).tolist()), self._dt)
@@ -215,8 +214,8 @@ def actuate(
         command: (2,) N, asked for now.
         past: earlier commands, the latest first, as many as the longest delay in control steps.
         force: (2,) N, applied in the last control step.
-        gain: share of the way to the due command that the force goes in one control step.
-        delay: control steps until a command is due.
+        gain: fraction of the difference to the delayed command by which the force changes in one control step.
+        delay: dead time of commands, control steps.
     """
     due = command
     for age, old in enumerate(past, start=1):
@@ -225,7 +224,7 @@ def actuate(
 
 
 def normals(z: tuple[Any, ...]) -> tuple[Any, ...]:
-    """As many standard normal numbers as there are uniform ones, an even number, by Box and Muller's transform."""
+    """An even number of uniform numbers as standard normal ones, by the Box–Muller transform."""
     out: list[Any] = []
     for z1, z2 in zip(z[::2], z[1::2], strict=True):
         radius, bearing = ops.sqrt(-2.0 * ops.log(1.0 - z1)), 2 * math.pi * z2

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium
 import numpy as np
@@ -13,11 +13,12 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 
 class PlanError(RuntimeError):
-    """A controller found no plan for the episode; the message gives each try's solver, status and constraint violation."""
+    """A controller found no plan for the episode. The message gives each attempt's solver, status and violation."""
 
 
 class Controller(Protocol):
@@ -27,7 +28,8 @@ class Controller(Protocol):
         """Starts an episode at time t, s, in state x (8,) with constants c (nc,)."""
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        """Force (2,) N to hold until the next control step. What exceeds the limit is clipped by the robot."""
+        """Force (2,) N to hold until the next control step. The robot clips it to its limit."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class FunctionController:
 
 
 class DelayedController:
-    """Another controller whose forces act a number of control steps late, as a slow computer's do; before the first, 0."""
+    """Another controller whose forces are applied some control steps late, like those of a slow computer; at first 0."""
 
     def __init__(self, controller: Controller, steps: int):
         self._controller, self._steps = controller, steps
@@ -58,12 +60,41 @@ class DelayedController:
         return self._pending.pop(0)
 
 
+class ActionController:
+    """A function from observation to action as a Controller. It gets the observations that the env would show.
+
+    This is the one place where an observation is turned into a force.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray]):
+        """Wraps a function.
+
+        Args:
+            task: what is observed.
+            params: the robot, whose force limit is the unit of actions.
+            action: gets an observation (no,) float32 and whether an episode begins; returns an action (2,) in [−1, 1].
+        """
+        self._task, self._params, self._action = task, params, action
+        self._c: tuple[float, ...] = ()
+        self._begins = True
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
+        action = np.asarray(self._action(observation, self._begins), np.float64)
+        self._begins = False
+        return self._params.force_limit * action
+
+
 @dataclass(frozen=True)
 class Episode:
     """One episode under one controller.
 
-    `trajectory` holds the applied forces; `cost` is minus the return; `settle_time` the time from which on the goal held
-    until the end, s, or NaN; `act_seconds` the median wall time of `act`.
+    `trajectory` holds the applied forces. `cost` is minus the return. From `settle_time`, s, the goal held until the end; it
+    is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`, `act_seconds` its
+    median wall time in `act`.
     """
 
     trajectory: Trajectory
@@ -88,14 +119,14 @@ def rollout(
 
     Args:
         env: a BallbotEnv, wrapped or not; its wrappers are bypassed.
-        controller: gets the state as the env's sensors report it: the true one, unless its randomization has noise.
+        controller: gets the state as the env's sensors report it. Without sensor noise this is the true state.
         seed: as for `env.reset`.
         options: as for `env.reset`.
 
     Raises:
-        Exception: whatever the controller's `reset` raises, as a PlanError where no plan exists.
+        Exception: what the controller's `reset` raises, for instance a PlanError where it found no plan.
     """
-    ballbot: BallbotEnv = env.unwrapped
+    ballbot = cast(BallbotEnv, env.unwrapped)
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     _, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]
@@ -130,7 +161,7 @@ def rollout(
 
 
 def _sensed(env: BallbotEnv, x: np.ndarray) -> np.ndarray:
-    """State x (8,) with the noise of the env's sensors, drawn from the env's generator, anew at each call."""
+    """State x (8,) with the noise of the env's sensors. Each call draws new noise from the env's generator."""
     if not env.randomization.is_noisy:
         return x
     z = tuple(env.np_random.random(Randomization.NOISE_DRAWS).tolist())
@@ -145,7 +176,7 @@ def simulate(
     control_dt: float = 0.02,
     physics: str = "bullet",
 ) -> Trajectory:
-    """Runs a controller without a task: from state x0 (8,) for duration s, forces clipped to the robot's limit."""
+    """Runs a controller without a task, from state x0 (8,) for `duration` s. Forces are clipped to the robot's limit."""
     simulator = PHYSICS[physics](params, control_dt)
     x = np.asarray(x0, np.float64)
     simulator.reset(tuple(x.tolist()))

@@ -1,5 +1,6 @@
-"""Scene: draws states of the ballbot through PyBullet, in a physics client of its own, so that looking never changes a
-trajectory.
+"""Scene: draws states of the ballbot with PyBullet.
+
+It has its own physics client, so that drawing never changes a trajectory.
 """
 
 import math
@@ -18,9 +19,9 @@ _CAMERA = (4.0, -55.0, -22.0)  # distance, m, yaw and pitch, deg: from behind a 
 
 
 class Scene:
-    """Draws the ballbot on a floor with a grid, through PyBullet's software renderer or its window.
+    """Draws the ballbot on a floor with 1 m squares, with PyBullet's software renderer or in its window.
 
-    The camera follows the ball; the floor's 1 m squares make speed readable.
+    The camera follows the ball.
     """
 
     def __init__(self, params: BallbotParams, human: bool = False, width: int = 640, height: int = 480):
@@ -44,7 +45,7 @@ class Scene:
         self._add_floor()
 
     def set_markers(self, markers: list[Marker]) -> None:
-        """Replaces what the task wants drawn."""
+        """Replaces the task's markers."""
         for body in self._markers:
             self._bullet.removeBody(body, physicsClientId=self._client)
         self._markers = [body for marker in markers for body in self._add_marker(marker)]

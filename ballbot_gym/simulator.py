@@ -1,4 +1,4 @@
-"""Simulators of the ballbot behind one interface.
+"""Simulators of the ballbot with one interface.
 
 `BulletSimulator` loads the URDF into PyBullet; `Rk4Simulator` integrates the closed form and needs no PyBullet.
 """
@@ -30,6 +30,7 @@ class Simulator(Protocol):
 
     def step(self, u: tuple[float, float]) -> State:
         """Holds force u, N, for one control step and returns the state after it."""
+        ...
 
     def close(self) -> None:
         """Releases what the simulator holds; may be called again."""
@@ -82,7 +83,7 @@ class BulletSimulator:
         self._client = connect(bullet, bullet.DIRECT)
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
         self._robot, self._joints = load_robot(bullet, self._client, params)
-        # Substeps run in C++ with the torque held, bitwise equal to as many calls and a third faster.
+        # Substeps run in C++ with the force held. Results are bit-identical to single steps, a third faster.
         bullet.setPhysicsEngineParameter(fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client)
         bullet.setGravity(0, 0, -params.gravity, physicsClientId=self._client)
         self._bullet, self._com_height = bullet, params.com_height
@@ -95,7 +96,7 @@ class BulletSimulator:
     def set_params(self, params: BallbotParams) -> None:
         bullet, client = self._bullet, self._client
         if params.com_height != self._com_height:
-            # Loaded anew, because changeDynamics cannot move a link's centre of mass.
+            # The URDF is loaded again, because changeDynamics cannot move a link's centre of mass.
             bullet.removeBody(self._robot, physicsClientId=client)
             self._robot, self._joints = load_robot(bullet, client, params)
             self._com_height = params.com_height

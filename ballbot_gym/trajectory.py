@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_gym import files
+from ballbot_gym import dynamics, files
+from ballbot_gym.paths import hermite_basis
 
 
 class TrajectoryError(ValueError):
-    """A trajectory whose arrays do not fit together, or a file that holds none."""
+    """The arrays of a trajectory do not fit together, or a file holds no trajectory."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +63,10 @@ class Trajectory:
     @property
     def tilt(self) -> np.ndarray:
         """(N+1,) angle between the body's axis and the vertical, rad."""
-        return np.arccos(np.clip(np.cos(self.x[:, 2]) * np.cos(self.x[:, 3]), -1.0, 1.0))
+        return dynamics.tilt(self.x)
 
     def state(self, t: float) -> np.ndarray:
-        """x(t), (8,); before the start and after the end, the nearest end."""
+        """x(t), (8,). Before the start it is the first state, after the end the last one."""
         i, fraction = self._locate(t)
         if i == len(self.t) - 1:
             return self.x[-1].copy()
@@ -74,16 +75,11 @@ class Trajectory:
             return a + fraction * (b - a)
         h = self.t[i + 1] - self.t[i]
         slope_a, slope_b = h * self.xdot[i], h * self.xdot[i + 1]
-        s = fraction
-        return (
-            (1 + 2 * s) * (1 - s) ** 2 * a
-            + s * (1 - s) ** 2 * slope_a
-            + s**2 * (3 - 2 * s) * b
-            + s**2 * (s - 1) * slope_b
-        )
+        start, start_slope, end, end_slope = hermite_basis(fraction)
+        return start * a + start_slope * slope_a + end * b + end_slope * slope_b
 
     def force(self, t: float) -> np.ndarray:
-        """u(t), (2,) N; before the start and after the end, the nearest end."""
+        """u(t), (2,) N. Before the start it is the first force, after the end the last one."""
         i, fraction = self._locate(t)
         if self.held:
             return self.u[min(i, len(self.u) - 1)].copy()
@@ -92,20 +88,20 @@ class Trajectory:
         return self.u[i] + fraction * (self.u[i + 1] - self.u[i])
 
     def _locate(self, t: float) -> tuple[int, float]:
-        """Interval and fraction of it at which t lies; (N, 0) at the end."""
+        """The interval that contains t, and the fraction of it before t; (N, 0) at the end."""
         if t >= self.t[-1]:
             return len(self.t) - 1, 0.0
         i = max(0, int(np.searchsorted(self.t, t, side="right")) - 1)
         return i, max(0.0, (t - self.t[i]) / (self.t[i + 1] - self.t[i]))
 
     def resampled(self, dt: float) -> "Trajectory":
-        """The interpolated states and forces every dt s, with linear forces; for drawing and comparing."""
+        """The interpolated states and forces every dt s, with linear forces. For figures and comparisons."""
         times = np.append(np.arange(self.t[0], self.t[-1], dt), self.t[-1])
         times = times[np.concatenate([[True], np.diff(times) > 1e-9])]
         return Trajectory(times, np.array([self.state(t) for t in times]), np.array([self.force(t) for t in times]))
 
     def save(self, path: str | Path) -> Path:
-        """Writes an .npz file of the arrays; a reader never sees it half written."""
+        """Writes an .npz file of the arrays. A reader never sees half of it."""
         arrays = {"t": self.t, "x": self.x, "u": self.u}
         if self.xdot is not None:
             arrays["xdot"] = self.xdot

@@ -1,4 +1,4 @@
-"""BallbotVectorEnv: Gymnasium's interface over a `BallbotBatch`, with NumPy at the border."""
+"""BallbotVectorEnv: Gymnasium's vector interface to a `BallbotBatch`, with NumPy arrays."""
 
 import math
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ from ballbot_gym.tasks import Task
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.
 
-    Spaces, rewards, ends and `info` are those of `BallbotEnv(physics="rk4")`, with float32 physics unless dtype says
-    otherwise. Episodes restart within the step in which they end (`AutoresetMode.SAME_STEP`): then `infos` has, under
-    `final_obs` and `final_info`, what that step showed before the restart. In `final_info`, only the envs that the masks
-    `_…` mark are meant. Arrays returned are never written to again; `state` and `constants` in `infos` are the batch's
-    own memory, and read-only. Observations and states lie in memory component by component (Fortran order), as those of
-    Gymnasium's own batched CartPole; give actions in that order too and they are not copied.
+    Spaces, rewards, ends and `info` are those of `BallbotEnv(physics="rk4")`, in float32 by default. An env starts its next
+    episode in the step that ends the last one (`AutoresetMode.SAME_STEP`). `infos["final_obs"]` and `infos["final_info"]`
+    then hold the observation and info before the restart. The entries of `final_info` are valid only for the envs that the
+    masks `_…` mark. Returned arrays never change later; `state` and `constants` in `infos` share the batch's memory and are
+    read-only. Observations and states are in Fortran order, component by component, like those of Gymnasium's own batched
+    CartPole. Actions in that order are not copied.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -43,7 +43,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         randomization: Randomization | None = None,
         **task_fields: Any,
     ):
-        """Makes the environments; all arguments but render_mode are `BallbotBatch`'s.
+        """Makes the environments. All arguments except render_mode are those of `BallbotBatch`.
 
         Args:
             render_mode: None or "rgb_array", which draws every env in turn.
@@ -71,7 +71,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """Starts episodes.
 
         Args:
-            seed: env i is seeded with seed + i, or with seed[i]; where there is none, it goes on to its next episode.
+            seed: env i is seeded with seed + i, or with seed[i]. An env without a seed starts its next episode.
             options: may hold "reset_mask", (B,) bool NumPy array of the envs to reset; "state", (8,) or (B, 8) initial
                 states; "constants", (nc,) or (B, nc), or a dict of some of them by name, each a number or (B,).
 
@@ -91,10 +91,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             mask = np.ones_like(mask)
         tensor_mask = torch.from_numpy(mask).to(self.batch.device)
         with torch.no_grad():
-            state = self.batch.begin(seed, tensor_mask)
+            state = self.batch.initial_state(seed, tensor_mask)
             if constants is not None:
                 c = self._constants(constants, state, mask)
-                state = self.batch.begin(seed, tensor_mask, c=c)
+                state = self.batch.initial_state(seed, tensor_mask, c=c)
             if x is not None:
                 state = self._with_x(state, x, mask)
             self.batch.state = state
@@ -121,13 +121,15 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
+        before = self.batch.state
+        if before is None:
+            raise gymnasium.error.ResetNeeded("step() before reset()")
         actions = np.asarray(actions, self._dtype, order="F")  # components contiguous, as everything in the batch
         if actions.shape != (self.num_envs, 2):
             raise ValueError(f"actions must have shape ({self.num_envs}, 2), not {actions.shape}")
         if not np.isfinite(actions).all():
             bad = np.flatnonzero(~np.isfinite(actions).all(1))
             raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
-        before = self.batch.state
         with torch.no_grad():
             result = self.batch.step(torch.from_numpy(actions).to(self.batch.device))
         reward = self._array(result.reward, np.float64)
@@ -145,11 +147,13 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             infos["final_info"] = _masked(final_info, done)
             infos["final_obs"] = _some_rows(self._array(result.final_observation, np.float32), ended)
             infos["_final_info"] = infos["_final_obs"] = done
-            # What follows is of the next episodes where one ended, and they begin as after `reset`.
+            # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
             cost, force, clipped = cost.copy(), force.copy(), clipped.copy()
             cost[ended], force[:, ended], clipped[ended] = 0.0, 0.0, False
         never = np.zeros_like(done)
-        info = self._info(self.batch.state, cost, tilt, force.T, never, never.copy(), clipped)
+        state = self.batch.state
+        assert state is not None
+        info = self._info(state, cost, tilt, force.T, never, never.copy(), clipped)
         infos |= _masked(info, np.ones_like(done))
         return self._array(result.observation, np.float32), reward, terminated, truncated, infos
 
@@ -162,9 +166,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         return (getattr(self, name),) * self.num_envs
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """As `get_attr`, or what `render` gives for every env."""
+        """As `get_attr`, or what `render` gives for every env: None each where there is no render mode."""
         if name == "render":
-            return self.render()
+            return self.render() or (None,) * self.num_envs
         value = self.get_attr(name)
         return tuple(part(*args, **kwargs) if callable(part) else part for part in value)
 
@@ -228,7 +232,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         failure: np.ndarray,
         clipped: np.ndarray,
     ) -> dict[str, Any]:
-        """The keys of `BallbotEnv`'s info, in its order; the batch's own memory is not to be written to."""
+        """An info with the keys of `BallbotEnv`'s, in the same order. Arrays that share the batch's memory are read-only."""
         x, c = self._array(state.x.T), self._array(state.c.T)
         x.flags.writeable = c.flags.writeable = False
         return {
@@ -243,7 +247,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         }
 
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> torch.Tensor:
-        """(nc, B) constants, those given in place of those drawn."""
+        """(nc, B) constants: those given, and drawn ones for the rest."""
         names, task = self.task.constant_names, self.task
         c = self._array(drawn.c).astype(np.float64)
         if isinstance(constants, dict):
@@ -259,7 +263,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         return torch.as_tensor(c.astype(self._dtype), device=self.batch.device)
 
     def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
-        """The state with the initial x given, checked, where the mask says so."""
+        """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
         x = torch.as_tensor(_finite(given, (self.num_envs, 8), "state").T.astype(self._dtype, order="C"))
         x = torch.where(torch.from_numpy(mask), x, state.x.cpu()).to(self.batch.device)
         safe = self._array(all_of(m >= 0 for m in self.task.margins(x.unbind(0), state.c.unbind(0))))
@@ -294,7 +298,7 @@ def _finite(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """An info with Gymnasium's masks, which say whose entries are meant."""
+    """An info with Gymnasium's masks, which mark the envs whose entries are valid."""
     return {key: part for name, value in info.items() for key, part in ((name, value), (f"_{name}", mask))}
 
 

@@ -4,20 +4,14 @@ Times are of one process, and include everything between state and force. Run it
 busy one are the scheduler's.
 """
 
-import csv
-import io
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from ballbot_baselines.certification import episode
 from ballbot_baselines.nmpc import NmpcController
@@ -134,17 +128,9 @@ def main(
             f"regret {row.regret_percent:+.2f} %, {row.failed} failed, {row.falls} falls",
             flush=True,
         )
-    files.write(out / "mpc_latency.csv", _csv(rows))
+    files.write_csv(out / "mpc_latency.csv", [asdict(row) for row in rows])
     _figure(rows, out / "mpc_latency.png")
     print(f"written to {out}")
-
-
-def _csv(rows: list[Latency]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(rows[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(row) for row in rows)
-    return text.getvalue()
 
 
 def _figure(rows: list[Latency], path: Path) -> None:
@@ -152,7 +138,8 @@ def _figure(rows: list[Latency], path: Path) -> None:
         f"{row.task}, {row.mode}\n{row.nodes} nodes, {row.horizon:.1f} s, {1 / row.control_dt:.0f} Hz" for row in rows
     ]
     places = np.arange(len(rows))[::-1]
-    figure, axis = plt.subplots(figsize=(8, 0.5 * len(rows) + 1.2), layout="constrained")
+    figure = Figure(figsize=(8, 0.5 * len(rows) + 1.2), layout="constrained")
+    axis = figure.subplots()
     for name, style in (("median_ms", "o"), ("p99_ms", "|"), ("max_ms", "x")):
         label = name.removesuffix("_ms")
         axis.plot([getattr(row, name) for row in rows], places, style, color="#e08a00", label=label, ms=8)
@@ -163,7 +150,6 @@ def _figure(rows: list[Latency], path: Path) -> None:
     axis.legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from ballbot_gym.tasks.weave import sides_passed, split_constants
 console = Console()
 
 
-def coverage(name: str, draws: int, seed: int) -> str:
-    """One CSV row for a task; prints the episodes without an optimum."""
+def coverage(name: str, draws: int, seed: int) -> dict[str, object]:
+    """The row of a task; prints the episodes without an optimum."""
     task, params, rng = TASKS[name](), default_params(), np.random.default_rng(seed)
     seconds, costs, both_sides, failed = [], [], [], 0
     find_optimum(task, params, *task.sample(rng, params))  # compiles, and builds solvers
@@ -42,15 +42,21 @@ def coverage(name: str, draws: int, seed: int) -> str:
         costs.append(optimum.cost)
         if name == "weave":
             both_sides.append(len(set(sides_passed(optimum.trajectory.x[:, :2], c))) == 2)
-    share = f"{np.mean(both_sides):.3f}" if both_sides else ""
-    return (
-        f"{name},{draws},{1 - failed / draws:.4f},{np.median(seconds):.4f},{np.percentile(seconds, 99):.4f},"
-        f"{np.max(seconds):.4f},{np.median(costs):.3f},{np.max(costs):.3f},{share}"
-    )
+    return {
+        "task": name,
+        "draws": draws,
+        "found": f"{1 - failed / draws:.4f}",
+        "seconds_median": f"{np.median(seconds):.4f}",
+        "seconds_p99": f"{np.percentile(seconds, 99):.4f}",
+        "seconds_max": f"{np.max(seconds):.4f}",
+        "cost_median": f"{np.median(costs):.3f}",
+        "cost_max": f"{np.max(costs):.3f}",
+        "both_sides": f"{np.mean(both_sides):.3f}" if both_sides else "",
+    }
 
 
-def exhaustive(episodes: int, seed: int) -> list[str]:
-    """CSV rows of Weave episodes: the default search's cost, and the best over every choice of sides."""
+def exhaustive(episodes: int, seed: int) -> list[dict[str, object]]:
+    """The rows of Weave episodes: the default search's cost, and the best over every choice of sides."""
     task, params, rng = TASKS["weave"](), default_params(), np.random.default_rng(seed)
     rows = []
     for index in track(range(episodes), description="exhaustive"):
@@ -65,7 +71,15 @@ def exhaustive(episodes: int, seed: int) -> list[str]:
                 best = min(best, find_optimum(task, params, x0, c, paths=[path]).cost)
             except PlanError:
                 continue
-        rows.append(f"{index},{len(obstacles)},{found:.6f},{best:.6f},{found / best - 1:.6f}")
+        rows.append(
+            {
+                "episode": index,
+                "obstacles": len(obstacles),
+                "found": f"{found:.6f}",
+                "best": f"{best:.6f}",
+                "gap": f"{found / best - 1:.6f}",
+            }
+        )
     return rows
 
 
@@ -77,14 +91,12 @@ def main(
     out: Path = Path("runs/optimum_coverage"),
 ) -> None:
     """Runs both studies."""
-    header = "task,draws,found,seconds_median,seconds_p99,seconds_max,cost_median,cost_max,both_sides"
-    table = [header, *(coverage(name, draws, seed) for name in tasks)]
-    files.write(out / "coverage.csv", "\n".join(table) + "\n")
-    console.print("\n".join(table))
+    table = [coverage(name, draws, seed) for name in tasks]
+    console.print(files.write_csv(out / "coverage.csv", table).read_text())
     if "weave" in tasks and exhaustive_episodes:
         rows = exhaustive(exhaustive_episodes, seed + 1)
-        files.write(out / "exhaustive.csv", "\n".join(["episode,obstacles,found,best,gap", *rows]) + "\n")
-        gaps = np.array([float(row.rsplit(",", 1)[1]) for row in rows])
+        files.write_csv(out / "exhaustive.csv", rows)
+        gaps = np.array([float(str(row["gap"])) for row in rows])
         console.print(f"exhaustive search gains more than 0.5 % in {(gaps > 0.005).sum()} of {len(gaps)} episodes")
 
 

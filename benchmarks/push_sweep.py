@@ -4,19 +4,13 @@ At rest, the body is hit at its centre of mass by a horizontal impulse. LQR and 
 still. Re-planning knows the pushed state and takes the time it takes.
 """
 
-import csv
-import io
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import NmpcController
@@ -116,21 +110,14 @@ def main(out: Path = Path("runs/push_sweep"), bearings: int = 24, resolution: fl
             pushes.append(Push(name, float(np.degrees(bearing)), near))
         mine = [push.impulse for push in pushes if push.controller == name]
         print(f"{name:16s} survives {min(mine):.0f} to {max(mine):.0f} N·s, median {np.median(mine):.0f}", flush=True)
-    files.write(out / "push_sweep.csv", _csv(pushes))
+    files.write_csv(out / "push_sweep.csv", [asdict(push) for push in pushes])
     _figure(pushes, out / "push_sweep.png")
     print(f"written to {out}")
 
 
-def _csv(pushes: list[Push]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(pushes[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(push) for push in pushes)
-    return text.getvalue()
-
-
 def _figure(pushes: list[Push], path: Path) -> None:
-    figure, axis = plt.subplots(figsize=(6, 6), layout="constrained", subplot_kw={"projection": "polar"})
+    figure = Figure(figsize=(6, 6), layout="constrained")
+    axis = figure.subplots(subplot_kw={"projection": "polar"})
     for name, (color, _) in CONTROLLERS.items():
         mine = [push for push in pushes if push.controller == name]
         bearings = np.radians([push.bearing for push in [*mine, mine[0]]])
@@ -139,7 +126,6 @@ def _figure(pushes: list[Push], path: Path) -> None:
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

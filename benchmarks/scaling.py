@@ -1,17 +1,11 @@
 """Solve time against the number of intervals, 20 to 640: with stage-wise structure it grows linearly."""
 
-import csv
-import io
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from ballbot_baselines.collocation import Guess, solve
 from ballbot_baselines.guess import along_path, cubic_hermite
@@ -81,7 +75,7 @@ def main(out: Path = Path("runs/scaling"), repeats: int = 5, quick: bool = False
             )
     for name in dict.fromkeys(point.problem for point in points):
         print(f"{name}: time per iteration grows as intervals^{exponent(points, name):.2f}")
-    files.write(out / "scaling.csv", _csv(points))
+    files.write_csv(out / "scaling.csv", [asdict(point) for point in points])
     _figure(points, out / "scaling.png")
     print(f"written to {out}")
 
@@ -93,16 +87,9 @@ def exponent(points: list[Point], problem: str) -> float:
     return float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0])
 
 
-def _csv(points: list[Point]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(points[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(point) for point in points)
-    return text.getvalue()
-
-
 def _figure(points: list[Point], path: Path) -> None:
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots(1, 2)
     for name in dict.fromkeys(point.problem for point in points):
         chosen = [point for point in points if point.problem == name]
         n = [point.intervals for point in chosen]
@@ -117,7 +104,6 @@ def _figure(points: list[Point], path: Path) -> None:
     axes[0].legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

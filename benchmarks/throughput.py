@@ -4,7 +4,6 @@ Random actions, resets included, one measurement after another, each in a proces
 the extra `[bench]`; what is not installed is said so in the table.
 """
 
-import csv
 import importlib.util
 import os
 import resource
@@ -16,14 +15,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import gymnasium
-import matplotlib
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-from ballbot_gym import TASKS, BallbotEnv
+from ballbot_gym import TASKS, BallbotEnv, files
 from ballbot_gym.params import default_params
 from ballbot_gym.simulator import BulletSimulator
 
@@ -78,10 +74,7 @@ def main(
             f" {row.first_step_seconds:7.2f} s to the first step  {row.note}",
             flush=True,
         )
-        with (out / "throughput.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(asdict(rows[0])))
-            writer.writeheader()
-            writer.writerows(asdict(row) for row in rows)
+        files.write_csv(out / "throughput.csv", [asdict(row) for row in rows])
     _plot(rows, out / "throughput.png")
     print(f"written: {out / 'throughput.csv'}, {out / 'throughput.png'}")
 
@@ -226,7 +219,8 @@ def _resident() -> float:
 
 
 def _plot(rows: list[Row], path: Path) -> None:
-    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
     curves: dict[str, list[Row]] = {}
     for row in rows:
         if row.what != "soak" and row.steps_per_second > 0:
@@ -239,7 +233,6 @@ def _plot(rows: list[Row], path: Path) -> None:
     axes.grid(which="major", alpha=0.3)
     axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
     figure.savefig(path, dpi=150)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -5,22 +5,16 @@ cost summed over knots), from the same guesses. Equal optima are asserted. Build
 solving, for both. Needs the [bench] extra: `pip install -e ".[bench]"`.
 """
 
-import csv
-import io
 import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.planning import DirectCollocation
@@ -76,7 +70,7 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
     summary = ratios(rows)
     for line in summary:
         print(line)
-    files.write(out / "trajopt_vs_drake.csv", _csv(rows))
+    files.write_csv(out / "trajopt_vs_drake.csv", [asdict(row) for row in rows])
     files.write(out / "trajopt_vs_drake.txt", "\n".join([*map(_line, rows), *summary]) + "\n")
     _figure(rows, out / "trajopt_vs_drake.png")
     print(f"written to {out}")
@@ -214,17 +208,10 @@ def _line(row: Timing) -> str:
     )
 
 
-def _csv(rows: list[Timing]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(vars(rows[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(vars(row) for row in rows)
-    return text.getvalue()
-
-
 def _figure(rows: list[Timing], path: Path) -> None:
     problems = list(dict.fromkeys(row.problem for row in rows))
-    figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
     groups = list(dict.fromkeys((row.program, row.guess) for row in rows))
     colors = ("#c0392b", "#1f6fb2", "#e6a9a0", "#93bfe0")
     for i, group in enumerate(groups):
@@ -236,7 +223,6 @@ def _figure(rows: list[Timing], path: Path) -> None:
     axis.grid(axis="y", alpha=0.3)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -1,28 +1,26 @@
-"""The site quotes the README, so that both say the same: `<!-- README: Title -->` stands for that section of it."""
+"""The site shows files of the repository's root: `<!-- file: README.md -->` in a page stands for that file."""
 
 import re
 from pathlib import Path
 from typing import Any
 
-_README = Path(__file__).parent.parent / "README.md"
-_QUOTE = re.compile(r"<!-- README: (.*?) -->")
-
-
-def sections(text: str) -> dict[str, str]:
-    """The README's second-level sections by title, headings left out; what precedes the first is "Introduction"."""
-    introduction, *rest = re.split(r"^## ", text, flags=re.MULTILINE)
-    parts = {"Introduction": introduction.partition("\n")[2]}
-    for part in rest:
-        title, _, body = part.partition("\n")
-        parts[title.strip()] = body
-    return parts
+_ROOT = Path(__file__).parent.parent
+_FILE = re.compile(r"<!-- file: (\S+) -->")
+_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Called by mkdocs for each page.
 
     Raises:
-        KeyError: a page quotes a section that the README does not have.
+        FileNotFoundError: a page names a file that does not exist.
     """
-    quoted = sections(_README.read_text())
-    return _QUOTE.sub(lambda match: quoted[match[1]].strip().replace("](docs/", "]("), markdown)
+    return _FILE.sub(lambda match: _with_links_of_the_site((_ROOT / match[1]).read_text(encoding="utf-8")), markdown)
+
+
+def _with_links_of_the_site(text: str) -> str:
+    """The text of a file of the root, with links that hold between the site's pages."""
+    text = text.replace("](docs/", "](")
+    for file, page in _PAGES.items():
+        text = text.replace(f"]({file}", f"]({page}")
+    return text

@@ -1,10 +1,15 @@
 import ast
+import importlib.metadata
 import re
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 import ballbot_gym
+from ballbot_gym.params import URDF_PATH
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("ballbot_gym", "ballbot_baselines", "ballbot_train")
@@ -13,17 +18,52 @@ FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.p
 ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for path in (ROOT / folder).rglob("*.py")})
 
 
+# The rooms from the bottom to the top. A file imports from its own room and from those below it only.
+ROOMS = ("ballbot_gym", "ballbot_baselines", "ground floor", "evaluation", "learning", "report", "commands")
+
+
+def modules(path, only_top_level=False):
+    """Dotted names that the import statements of a file name, anywhere in it or at its top level only.
+
+    `from a import b` counts as a.b, because b may be a module.
+    """
+    tree = ast.parse(path.read_text())
+    found = set()
+    for node in tree.body if only_top_level else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} has a relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
 def imports(path, only_top_level=False):
     """Names of the packages that a file imports, anywhere or at its top level."""
-    tree = ast.parse(path.read_text())
-    nodes = tree.body if only_top_level else ast.walk(tree)
-    found = set()
-    for node in nodes:
-        if isinstance(node, ast.Import):
-            found |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            found.add(node.module.partition(".")[0])
-    return found
+    return {name.partition(".")[0] for name in modules(path, only_top_level)}
+
+
+def package(path):
+    """The package that a file belongs to."""
+    return next(part for part in path.relative_to(ROOT).parts if part in PACKAGES)
+
+
+def room(module):
+    """The room of a dotted name; None where it is of another package.
+
+    The entry point `ballbot_train.cli` belongs to the commands.
+    """
+    top, *inner = module.split(".")
+    if top != "ballbot_train":
+        return top if top in PACKAGES else None
+    below = inner[0] if inner else ""
+    return "commands" if below == "cli" else below if below in ROOMS else "ground floor"
+
+
+def room_of(path):
+    """The room of a file."""
+    parts = path.with_suffix("").parts
+    return room(".".join(parts[parts.index(package(path)) :]))
 
 
 def relative(paths):
@@ -34,29 +74,84 @@ def test_there_are_files_to_look_at():
     assert len(FILES) > 20
 
 
-@pytest.mark.parametrize(
-    ("package", "above"),
-    [("ballbot_gym", {"ballbot_baselines", "ballbot_train"}), ("ballbot_baselines", {"ballbot_train"})],
-)
-def test_packages_depend_in_one_direction(package, above):
-    assert (
-        relative(path for path in FILES if path.relative_to(ROOT).parts[0] == package and imports(path) & above) == []
-    )
+@pytest.mark.parametrize("path", FILES, ids=relative(FILES))
+def test_imports_go_down(path):
+    floor = ROOMS.index(room_of(path))
+    upwards = sorted(name for name in modules(path) if room(name) and ROOMS.index(room(name)) > floor)
+    assert not upwards, f"{path.relative_to(ROOT)} ({room_of(path)}) imports from a room above it: {', '.join(upwards)}"
 
 
-def test_only_the_simulator_knows_pybullet():
+def test_every_room_is_looked_at():
+    assert {room_of(path) for path in FILES} == set(ROOMS)
+
+
+def test_only_simulator_and_scene_know_pybullet():
     knowing = [path for path in FILES if imports(path) & {"pybullet", "pybullet_data"}]
-    assert relative(knowing) == ["ballbot_gym/simulator.py"]
+    assert relative(knowing) == ["ballbot_gym/scene.py", "ballbot_gym/simulator.py"]
 
 
 def test_environments_import_no_solver_and_no_learner_at_their_top():
     heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "scipy", "matplotlib"}
-    gym = [path for path in FILES if path.relative_to(ROOT).parts[0] == "ballbot_gym" and path.name != "vector.py"]
+    batched = {"batch.py", "counter_rng.py", "vector.py"}  # these are written in torch and imported when first used
+    gym = [path for path in FILES if package(path) == "ballbot_gym" and path.name not in batched]
     assert relative(path for path in gym if imports(path, only_top_level=True) & heavy) == []
 
 
+def test_importing_the_environments_imports_only_numpy_and_gymnasium():
+    heavy = {
+        "torch",
+        "casadi",
+        "scipy",
+        "matplotlib",
+        "pybullet",
+        "stable_baselines3",
+        "ballbot_baselines",
+        "ballbot_train",
+    }
+    code = f"import sys, ballbot_gym; print(*sorted({heavy} & set(sys.modules)))"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == []
+
+
+def test_importing_the_environments_opens_no_urdf():
+    code = (
+        "import sys\n"
+        "opened = []\n"
+        "sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == 'open' else None)\n"
+        "import ballbot_gym\n"
+        "print(*(name for name in opened if name.endswith('.urdf')))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == []
+
+
+def test_no_default_reads_a_urdf_when_its_module_is_imported():
+    def early_calls(path):
+        """Calls outside of functions' bodies, where they run at import: at the top, in classes and in defaults."""
+        waiting = [ast.parse(path.read_text())]
+        while waiting:
+            node = waiting.pop()
+            if isinstance(node, ast.Call):
+                yield ast.unparse(node.func)
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                waiting += [*node.args.defaults, *(d for d in node.args.kw_defaults if d), *node.decorator_list]
+            elif not isinstance(node, ast.Lambda):
+                waiting += ast.iter_child_nodes(node)
+
+    readers = {"default_params", "params.default_params", "BallbotParams.from_urdf"}
+    assert relative(path for path in FILES if readers & set(early_calls(path))) == []
+
+
+def test_version_is_that_of_the_installed_package():
+    try:
+        expected = importlib.metadata.version("ballbot-gym")
+    except importlib.metadata.PackageNotFoundError:
+        expected = "unknown"
+    assert ballbot_gym.__version__ == expected
+
+
 def test_experts_import_no_learner():
-    experts = [path for path in FILES if path.relative_to(ROOT).parts[0] == "ballbot_baselines"]
+    experts = [path for path in FILES if package(path) == "ballbot_baselines"]
     assert relative(path for path in experts if imports(path) & {"torch", "stable_baselines3"}) == []
 
 
@@ -73,7 +168,16 @@ def test_no_file_names_a_place_on_the_developers_machine():
 
 
 def test_urdf_travels_with_the_package():
-    assert (Path(ballbot_gym.__file__).parent / "urdf" / "ballbot.urdf").is_file()
+    assert URDF_PATH.is_file()
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert wheel["force-include"] == {"urdf/ballbot.urdf": "ballbot_gym/urdf/ballbot.urdf"}
+
+
+def test_the_cubic_hermite_basis_and_the_angle_of_tilt_each_have_one_place():
+    basis = re.compile(r"3 - 2 \* \w+|1 \+ 2 \* \w+\) \*")
+    assert relative(path for path in FILES if basis.search(path.read_text())) == ["ballbot_gym/paths.py"]
+    angle = re.compile(r"\b(math|np|torch)\.(acos|arccos)\(")
+    assert relative(path for path in FILES if angle.search(path.read_text())) == ["ballbot_gym/ops.py"]
 
 
 def test_no_file_prints_but_the_command_line():
@@ -81,5 +185,5 @@ def test_no_file_prints_but_the_command_line():
         calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
         return any(isinstance(call.func, ast.Name) and call.func.id == "print" for call in calls)
 
-    library = [path for path in FILES if path.relative_to(ROOT).parts[0] != "ballbot_train"]
+    library = [path for path in FILES if package(path) != "ballbot_train"]
     assert relative(path for path in library if prints(path)) == []

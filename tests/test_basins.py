@@ -78,7 +78,19 @@ def test_maps_are_read_back_as_they_were_written_and_drawn(bounds, tmp_path):
     for wrote, read in zip(maps, basins.read(tmp_path), strict=True):
         np.testing.assert_array_equal(wrote.recovered["lqr"], read.recovered["lqr"])
         np.testing.assert_array_equal(wrote.boundary, read.boundary)
-    assert basins.recovered_fractions(tmp_path) == {("stabilize", "lqr"): pytest.approx(3 / 30)}
-    assert basins.recovered_fractions(tmp_path / "nowhere") == {}
+    assert basins.recovered_fractions(tmp_path) == ({("stabilize", "lqr"): pytest.approx(3 / 30)}, "")
+    assert basins.recovered_fractions(tmp_path / "nowhere") == ({}, "")
     assert len((tmp_path / "basins.csv").read_text().splitlines()) == 1 + 2 * 25
     assert figures.save(figures.basin_figure(maps), tmp_path / "basins.png").exists()
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"rows": [{"task": "stabilize"}]}', "[" * 100_000])
+def test_damaged_maps_are_named_and_no_error(content, tmp_path):
+    (tmp_path / "basins.json").write_text(content)
+    fractions, why = basins.recovered_fractions(tmp_path)
+    assert fractions == {}
+    assert f"{tmp_path / 'basins.json'} is damaged" in why
+
+
+def test_the_states_to_run_are_counted_by_controller(bounds):
+    assert basins.states_to_run(bounds, ["lqr", "nmpc"], 5, "rk4") == {"lqr": 18, "nmpc": 18}

@@ -1,9 +1,12 @@
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ballbot_gym import certified, dynamics
+from ballbot_gym.env import make_task
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 
 
@@ -69,6 +72,46 @@ def test_solving_again_from_another_guess_gives_the_same_cost(task, evaluation, 
         detour = path + 0.15 * np.column_stack([np.sin(2 * s), -np.sin(s)])
         again = find_optimum(task, params, evaluation.states[i], evaluation.constants[i], paths=[detour])
         assert again.cost == pytest.approx(evaluation.costs[i], rel=1e-4)
+
+
+def test_entries_survive_json_and_make_the_set_that_the_optima_make(params):
+    """Bit for bit: costs, times, states and forces."""
+    certification = pytest.importorskip("ballbot_baselines.certification")
+    from ballbot_baselines.optimum import find_optimum
+
+    task, count = make_task("stabilize"), 3
+    found = json.loads(json.dumps(list(certification.entries("stabilize", range(count)))))
+    made = certification.evaluation_set(task, params, found)
+    optima = [find_optimum(task, params, *certification.episode(task, params, i)) for i in range(count)]
+    np.testing.assert_array_equal(made.costs, [optimum.cost for optimum in optima])
+    np.testing.assert_array_equal(made.violations, [optimum.violation for optimum in optima])
+    np.testing.assert_array_equal(made.durations, [optimum.trajectory.duration for optimum in optima])
+    assert list(made.statuses) == [f"{optimum.solver}: {optimum.status}" for optimum in optima]
+    for trajectory, optimum in zip(made.trajectories, optima, strict=True):
+        for name in ("t", "x", "u"):
+            np.testing.assert_array_equal(getattr(trajectory, name), getattr(optimum.trajectory, name))
+    for i, optimum in enumerate(optima):
+        np.testing.assert_array_equal(made.states[i], optimum.trajectory.x[0])
+
+
+def test_entry_of_an_episode_without_an_optimum_says_why(monkeypatch, params):
+    certification = pytest.importorskip("ballbot_baselines.certification")
+
+    def fail(*args):
+        raise PlanError("no feasible episode")
+
+    monkeypatch.setattr(certification, "find_optimum", fail)
+    found = list(certification.entries("stabilize", [4]))
+    assert found == [{"episode": 4, "error": "no feasible episode"}]
+    with pytest.raises(PlanError, match="episode 4: no feasible episode"):
+        certification.evaluation_set(make_task("stabilize"), params, found)
+
+
+def test_set_with_a_missing_episode_is_refused(params):
+    certification = pytest.importorskip("ballbot_baselines.certification")
+    found = [{"episode": 0}, {"episode": 2}]
+    with pytest.raises(ValueError, match=r"entry 1 of .* is of episode 2"):
+        certification.evaluation_set(make_task("stabilize"), params, found)
 
 
 def test_set_survives_saving(task, evaluation, tmp_path):

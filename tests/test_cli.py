@@ -1,17 +1,25 @@
 """The commands, as a user runs them."""
 
+import importlib
 import json
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
+from builders import result
 
+from ballbot_gym import certified
+from ballbot_gym.env import make_task
+from ballbot_gym.lazy import load
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.commands import COMMANDS
+from ballbot_train.commands import COMMANDS, help_of
+from ballbot_train.commands.certify import certify
 from ballbot_train.commands.compare import compare
-from ballbot_train.evaluation import evaluate
-from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.results import leaderboard, write_leaderboard
 
 
 def ballbot(*arguments, cwd):
@@ -61,8 +69,8 @@ def test_robustness_writes_tables_and_curves(tmp_path):
 
 def test_compare_says_whether_b_is_better(tmp_path, capsys):
     for name, cost in (("a", 12.0), ("b", 11.0)):
-        results = [Result("turn", "lqr", i, "rk4", cost, 10.0, True, False, 30, 2, 2, 0, 0) for i in range(20)]
-        evaluate.write_leaderboard(evaluate.leaderboard(results), results, {"commit": name}, tmp_path / name)
+        results = [result(episode=i, cost=cost) for i in range(20)]
+        write_leaderboard(leaderboard(results), results, {"commit": name}, tmp_path / name)
     compare(tmp_path / "a", tmp_path / "b", out=tmp_path / "compared.json")
     assert "better" in capsys.readouterr().out
     (row,) = json.loads((tmp_path / "compared.json").read_text())["rows"]
@@ -122,12 +130,169 @@ def test_a_wrong_argument_ends_with_one_line_that_says_so(arguments, message, tm
     [
         ("benchmark", {"controllers": ("pid",)}, "unknown controller pid"),
         ("benchmark", {"controllers": ("mine.json",)}, "mine.json is not a policy"),
+        ("benchmark", {"controllers": ("mine.zip",)}, "mine.zip is a saved Stable-Baselines3 model"),
+        ("benchmark", {"controllers": ("lqr", "lqr")}, "controller lqr is given more than once"),
+        ("benchmark", {"tasks": ()}, "give at least one task: stabilize"),
+        ("benchmark", {"tasks": ("turn", "turn")}, "task turn is given more than once"),
+        ("benchmark", {"seed": -1}, "seed must be at least 0, not -1"),
+        ("benchmark", {"workers": 0}, "workers must be at least 1, not 0"),
         ("robustness", {"stresses": ("wind",)}, "unknown stress wind"),
+        ("robustness", {"stresses": ()}, "give at least one stress: push"),
+        ("robustness", {"stresses": ("push", "push")}, "stress push is given more than once"),
+        ("robustness", {"seed": -1}, "seed must be at least 0"),
         ("basins", {"points": 4}, "points must be odd"),
+        ("basins", {"workers": -1}, "workers must be at least 1"),
+        ("certify", {"tasks": ()}, "give at least one task"),
+        ("certify", {"episodes": 0}, "episodes must be at least 1"),
+        ("certify", {"episodes": 3, "install": True}, "the package needs sets of 200 episodes"),
     ],
 )
-def test_a_wrong_name_is_refused_before_anything_is_written(command, arguments, message, tmp_path, monkeypatch):
+def test_a_wrong_argument_is_refused_before_anything_is_written(command, arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=message):
-        COMMANDS[command](**arguments)
+        load(COMMANDS[command])(**arguments)
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_one_line_of_help_that_is_its_own(name):
+    function = load(COMMANDS[name])
+    assert help_of(name) == function.__doc__.strip().partition("\n")[0]
+    assert help_of(name).endswith(".")
+
+
+LOADED = """
+import sys
+from ballbot_train.cli import main
+sys.argv = ["ballbot", *sys.argv[1:]]
+try:
+    main()
+finally:
+    heavy = {"torch", "casadi", "scipy", "gymnasium", "numpy", "tyro", "stable_baselines3", "matplotlib"}
+    print(sorted(heavy & set(sys.modules)))
+"""
+
+
+def test_the_help_names_every_command_and_imports_none(tmp_path):
+    run = subprocess.run([sys.executable, "-c", LOADED, "--help"], capture_output=True, text=True, check=True)
+    lines = run.stdout.splitlines()
+    assert lines[-1] == "[]"
+    assert lines[0] == "usage: ballbot COMMAND [OPTIONS]"
+    for name in COMMANDS:
+        assert any(line.split()[:1] == [name] for line in lines)
+
+
+def test_only_the_command_that_is_called_is_imported():
+    run = subprocess.run(
+        [sys.executable, "-c", LOADED, "compare", "--help"], capture_output=True, text=True, check=True
+    )
+    assert "--training-margin" in run.stdout
+    loaded = run.stdout.splitlines()[-1]
+    assert "tyro" in loaded
+    assert not {"torch", "casadi", "scipy", "stable_baselines3", "matplotlib"} & set(
+        json.loads(loaded.replace("'", '"'))
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        ([], 2, "usage: ballbot COMMAND"),
+        (["-h"], 0, "usage: ballbot COMMAND"),
+        (["--version"], 0, "ballbot 0."),
+        (["trian"], 2, "no command 'trian'; did you mean train?"),
+        (["[red]x"], 2, "no command '[red]x'; the commands are benchmark, compare"),
+        (["compare"], 2, "usage: ballbot compare"),
+    ],
+)
+def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, message, tmp_path):
+    run = ballbot(*arguments, cwd=tmp_path)
+    assert run.returncode == status
+    assert message in run.stdout + run.stderr
+
+
+def test_names_and_paths_are_printed_as_they_are(tmp_path):
+    for out in ("runs/a[/b]c", "[red]x:smile:"):
+        arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
+        run = ballbot(*arguments, "--workers", 1, "--out", out, cwd=tmp_path)
+        assert run.returncode == 0, run.stderr
+        assert f"report: {out}/report.html" in run.stdout
+        assert (tmp_path / out / "report.html").exists()
+
+
+def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path):
+    runs = tmp_path / "runs"
+    (runs / "basins").mkdir(parents=True)
+    (runs / "basins" / "basins.json").write_text("{")
+    arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
+    run = ballbot(*arguments, "--workers", 1, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "skipped: runs/basins/basins.json is damaged" in run.stdout
+    assert (runs / "benchmark" / "leaderboard.csv").exists()
+
+
+def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_path):
+    arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "trajopt", "--workers", "1", "--out", "out")
+    first = subprocess.Popen(
+        [sys.executable, "-m", "ballbot_train.cli", *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not (tmp_path / "out" / "unfinished").exists():
+        time.sleep(0.05)
+    second = ballbot(*arguments, cwd=tmp_path)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    assert second.returncode == 1
+    assert "another run is using out right now" in second.stderr
+    assert not (tmp_path / "out" / "leaderboard.csv").exists()
+
+
+def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    packaged = certified.path_of(make_task("turn")).read_bytes()
+    certification = importlib.import_module("ballbot_baselines.certification")
+    solved, again = [], []
+    find_optimum = certification.find_optimum
+
+    def find(*arguments):
+        if len(solved) == 2:
+            raise KeyboardInterrupt
+        solved.append(arguments)
+        return find_optimum(*arguments)
+
+    monkeypatch.setattr(certification, "find_optimum", find)
+    with pytest.raises(KeyboardInterrupt):
+        certify(("turn",), 3, workers=1)
+    monkeypatch.setattr(certification, "find_optimum", lambda *arguments: again.append(1) or find_optimum(*arguments))
+    certify(("turn",), 3, workers=1)
+    assert (len(solved), len(again)) == (2, 1)
+    out = tmp_path / "runs" / "certify"
+    assert [path.name for path in out.iterdir()] == ["BallbotTurn-v0.npz"]
+    made, known = certified.load(make_task("turn"), out / "BallbotTurn-v0.npz"), certified.load(make_task("turn"))
+    np.testing.assert_array_equal(made.states, known.states[:3])
+    np.testing.assert_allclose(made.costs, known.costs[:3], rtol=1e-9)
+    assert len(made.trajectories) == 3
+    assert certified.path_of(make_task("turn")).read_bytes() == packaged
+
+
+def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
+    task = make_task("turn")
+    full = certified.load(task)
+    monkeypatch.setattr(certified, "EPISODES", 2)
+    monkeypatch.setattr(certified, "path_of", lambda task: tmp_path / "package" / f"{task.id}.npz")
+    certify(("turn",), 2, out=tmp_path / "out", workers=1)
+    assert not (tmp_path / "package").exists()
+    certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
+    np.testing.assert_array_equal(certified.load(task).states, full.states[:2])
+
+
+def test_certify_says_which_episode_has_no_optimum_and_writes_no_set(tmp_path, monkeypatch):
+    certification = importlib.import_module("ballbot_baselines.certification")
+
+    def fail(*arguments):
+        raise PlanError("no plan")
+
+    monkeypatch.setattr(certification, "find_optimum", fail)
+    with pytest.raises(PlanError, match="no optimum for\nturn episode 0: no plan\nturn episode 1: no plan"):
+        certify(("turn",), 2, out=tmp_path / "out", workers=1)
+    assert not any((tmp_path / "out").iterdir())

@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import result
 
 from ballbot_train.evaluation.comparison import compare
-from ballbot_train.evaluation.evaluate import Result
 from ballbot_train.evaluation.statistics import interval, verdict
 
 EXPERT, POLICY = "lqr", "shac"
@@ -14,20 +14,13 @@ EXPERT, POLICY = "lqr", "shac"
 def results(regrets, controller=EXPERT, failures=()):
     """One episode for each regret; their optima differ, as real ones do."""
     return [
-        Result(
-            task="stabilize",
+        result(
             controller=controller,
             episode=i,
-            physics="rk4",
             cost=1000.0 if i in failures else (1 + regret) * (10 + i),
             optimum=10.0 + i,
             success=i not in failures,
             failure=i in failures,
-            peak_tilt=30.0,
-            settle_time=2.0,
-            duration=8.0,
-            plan_seconds=0.0,
-            step_seconds=1e-5,
         )
         for i, regret in enumerate(regrets)
     ]
@@ -129,3 +122,15 @@ def test_runs_with_nothing_in_common_are_an_error_that_says_what_they_have(regre
     a = results(regrets) + results(regrets, "nmpc")
     with pytest.raises(ValueError, match="A has lqr on stabilize, nmpc on stabilize, B has trajopt on stabilize"):
         compare(({}, a), ({}, results(regrets, "trajopt")))
+
+
+@pytest.mark.parametrize("margin", [-0.1, float("nan"), float("inf")])
+def test_a_margin_that_is_no_number_from_0_is_refused(margin, regrets):
+    for name in ("margin", "training_margin"):
+        with pytest.raises(ValueError, match=f"^{name} must be a number from 0"):
+            only(results(regrets), results(regrets), **{name: margin})
+
+
+def test_an_episode_that_is_there_twice_is_refused(regrets):
+    with pytest.raises(ValueError, match="episode 0 of lqr on stabilize is there twice"):
+        only(results(regrets) + results(regrets[:1]), results(regrets))

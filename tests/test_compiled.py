@@ -1,6 +1,7 @@
 import multiprocessing
 import os
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,7 @@ import casadi
 from ballbot_baselines import compiled
 
 needs_compiler = pytest.mark.skipif(compiled._compiler() is None, reason="no C compiler")
+posix = pytest.mark.skipif(os.name != "posix", reason="programs and permissions of POSIX")
 
 
 def powers(factor=1.0):
@@ -126,3 +128,120 @@ def test_library_that_does_not_load_leaves_functions_interpreted(folder, monkeyp
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
     assert "wrong ELF class" in caplog.text
+
+
+@pytest.fixture
+def fake_compiler(folder, tmp_path, monkeypatch):
+    """Makes CC a program with given content."""
+
+    def make(content):
+        program = tmp_path / "fake-cc"
+        program.write_bytes(content)
+        program.chmod(0o755)
+        monkeypatch.setenv("CC", str(program))
+        compiled._compiler.cache_clear()
+        return str(program)
+
+    yield make
+    monkeypatch.undo()
+    compiled._compiler.cache_clear()
+    compiled._machine.cache_clear()
+    compiled._hanging.clear()
+
+
+@posix
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\x00\x01 no program",
+        b"#!/no/such/interpreter\n",
+        b"#!/bin/sh\nprintf '\\377\\376' >&2\nprintf '\\377'\nexit 1\n",
+    ],
+    ids=["no program", "no interpreter", "no UTF-8"],
+)
+def test_compiler_that_is_none_leaves_functions_interpreted(fake_compiler, caplog, content):
+    fake_compiler(content)
+    functions = powers()
+    assert compiled.compiled("powers", functions) is functions
+    assert len(caplog.records) == 1
+    assert "powers stay interpreted" in caplog.text
+
+
+@posix
+@pytest.mark.parametrize("hangs", ["at --version", "when it compiles"])
+def test_compiler_that_hangs_is_given_up_and_not_asked_again(fake_compiler, monkeypatch, caplog, hangs):
+    monkeypatch.setattr(compiled, "_VERSION_SECONDS", 0.2 if hangs == "at --version" else 10.0)
+    monkeypatch.setattr(compiled, "_COMPILE_SECONDS", 0.2)
+    answer = b"" if hangs == "at --version" else b'[ "$1" = --version ] && exit 0\n'
+    program = fake_compiler(b"#!/bin/sh\n" + answer + b"exec sleep 30\n")
+    functions = powers()
+    assert compiled.compiled("powers", functions) is functions
+    assert f"{program} did not answer within 0.2 s" in caplog.text
+    monkeypatch.setattr(compiled, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
+    assert compiled.compiled("others", functions) is functions
+    assert len(caplog.records) == 1
+
+
+@needs_compiler
+@pytest.mark.parametrize("home", ["none", "empty"])
+def test_without_a_home_directory_functions_stay_interpreted(monkeypatch, caplog, home):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("BALLBOT_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", no_home if home == "none" else Path)
+    functions = powers()
+    assert compiled.compiled("powers", functions) is functions
+    assert "home directory" in caplog.text
+    assert len(caplog.records) == 1
+
+
+@posix
+@needs_compiler
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o702])
+def test_library_in_a_folder_that_others_can_write_is_not_loaded(folder, monkeypatch, caplog, mode):
+    compiled.compiled("powers", powers())
+    folder.chmod(mode)
+    monkeypatch.setattr(casadi, "external", lambda *args: pytest.fail("loaded"))
+    functions = powers()
+    assert compiled.compiled("powers", functions) is functions
+    assert f"others may write into {folder}" in caplog.text
+
+
+@posix
+@needs_compiler
+def test_library_in_a_folder_of_another_user_is_not_loaded(folder, monkeypatch, caplog):
+    compiled.compiled("powers", powers())
+    user = os.geteuid()
+    monkeypatch.setattr(os, "geteuid", lambda: user + 1)
+    monkeypatch.setattr(casadi, "external", lambda *args: pytest.fail("loaded"))
+    functions = powers()
+    assert compiled.compiled("powers", functions) is functions
+    assert f"{folder} belongs to another user" in caplog.text
+
+
+@posix
+@needs_compiler
+def test_new_cache_is_closed_to_others_whatever_the_umask(folder):
+    before = os.umask(0)
+    try:
+        compiled.compiled("powers", powers())
+    finally:
+        os.umask(before)
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@needs_compiler
+@pytest.mark.parametrize("given", ["", "cache", "./cache"])
+def test_cache_that_is_no_absolute_path_is_refused(monkeypatch, given):
+    monkeypatch.setenv("BALLBOT_CACHE", given)
+    with pytest.raises(ValueError, match="BALLBOT_CACHE must be an absolute path"):
+        compiled.compiled("powers", powers())
+
+
+def test_relative_xdg_cache_home_is_ignored(monkeypatch, tmp_path):
+    monkeypatch.delenv("BALLBOT_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    assert compiled.cache_folder() == tmp_path / ".cache" / "ballbot-gym"

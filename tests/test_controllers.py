@@ -1,9 +1,13 @@
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
 
 pytest.importorskip("casadi")
 
+import ballbot_baselines
 from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.lqr import LqrController, discrete_lqr
 from ballbot_baselines.optimum import find_optimum
@@ -156,6 +160,24 @@ def test_tracker_with_given_weights_is_that_of_the_task_with_those_weights(param
     given = TvlqrController.for_weights(params, plan, 0.02, q, r)
     of_task = TvlqrController.for_task(Stabilize(), params, plan)
     np.testing.assert_allclose(given.gains.k, of_task.gains.k, rtol=1e-9)
+
+
+def test_importing_the_package_loads_neither_casadi_nor_scipy():
+    code = """
+import sys
+import ballbot_baselines
+
+assert not {"casadi", "scipy"} & set(sys.modules)
+ballbot_baselines.find_optimum
+assert "casadi" in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_find_optimum_has_a_short_import_path():
+    assert ballbot_baselines.find_optimum is find_optimum
+    with pytest.raises(AttributeError, match="no attribute 'find_minimum'"):
+        ballbot_baselines.find_minimum  # noqa: B018
 
 
 def test_every_registered_controller_returns_a_force(task, params, rng):

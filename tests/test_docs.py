@@ -12,7 +12,7 @@ import pytest
 from ballbot_train.policy import SHIPPED
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 
 
@@ -60,8 +60,15 @@ def test_pictures_and_commands_that_it_names_exist(page):
         assert command in COMMANDS
 
 
-def test_the_readme_says_of_every_shipped_policy_what_its_file_says():
-    text = (ROOT / "README.md").read_text()
+def test_every_page_that_is_linked_exists():
+    for page in PAGES:
+        prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+        for link in re.findall(r"\]\(([^)#:]*)[^):]*\)", prose):
+            assert not link or (page.parent / link).exists(), f"{page.relative_to(ROOT)}: {link}"
+
+
+def test_the_documentation_says_of_every_shipped_policy_what_its_file_says():
+    text = (ROOT / "docs" / "policies.md").read_text()
     for path in sorted(SHIPPED.glob("*.json")):
         about = json.loads(path.read_text())
         measured, training = about["measured"], about["training"]
@@ -73,11 +80,68 @@ def test_the_readme_says_of_every_shipped_policy_what_its_file_says():
         assert row in text, row
 
 
+def table(page, header):
+    """Cells of the rows of the page's table whose header starts so."""
+    _, _, rest = page.read_text().partition(header)
+    rows = rest.partition("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+
+
+def test_the_readme_s_leaderboard_is_that_of_the_documentation():
+    full = table(ROOT / "docs" / "leaderboard.md", "| task | controller |")
+    short = table(ROOT / "README.md", "| task | controller |")
+    assert len(short) > 10
+    assert short == [[*row[:4], row[4].partition(" (")[0]] for row in full]
+
+
+def layout():
+    """Paths of the tree in CONTRIBUTING.md, relative to the root; patterns such as `*.npz` stand for several files."""
+    _, _, text = (ROOT / "CONTRIBUTING.md").read_text().partition("## Layout")
+    folders, paths = [], []
+    for line in re.search(r"```\n(.*?)```", text, flags=re.DOTALL)[1].splitlines():
+        depth = (len(line) - len(line.lstrip())) // 4
+        name = line.split()[0]
+        folders = folders[:depth]
+        if name.endswith("/"):
+            folders.append(name)
+        else:
+            paths.append("".join(folders) + name)
+    return paths
+
+
+def test_the_layout_in_contributing_lists_exactly_the_files_that_exist():
+    listed = layout()
+    assert [path for path in listed if not list(ROOT.glob(path))] == [], "listed, but do not exist"
+    folders = sorted({path.partition("/")[0] for path in listed if "/" in path})
+    assert {"ballbot_gym", "baselines", "train", "tests"} <= set(folders)
+    existing = {
+        path
+        for folder in folders
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts and not path.name.startswith(".")
+    }
+    found = {path for pattern in listed for path in ROOT.glob(pattern)}
+    assert sorted(str(path.relative_to(ROOT)) for path in existing - found) == [], "exist, but are not listed"
+
+
+def test_every_line_of_the_layout_says_what_the_file_is():
+    _, _, text = (ROOT / "CONTRIBUTING.md").read_text().partition("## Layout")
+    lines = re.search(r"```\n(.*?)```", text, flags=re.DOTALL)[1].splitlines()
+    assert [line for line in lines if len(line.split()) < 2 and not line.endswith("/")] == []
+
+
+def test_version_is_the_same_everywhere():
+    version = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), flags=re.MULTILINE)[1]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"version = {{{version}}}" in (ROOT / "README.md").read_text()
+    assert f"## [{version}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
 def test_the_site_builds_without_a_warning(tmp_path):
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     start = (tmp_path / "index.html").read_text()
-    assert "<!-- README" not in start
+    assert "<!-- file" not in start
     assert "Two commands" in start
     assert "discrete_lqr" in (tmp_path / "api" / "baselines" / "index.html").read_text()

@@ -155,6 +155,32 @@ def test_tilt_is_the_angle_of_the_bodys_axis():
     assert dynamics.cos_tilt((0.0, 0.0, gamma, theta, 0.0, 0.0, 0.0, 0.0)) == pytest.approx(axis_z)
 
 
+def test_tilt_of_floats_arrays_and_tensors_is_the_same_angle(rng):
+    torch = pytest.importorskip("torch")
+    x = rng.uniform(-3, 3, (20, 8))
+    expected = [dynamics.tilt(tuple(row)) for row in x.tolist()]
+    np.testing.assert_allclose(dynamics.tilt(x), expected, rtol=1e-14)
+    np.testing.assert_allclose(dynamics.tilt(torch.as_tensor(x)), expected, rtol=1e-14)
+    np.testing.assert_allclose(np.cos(expected), dynamics.cos_tilt(x), atol=1e-15)
+
+
+def test_tilt_is_zero_where_rounding_makes_a_cosine_exceed_one(monkeypatch):
+    torch = pytest.importorskip("torch")
+    monkeypatch.setattr(dynamics, "cos_tilt", lambda cosine: cosine)
+    above, below = 1 + 1e-7, -1 - 1e-7
+    assert (dynamics.tilt(above), dynamics.tilt(below)) == (0, math.pi)
+    np.testing.assert_array_equal(dynamics.tilt(np.array([above, below])), [0, math.pi])
+    np.testing.assert_array_equal(dynamics.tilt(torch.tensor([above, below], dtype=torch.float64)), [0, math.pi])
+
+
+def test_tilt_of_a_state_that_is_not_a_number_is_not_a_number():
+    torch = pytest.importorskip("torch")
+    x = np.full(8, np.nan)
+    assert math.isnan(dynamics.tilt(tuple(x.tolist())))
+    assert math.isnan(dynamics.tilt(x))
+    assert math.isnan(dynamics.tilt(torch.as_tensor(x)))
+
+
 def test_state_and_input_are_named_in_order():
     assert [name for name, _ in dynamics.STATE] == ["x", "y", "γ", "θ", "ẋ", "ẏ", "γ̇", "θ̇"]
     assert [unit for _, unit in dynamics.STATE] == ["m", "m", "rad", "rad", "m/s", "m/s", "rad/s", "rad/s"]

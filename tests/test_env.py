@@ -13,6 +13,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ballbot_gym import BallbotEnv
+from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.scene import Scene
 from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import TASKS
@@ -482,3 +483,27 @@ def test_frame_rate_is_that_of_the_control_steps(make_env):
 
 if __name__ == "__main__":  # the other process of test_same_seed_is_bit_identical_across_processes
     print(json.dumps({f"{task} {physics}": digest(task, physics) for task in TASKS for physics in PHYSICS}))
+
+
+# --- functions of the observation as controllers ---
+
+
+def test_action_controller_sees_the_envs_observations_and_applies_its_forces(task, make_env, rng):
+    env = make_env(type(task)(duration=0.2), physics="rk4")
+    seen = []
+
+    def act(observation, begins):
+        seen.append((observation, begins))
+        return np.array([0.2, -0.1])
+
+    controller = ActionController(env.task, env.params, act)
+    for _ in range(2):
+        seen.clear()
+        episode = rollout(env, controller, seed=5)
+        observation, _ = env.reset(seed=5)
+        for k, (observed, begins) in enumerate(seen):
+            assert observed.dtype == np.float32
+            np.testing.assert_array_equal(observed, observation)
+            assert begins == (k == 0)
+            observation, *_, info = env.step(np.array([0.2, -0.1]))
+            np.testing.assert_allclose(info["force"], episode.trajectory.u[k], rtol=1e-12)

@@ -1,40 +1,25 @@
 import csv
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import stable_baselines3
+from builders import result
 
+import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import FunctionController, rollout
 from ballbot_gym.tasks import TASKS
-from ballbot_train.evaluation import evaluate
-from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation import benchmark, evaluate
+from ballbot_train.evaluation.results import leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy, shipped_policies
-
-
-def result(**changes):
-    fields = {
-        "task": "stabilize",
-        "controller": "lqr",
-        "episode": 0,
-        "physics": "rk4",
-        "cost": 12.0,
-        "optimum": 10.0,
-        "success": True,
-        "failure": False,
-        "peak_tilt": 30.0,
-        "settle_time": 2.0,
-        "duration": 8.0,
-        "plan_seconds": 0.1,
-        "step_seconds": 1e-5,
-    }
-    return Result(**(fields | changes))
 
 
 def test_regret_is_the_cost_above_the_optimum_and_failed_episodes_have_none():
@@ -43,7 +28,7 @@ def test_regret_is_the_cost_above_the_optimum_and_failed_episodes_have_none():
 
 
 def test_a_row_counts_falls_and_takes_regret_over_standing_episodes():
-    row = evaluate.summarize(
+    row = summarize(
         [
             result(),
             result(episode=1, cost=14.0, success=False),
@@ -66,7 +51,7 @@ def test_the_episodes_of_every_controller_are_the_certified_ones():
 
 def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path, monkeypatch):
     def run():
-        return evaluate.benchmark({"stabilize": ["lqr"]}, 4, "rk4", tmp_path, 1, lambda task, count: None)
+        return benchmark.benchmark({"stabilize": ["lqr"]}, 4, "rk4", tmp_path, 1, lambda task, count: None)
 
     first = run()
     (path,) = tmp_path.rglob("*.jsonl")
@@ -82,16 +67,16 @@ def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_p
 
 def test_a_rerun_in_other_processes_gives_the_same_but_for_times(tmp_path):
     def rows(out, workers):
-        results = evaluate.benchmark({"stabilize": ["lqr"]}, 7, "rk4", out, workers, lambda task, count: None)
-        return [replace(row, plan_ms_median=0, step_us_median=0) for row in evaluate.leaderboard(results)]
+        results = benchmark.benchmark({"stabilize": ["lqr"]}, 7, "rk4", out, workers, lambda task, count: None)
+        return [replace(row, plan_ms_median=0, step_us_median=0) for row in leaderboard(results)]
 
     assert rows(tmp_path / "a", 1) == rows(tmp_path / "b", 2)
 
 
 def test_the_leaderboard_files_hold_what_was_measured(tmp_path):
     results = [result(), result(controller="trajopt", cost=10.0, settle_time=math.nan)]
-    rows = evaluate.leaderboard(results)
-    evaluate.write_leaderboard(rows, results, {"commit": "none"}, tmp_path)
+    rows = leaderboard(results)
+    write_leaderboard(rows, results, {"commit": "none"}, tmp_path)
     with (tmp_path / "leaderboard.csv").open() as file:
         table = list(csv.DictReader(file))
     assert [entry["controller"] for entry in table] == ["lqr", "trajopt"]
@@ -104,8 +89,8 @@ def test_the_leaderboard_files_hold_what_was_measured(tmp_path):
 @pytest.mark.parametrize("name", ["", "leaderboard.json", "episodes.csv"])
 def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
     results = [result(effort=20.0, note="no plan"), result(controller="trajopt", settle_time=math.nan, success=False)]
-    evaluate.write_leaderboard(evaluate.leaderboard(results), results, {"commit": "none"}, tmp_path)
-    about, read = evaluate.read_results(tmp_path / name)
+    write_leaderboard(leaderboard(results), results, {"commit": "none"}, tmp_path)
+    about, read = read_results(tmp_path / name)
     assert repr(read) == repr(results)  # NaN is not equal to itself
     assert about == ({} if name.endswith(".csv") else {"commit": "none"})
 
@@ -113,7 +98,7 @@ def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
 def test_a_file_without_episodes_is_refused(tmp_path):
     (tmp_path / "leaderboard.json").write_text('{"rows": []}')
     with pytest.raises(ValueError, match="holds no episodes"):
-        evaluate.read_results(tmp_path)
+        read_results(tmp_path)
 
 
 class Standing:
@@ -186,19 +171,125 @@ def test_noise_reaches_the_controller_and_only_it():
 
 def test_a_policy_is_benchmarked_on_the_task_it_was_made_for(tmp_path):
     path = str(save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {}))
-    chosen = evaluate.controllers_of(["stabilize", "turn"], ["lqr", path])
+    chosen = benchmark.controllers_of(["stabilize", "turn"], ["lqr", path])
     assert chosen == {"stabilize": ["lqr"], "turn": ["lqr", path]}
-    assert evaluate.controllers_of(["stabilize", "turn"], [path]) == {"turn": [path]}
-    assert set(evaluate.policy_digests(chosen)) == {f"turn/{path}"}
+    assert benchmark.controllers_of(["stabilize", "turn"], [path]) == {"turn": [path]}
+    assert set(benchmark.policy_digests(chosen)) == {f"turn/{path}"}
     with pytest.raises(ValueError, match="which is none of stabilize"):
-        evaluate.controllers_of(["stabilize"], [path])
+        benchmark.controllers_of(["stabilize"], [path])
 
 
 def test_without_names_every_expert_and_shipped_policy_is_benchmarked():
-    for task, names in evaluate.controllers_of(list(TASKS)).items():
+    for task, names in benchmark.controllers_of(list(TASKS)).items():
         assert names == [*CONTROLLERS, *shipped_policies(make_task(task))]
 
 
 def test_an_unknown_controller_is_an_error_that_names_the_known_ones():
     with pytest.raises(ValueError, match=r"unknown controller pid; known: lqr, trajopt"):
-        evaluate.check_names("controller", ["pid"], ["lqr", "trajopt"])
+        benchmark.controllers_of(["stabilize"], ["pid"])
+
+
+def test_controllers_and_tasks_are_given_once_and_at_least_one_task(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="controller lqr is given more than once"):
+        benchmark.controllers_of(["stabilize"], ["lqr", "nmpc", "lqr"])
+    with pytest.raises(ValueError, match="task turn is given more than once"):
+        benchmark.controllers_of(["turn", "turn"])
+    with pytest.raises(ValueError, match="give at least one task: stabilize, turn"):
+        benchmark.controllers_of([])
+    monkeypatch.chdir(tmp_path)
+    save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {})
+    with pytest.raises(ValueError, match=r"controller ./mine.safetensors is given more than once"):
+        benchmark.controllers_of(["turn"], ["mine.json", "./mine.safetensors"])
+
+
+@pytest.mark.parametrize(
+    ("episodes", "message"),
+    [
+        (0, "must be 1 to 200, or a list of indices, not 0"),
+        (201, "must be 1 to 200"),
+        ([], "is empty"),
+        ([0, 0], "names an episode twice"),
+        ([0, 200], "must be 0 to 199, not 200"),
+        ([-1], "must be 0 to 199, not -1"),
+    ],
+)
+def test_episodes_that_do_not_exist_or_come_twice_are_refused(episodes, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate.evaluate("lqr", "stabilize", episodes, "rk4")
+
+
+def test_episodes_that_are_no_numbers_are_refused():
+    for episodes in (1.5, ["0"]):
+        with pytest.raises(TypeError, match=r"whole numbers|number of episodes"):
+            evaluate.evaluate("lqr", "stabilize", episodes, "rk4")
+
+
+def test_chosen_episodes_are_those_that_are_run():
+    rows = [evaluate.evaluate("lqr", "stabilize", chosen, "rk4") for chosen in ([3], np.array([3]), range(3, 4))]
+    assert len({row.cost_mean for row in rows}) == 1
+    assert rows[0].cost_mean != evaluate.evaluate("lqr", "stabilize", [4], "rk4").cost_mean
+
+
+def test_a_saved_stable_baselines_model_is_answered_with_how_to_give_it():
+    with pytest.raises(ValueError, match=r"load it and give the model: evaluate\(stable_baselines3.PPO.load"):
+        evaluate.evaluate("model.zip", "stabilize", 1, "rk4")
+    with pytest.raises(ValueError, match="saved Stable-Baselines3 model"):
+        benchmark.controllers_of(["stabilize"], ["model.zip"])
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"about": {}, "episodes": [{"task": 3}]}', "\xff", '{"about": 3}'])
+def test_damaged_results_are_refused(content, tmp_path):
+    (tmp_path / "leaderboard.json").write_text(content, encoding="latin-1")
+    with pytest.raises(ValueError, match="holds no episodes"):
+        read_results(tmp_path)
+
+
+def test_results_that_are_cut_off_are_refused(tmp_path):
+    results = [result(), result(episode=1, note="a, b")]
+    write_leaderboard(leaderboard(results), results, {}, tmp_path)
+    path = tmp_path / "episodes.csv"
+    content = path.read_text()
+    assert len(read_results(path)[1]) == 2
+    for length in range(len(content.splitlines()[0]) + 1, len(content)):
+        path.write_text(content[:length])
+        if content[length - 1] != "\n":
+            with pytest.raises(ValueError, match="holds no episodes"):
+                read_results(path)
+
+
+LIGHT = """
+import sys
+{code}
+print(sorted({{"torch", "casadi", "scipy", "stable_baselines3", "tyro", "matplotlib"}} & set(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "loaded"),
+    [
+        ("from ballbot_train import evaluate, shipped_policies", []),
+        ("import ballbot_train.evaluation.benchmark, ballbot_train.evaluation.comparison", []),
+        ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
+        (
+            "from ballbot_train import evaluate\n"
+            "class Idle:\n"
+            "    def reset(self, t, x, c): pass\n"
+            "    def act(self, t, x): return (0.0, 0.0)\n"
+            "evaluate(Idle(), 'stabilize', 1, 'rk4')",
+            [],
+        ),
+        ("from ballbot_train import load_policy", ["torch"]),
+    ],
+)
+def test_an_import_loads_only_what_it_needs(code, loaded):
+    run = subprocess.run([sys.executable, "-c", LIGHT.format(code=code)], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == str(loaded)
+
+
+def test_the_short_paths_are_the_same_functions():
+    assert ballbot_train.evaluate is evaluate.evaluate
+    assert ballbot_train.shipped_policies is shipped_policies
+    assert ballbot_train.BallbotVecEnv.__name__ == "BallbotVecEnv"
+    assert set(ballbot_train.__all__) <= set(dir(ballbot_train))
+    with pytest.raises(AttributeError, match="no attribute 'evaluat'"):
+        ballbot_train.evaluat  # noqa: B018

@@ -1,12 +1,18 @@
+import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ballbot_train import jobs
+from ballbot_train.provenance import commit_of, provenance
 
 
 def squares(log, items):
@@ -104,3 +110,151 @@ def test_a_folder_belongs_to_one_run_until_it_is_released(tmp_path):
         jobs.claim(tmp_path, {"episodes": 4, "policies": {}})
     jobs.release(tmp_path)
     jobs.claim(tmp_path, {"episodes": 4, "policies": {}})
+
+
+def test_the_files_of_a_claim_keep_facts_that_are_not_compared(tmp_path):
+    jobs.claim(tmp_path, {"seed": 1}, "config.json", {"about": {"commit": "a"}})
+    jobs.claim(tmp_path, {"seed": 1}, "config.json", {"about": {"commit": "b"}})
+    assert json.loads((tmp_path / "config.json").read_text()) == {"seed": 1, "about": {"commit": "b"}}
+    with pytest.raises(ValueError, match="seed 1, not 2"):
+        jobs.claim(tmp_path, {"seed": 2}, "config.json", {"about": {}})
+
+
+def test_unlocking_keeps_the_configuration_and_releasing_leaves_nothing(tmp_path):
+    jobs.claim(tmp_path, {"seed": 1})
+    jobs.unlock(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [jobs.MARKER]
+    jobs.claim(tmp_path, {"seed": 1})
+    jobs.release(tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_that_was_deleted_can_be_claimed_again(tmp_path):
+    out = tmp_path / "out"
+    jobs.claim(out, {"seed": 1})
+    shutil.rmtree(out)
+    jobs.claim(out, {"seed": 2})
+    assert (out / jobs.MARKER).exists()
+    jobs.release(out)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "[" * 100_000, ""])
+def test_a_damaged_claim_is_named(content, tmp_path):
+    (tmp_path / jobs.MARKER).write_text(content)
+    with pytest.raises(ValueError, match=r"unfinished\.json is damaged .*; delete it or give another --out"):
+        jobs.claim(tmp_path, {})
+    jobs.unlock(tmp_path)
+
+
+HOLDING = """
+import sys
+from pathlib import Path
+from ballbot_train import jobs
+
+jobs.claim(Path(sys.argv[1]), {"seed": 1})
+print("claimed", flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_two_processes_never_use_a_folder_at_once(tmp_path):
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLDING, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout.readline() == "claimed\n"
+    with pytest.raises(ValueError, match=r"another run is using .* right now"):
+        jobs.claim(tmp_path, {"seed": 1})
+    with pytest.raises(ValueError, match="another run is using"):
+        jobs.run([job(squares, tmp_path / "log", range(3))], tmp_path, 1, ignore)
+    other.kill()  # what a killed process held is free again
+    other.communicate()
+    jobs.claim(tmp_path, {"seed": 1})
+    jobs.release(tmp_path)
+
+
+def deadly(log, victim, always, items):
+    """Squares, but the process dies at one item: the first time, or always."""
+    for item in items:
+        with open(log, "a") as file:
+            file.write(f"{item}\n")
+        if item == victim and (always or Path(log).read_text().split().count(str(victim)) == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield {"square": item**2}
+
+
+def deadly_jobs(log, always):
+    ranges = (range(4), range(4, 8), range(8, 12))
+    return [jobs.Job(f"job{i}", deadly, (str(log), 5, always), tuple(items)) for i, items in enumerate(ranges)]
+
+
+def test_an_item_whose_process_dies_is_tried_again(tmp_path):
+    log, counted = tmp_path / "log", []
+    done = jobs.run(deadly_jobs(log, False), tmp_path, 2, lambda group, count: counted.append(count))
+    assert [entry["square"] for entries in done for entry in entries] == [i**2 for i in range(12)]
+    assert sum(counted) == 12
+    assert sorted(map(int, log.read_text().split())) == sorted([*range(12), 5])
+
+
+def test_an_item_whose_process_dies_twice_is_named_and_everything_else_is_kept(tmp_path):
+    log = tmp_path / "log"
+    with pytest.raises(jobs.WorkerError, match=r"at job1, item 5\. Everything else is kept: the same command"):
+        jobs.run(deadly_jobs(log, True), tmp_path, 2, ignore)
+    assert sorted(map(int, log.read_text().split())) == sorted([*range(12), 5])
+    done = jobs.run(deadly_jobs(log, False), tmp_path, 2, ignore)
+    assert [entry["square"] for entries in done for entry in entries] == [i**2 for i in range(12)]
+    assert sorted(map(int, log.read_text().split())) == sorted([*range(12), 5, 5])
+
+
+def test_lines_that_are_damaged_are_done_again(tmp_path):
+    log = tmp_path / "log"
+    jobs.run([job(squares, log, range(4))], tmp_path, 1, ignore)
+    path = next(tmp_path.rglob("job.jsonl"))
+    first, second, _, last = path.read_text().splitlines()
+    path.write_text("\n".join([first, second[:5], "\x00" * 20, last, '{"item": 9, "entry": {}}', ""]))
+    (entries,) = jobs.run([job(squares, log, range(4))], tmp_path, 1, ignore)
+    assert [entry["square"] for entry in entries] == [0, 1, 4, 9]
+    assert log.read_text().split() == ["0", "1", "2", "3", "1", "2"]
+
+
+def careless(items):
+    """Yields for each item, and spoils what it did before."""
+    for folder in items:
+        yield {"item": folder}
+        next(Path(folder).rglob("*.jsonl")).write_text("")
+
+
+def test_a_run_never_ends_with_items_missing(tmp_path):
+    with pytest.raises(ValueError, match="holds 0 of 1 items though the run has ended"):
+        jobs.run([jobs.Job("job", careless, (), (str(tmp_path),))], tmp_path, 1, ignore)
+
+
+def test_a_run_needs_a_worker(tmp_path):
+    with pytest.raises(ValueError, match="workers must be at least 1, not 0"):
+        jobs.run([job(squares, tmp_path / "log", range(3))], tmp_path, 0, ignore)
+
+
+def test_a_result_names_the_commit_of_the_checkout_that_tracks_the_code(tmp_path):
+    def git(*arguments):
+        identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        subprocess.run(["git", *identity, "-C", str(tmp_path), *arguments], check=True, capture_output=True)
+
+    nested = tmp_path / "a" / "b"
+    nested.mkdir(parents=True)
+    tracked, untracked = nested / "tracked.py", nested / "untracked.py"
+    for path in (tracked, untracked):
+        path.write_text("")
+    git("init")
+    git("add", "a/b/tracked.py")
+    git("commit", "-m", "first")
+    assert re.fullmatch("[0-9a-f]{7,}", commit_of(tracked))
+    assert commit_of(untracked) == "none"  # an installed package in somebody else's repository
+    tracked.write_text("changed")
+    assert commit_of(tracked).endswith("-dirty")
+
+
+def test_provenance_says_none_for_what_is_not_installed(monkeypatch):
+    monkeypatch.setattr("ballbot_train.provenance._PACKAGES", ("numpy", "no-such-package"))
+    facts = provenance()
+    assert facts["numpy"] == np.__version__
+    assert facts["no-such-package"] == "none"
+    assert list(facts)[:3] == ["version", "commit", "python"]

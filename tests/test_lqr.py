@@ -11,6 +11,7 @@ from ballbot_baselines.lqr import (
     closed_gains,
     continuous_lqr,
     discrete_lqr,
+    equilibrium_gain,
     final_weight,
     is_equilibrium,
     tracking_gains,
@@ -206,3 +207,18 @@ def test_heavier_price_on_effort_means_less_of_it(params):
     cheap = discrete_lqr(Stabilize(), params, ORIGIN, NO_FORCE, NO_CONSTANTS)[1]
     dear = discrete_lqr(replace(Stabilize(), effort_weight=5e-2), params, ORIGIN, NO_FORCE, NO_CONSTANTS)[1]
     assert (np.linalg.eigvalsh(dear - cheap) > 0).all()
+
+
+def test_equilibrium_gain_gives_lqrs_force_and_cost_from_the_observation(params):
+    task = Stabilize()
+    k, p = discrete_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
+    action_gain, weight = equilibrium_gain(task, params)
+    x = 0.01 * np.arange(1.0, 9.0)
+    observation = np.asarray(task.observe(x, NO_CONSTANTS))[:8]
+    np.testing.assert_allclose(params.force_limit * action_gain @ observation, -k @ x, rtol=1e-12)
+    assert observation @ weight @ observation == pytest.approx(x @ p @ x, rel=1e-12)
+
+
+def test_tasks_that_do_not_end_at_rest_have_no_equilibrium_gain(params):
+    assert equilibrium_gain(Orbit(), params) is None
+    assert equilibrium_gain(Turn(), params) is None

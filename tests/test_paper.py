@@ -234,3 +234,25 @@ def test_orbits_start_on_the_y_axis_and_close(params):
     assert problem.initial[0][0] == problem.initial[1][0] == 0
     assert problem.periodic
     assert len(problem.free) == 1
+
+
+def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):
+    pytest.importorskip("pybullet")
+    from ballbot_baselines.paper_experiments import TRACKING_DT, track_plan
+
+    plan = plan_of("stabilize-1")
+    tracked = track_plan(plan, params)
+    assert tracked.error < 0.01  # measured: 1 mm
+    assert tracked.executed.duration == pytest.approx(plan.trajectory.duration, abs=TRACKING_DT)
+
+
+def test_lqr_and_trajectory_optimization_start_where_the_papers_problem_starts():
+    pytest.importorskip("pybullet")
+    from ballbot_baselines.paper_experiments import compare_stabilization
+
+    entry = PAPER_PROBLEMS["stabilize-1"]
+    runs = compare_stabilization(entry)
+    assert [(run.controller, round(run.rate)) for run in runs] == [("lqr", 1000), ("trajopt", 50)]
+    for run in runs:
+        np.testing.assert_array_equal(run.episode.trajectory.x[0], entry.problem.initial[0])
+        assert not run.episode.failure

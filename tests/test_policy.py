@@ -18,7 +18,7 @@ from ballbot_train.policy import (
     PolicyNetwork,
     PolicySpec,
     load_policy,
-    read_about,
+    read_description,
     save_policy,
     shipped_policies,
 )
@@ -113,11 +113,28 @@ SHIPPED = [(name, learner) for name in TASKS for learner in shipped_policies(TAS
 def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, learner):
     """On the first certified episodes they succeed, at a regret of the order that they claim."""
     task = TASKS[name]()
-    about = read_about(shipped_policies(task)[learner])
-    assert about["training"]["command"].startswith("ballbot ")
-    measured = about["measured"]
+    described = read_description(shipped_policies(task)[learner])
+    assert described["training"]["command"].startswith("ballbot ")
+    measured = described["measured"]
     assert measured["physics"] == "bullet"
     assert measured["episodes"] == 200
     row = evaluate(learner, name, episodes=10)
     assert row.success >= measured["success"] - 0.2
     assert row.regret_median < 3 * max(measured["regret_median"], 0.01)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("[" * 100_000, "recursion"),
+        ("[]", "list indices"),
+        ("{}", "has no 'spec'"),
+        ('{"spec": 3}', "its spec is no object"),
+        ('{"spec": {}}', "has no 'task'"),
+        ('{"spec": {"task": null}}', "its spec names no task"),
+    ],
+)
+def test_a_description_that_is_none_is_refused_with_the_reason(content, reason, tmp_path):
+    (tmp_path / "mine.json").write_text(content)
+    with pytest.raises(PolicyError, match=f"mine.json is not a policy: .*{reason}"):
+        read_description(tmp_path / "mine.json")

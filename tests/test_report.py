@@ -1,11 +1,13 @@
 """The report page, as text and in a browser."""
 
+import json
 import re
 import shutil
 import time
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
@@ -103,14 +105,36 @@ def test_a_page_without_figures_carries_no_plotly(tmp_path):
 def test_words_are_text_and_not_markup(tmp_path):
     sections = [
         table_section("<b>", ["<i>"], [["<u>"]]),
-        Section("plain", "<em>kept</em>", lead="<s>"),
+        Section("body", Markup("<em>kept</em>"), lead="<s>"),
+        Section("text", "<h8>"),
         replay_section("r", [Replay("</script>", (Take("<q>", leaning(0.1, 0.1), "red"),))]),
     ]
     text = write_report("<h9>", sections, {"<p9>": "<p8>"}, tmp_path / "report.html").read_text()
     text = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)  # less the page's own scripts
-    assert not re.search("<(b|i|u|s|q|h9|p9|p8)>", text)
+    assert not re.search("<(b|i|u|s|q|h8|h9|p9|p8)>", text)
     assert "<em>kept</em>" in text
-    assert '"title":"\\u003c/script>"' in text
+    assert '"title":"\\u003c/script\\u003e"' in text
+
+
+def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
+    name = """<script>alert('"a" & b')</script>"""
+    picture = figures.save(
+        figures.trajectory_figure("t", [figures.Curve("a", leaning(0.1, 0.1), "red")]), tmp_path / "'a\"&.png"
+    )
+    sections = [
+        table_section(name, [name], [[name, name]], lead=name),
+        curves_section(name, [Panel(name, name, name, [Line(name, [0, 1], [0, 1], "red")])]),
+        replay_section(name, [Replay(name, (Take(name, leaning(0.1, 0.1), "red", note=name),))]),
+        pictures_section(name, [picture]),
+    ]
+    text = write_report(name, sections, {name: name}, tmp_path / "report.html").read_text()
+    assert "alert" in text
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(&#39;&#34;a&#34; &amp; b&#39;)&lt;/script&gt;" in text
+    assert 'alt="&#39;a&#34;&amp;"' in text
+    for data in re.findall(r'<script type="application/json">(.*?)</script>', text, flags=re.DOTALL):
+        assert not set("<>&'") & set(data)
+        json.loads(data)
 
 
 def test_learning_curves_come_from_what_training_wrote(tmp_path):

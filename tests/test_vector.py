@@ -13,7 +13,9 @@ import torch
 
 from ballbot_gym import BallbotEnv, BallbotParams, counter_rng, dynamics
 from ballbot_gym import batch as batch_module
-from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.params import default_params
+from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.simulator import BulletSimulator
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.vector import BallbotVectorEnv
@@ -44,6 +46,47 @@ def column(infos, i):
 def assert_same_info(got, expected, tolerance):
     for key in INFO:
         np.testing.assert_allclose(got[key], expected[key], rtol=tolerance, atol=tolerance, err_msg=key)
+
+
+# --- whole episodes ---
+
+
+def test_episodes_run_at_once_are_those_that_single_envs_run(task, make_env, rng):
+    """Starts are such that some episodes end early; the policy is a linear function of the observation."""
+    short = type(task)(duration=1.0)
+    starts = [short.sample(rng, default_params()) for _ in range(6)]
+    x, c = (np.array(part) for part in zip(*starts, strict=True))
+    x[0, 2], x[0, 6] = 1.3, 4.0  # falls
+    weights = torch.tensor(rng.normal(0, 0.3, (2, len(short.observation_scale))), dtype=torch.float64)
+
+    def policy(observation):
+        return torch.tanh(observation.double() @ weights.T)
+
+    batch = BallbotBatch(short, len(x), dtype=torch.float64, compile=False)
+    run = run_episodes(batch, policy, x, c, record=True)
+    assert run.failure[0]
+    env = make_env(short, physics="rk4")
+    for i in range(len(x)):
+        controller = ActionController(short, env.params, lambda seen, begins: policy(torch.as_tensor(seen)).numpy())
+        alone = rollout(env, controller, options={"state": x[i], "constants": c[i]})
+        ended_early = len(alone.trajectory.u) < short.steps
+        assert (run.success[i], run.failure[i], run.steps[i]) == (alone.success, alone.failure, len(alone.trajectory.u))
+        assert run.terminated[i] == (alone.failure or (ended_early and alone.success))
+        # the env rounds observations to float32, and the robot multiplies that rounding by e^7.8 in a second
+        assert run.cost[i].item() == pytest.approx(alone.cost, rel=1e-3)
+        np.testing.assert_allclose(run.states[: run.steps[i], :, i], alone.trajectory.x[1:], atol=1e-2)
+
+
+def test_episodes_are_not_recorded_and_carry_no_gradient_unless_asked():
+    task = TASKS["stabilize"](duration=0.1)
+    weights = torch.zeros(8, 2, requires_grad=True)
+    run = run_episodes(
+        BallbotBatch(task, 2, compile=False), lambda seen: seen @ weights, np.zeros((2, 8)), np.zeros((2, 0))
+    )
+    assert run.states is None
+    assert not run.cost.requires_grad
+    assert run.success.all()
+    assert run.steps.tolist() == [5, 5]
 
 
 # --- the same environment as BallbotEnv(physics="rk4") ---

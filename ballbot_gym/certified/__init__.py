@@ -1,7 +1,7 @@
 """Certified evaluation sets: for every task 200 fixed episodes with their optima.
 
-`load(task)` reads what `ballbot certify` computed: initial states, constants, optimal costs and how the solver ended, and
-the whole optimal trajectory of the first 20 episodes. Costs are on the env's own discretization under physics="rk4".
+`load(task)` reads what `ballbot certify` computed: initial states, constants, optimal costs and the solver's status of each
+episode, and the optimal trajectories of the first 20 episodes. Costs hold for the env's discretization with physics="rk4".
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class EvaluationSet:
         return {"state": self.states[i], "constants": self.constants[i]}
 
     def save(self, task: Task, path: Path) -> Path:
-        """Writes the set, with the task's fields, so that it is never read for another problem."""
+        """Writes the set and the task's fields. `load` refuses it for a task with other fields."""
         arrays = {
             "task": np.array(repr(task)),
             **{name: getattr(self, name) for name in _PER_EPISODE},
@@ -75,7 +75,7 @@ def load(task: Task, path: Path | None = None) -> EvaluationSet:
     """The evaluation set of a task.
 
     Args:
-        task: must have the very fields the set was computed for.
+        task: must have the fields for which the set was computed.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
 
     Raises:

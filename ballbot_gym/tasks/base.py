@@ -1,4 +1,4 @@
-"""What a task is: one finite-horizon optimal-control problem that env, experts, optimizer and leaderboard all read."""
+"""Task: the one definition of an optimal-control problem that env, experts, optimizer and leaderboard use."""
 
 import math
 from abc import ABC, abstractmethod
@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ballbot_gym import dynamics, ops
+from ballbot_gym import dynamics
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
@@ -15,10 +15,10 @@ from ballbot_gym.tasks.marker import Marker
 
 @dataclass(frozen=True)
 class Reference:
-    """A steady motion that linear control regulates towards, one point per control step: x (n, 8) and u (n, 2).
+    """A steady motion that linear control tracks, one point per control step: x (n, 8) and u (n, 2).
 
-    An open reference is followed in time and its last point kept; a single point is an equilibrium. A closed one repeats
-    for ever, and whoever follows it may join at any point.
+    An open reference is tracked in time, and after its end its last point. A single point is an equilibrium. A closed
+    reference repeats for ever, and a controller may begin at any of its points.
     """
 
     x: np.ndarray
@@ -136,36 +136,3 @@ class Task(ABC):
     def is_goal(self, x: Vector, c: Vector) -> bool:
         """Whether one state is in the goal."""
         return all(excess <= 0 for excess in self.goal(x, c))
-
-
-def cubic(p0: np.ndarray, v0: np.ndarray, p1: np.ndarray, v1: np.ndarray, steps: int, dt: float) -> np.ndarray:
-    """(steps+1, 2) the cubic ground path from position and velocity to position and velocity, in SI units."""
-    s = np.linspace(0.0, 1.0, steps + 1)[:, None]
-    duration = steps * dt
-    return (
-        (1 + 2 * s) * (1 - s) ** 2 * p0
-        + s * (1 - s) ** 2 * duration * v0
-        + s**2 * (3 - 2 * s) * p1
-        + s**2 * (s - 1) * duration * v1
-    )
-
-
-def then_stay(path: np.ndarray, steps: int) -> np.ndarray:
-    """A path prolonged to (steps+1, 2) by its last point, or cut."""
-    rest = np.repeat(path[-1:], max(0, steps + 1 - len(path)), axis=0)
-    return np.concatenate([path, rest])[: steps + 1]
-
-
-def between(z: Any, low: Any, high: Any) -> Any:
-    """A uniform number z in [0, 1) as one in [low, high)."""
-    return low + (high - low) * z
-
-
-def squared(*parts: Any) -> Any:
-    """Sum of squares."""
-    return sum(part * part for part in parts)
-
-
-def scaled(parts: tuple[Any, ...], scale: tuple[float, ...], like: Vector) -> Vector:
-    """Stacks parts divided by scale."""
-    return ops.stack(tuple(part / s for part, s in zip(parts, scale, strict=True)), like)

@@ -1,11 +1,11 @@
-"""What a task wants drawn."""
+"""Markers: what a task draws besides the robot."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Marker:
-    """Something a task wants drawn: an upright cylinder of `radius` and `height`, its foot on the floor, both in m.
+    """An upright cylinder on the floor, with `radius` and `height` in m.
 
     A `ring` is drawn as its circumference only.
     """

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import ops
-from ballbot_gym.ops import Vector
+from ballbot_gym.ops import Vector, between, scaled, squared
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import Reference, Task, between, scaled, squared
+from ballbot_gym.tasks.base import Reference, Task
 from ballbot_gym.tasks.marker import Marker
 
 _GUESS_SECONDS = 1.5  # how long a guessed path takes to reach its speed

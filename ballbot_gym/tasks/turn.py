@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import dynamics, ops
-from ballbot_gym.ops import Vector
+from ballbot_gym.ops import Vector, between, scaled, squared
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import Reference, Task, between, cubic, scaled, squared
+from ballbot_gym.paths import cubic
+from ballbot_gym.tasks.base import Reference, Task
 from ballbot_gym.tasks.marker import Marker
 
 _START, _GATE = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # m, the paper's turn
-_LINEAR_SECONDS_PER_SPEED = 0.6  # s per m/s: with less LQR falls, with more it dawdles (0.5 to 1.0 tried)
+_LINEAR_SECONDS_PER_SPEED = 0.6  # s per m/s: with less LQR falls, with more it is slow (0.5 to 1.0 tried)
 
 
 @dataclass(frozen=True)

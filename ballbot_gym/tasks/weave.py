@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import ops
-from ballbot_gym.ops import Vector
+from ballbot_gym.ops import Vector, between, scaled, squared
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import Reference, Task, between, scaled, squared, then_stay
+from ballbot_gym.paths import catmull_rom, then_stay
+from ballbot_gym.tasks.base import Reference, Task
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import at_rest
 
@@ -165,7 +166,7 @@ class Weave(Task):
         knots_y = np.concatenate([[x[1]], obstacles[:, 1] + np.array(sides) * clearance, [goal[1]]])
         s = np.minimum(self.control_dt * np.arange(self.steps + 1) / _GUESS_SECONDS, 1.0)
         along = x[0] + (goal[0] - x[0]) * s**3 * (10 - 15 * s + 6 * s**2)  # minimum jerk
-        return then_stay(np.column_stack([along, _smooth(knots_x, knots_y, along)]), self.steps)
+        return then_stay(np.column_stack([along, catmull_rom(knots_x, knots_y, along)]), self.steps)
 
     def observe(self, x: Vector, c: Vector) -> Vector:
         px, py, *rest = ops.components(x)
@@ -194,18 +195,3 @@ def sides_passed(path: np.ndarray, c: np.ndarray) -> tuple[int, ...]:
     _, obstacles = split_constants(c)
     nearest = [np.argmin(np.hypot(*(path - obstacle[:2]).T)) for obstacle in obstacles]
     return tuple(1 if path[k, 1] > o[1] else -1 for k, o in zip(nearest, obstacles, strict=True))
-
-
-def _smooth(knots_x: np.ndarray, knots_y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Cubic Hermite interpolation with Catmull–Rom slopes, flat at both ends."""
-    slopes = np.zeros_like(knots_y)
-    slopes[1:-1] = (knots_y[2:] - knots_y[:-2]) / (knots_x[2:] - knots_x[:-2])
-    i = np.clip(np.searchsorted(knots_x, x, side="right") - 1, 0, len(knots_x) - 2)
-    h = knots_x[i + 1] - knots_x[i]
-    s = (x - knots_x[i]) / h
-    return (
-        (1 + 2 * s) * (1 - s) ** 2 * knots_y[i]
-        + s * (1 - s) ** 2 * h * slopes[i]
-        + s**2 * (3 - 2 * s) * knots_y[i + 1]
-        + s**2 * (s - 1) * h * slopes[i + 1]
-    )

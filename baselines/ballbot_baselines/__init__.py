@@ -1,19 +1,33 @@
-"""Experts that know the model: linear control, trajectory optimization, and the optima everything is measured by."""
+"""Experts that know the model: linear control, trajectory optimization, and the optima that regret is measured against.
+
+`from ballbot_baselines import find_optimum` is the short path to `optimum.find_optimum`. Importing this package is light:
+CasADi and SciPy are imported when a controller is made or `find_optimum` is first asked for.
+"""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_gym.lazy import called, load
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
-CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
-    "lqr": LqrController,
-    "trajopt": TrajoptController,
-    "nmpc": NmpcController,
-}
-"""Every controller by its name on the command line. A new one is one file and one line here."""
+if TYPE_CHECKING:
+    from ballbot_baselines.optimum import find_optimum
 
-__all__ = ["CONTROLLERS", "Controller"]
+CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
+    "lqr": called("ballbot_baselines.lqr:LqrController"),
+    "trajopt": called("ballbot_baselines.trajopt:TrajoptController"),
+    "nmpc": called("ballbot_baselines.nmpc:NmpcController"),
+}
+"""Every controller by its name on the command line. To add a controller, write one file and add one line here."""
+
+_LAZY = {"find_optimum": "ballbot_baselines.optimum:find_optimum"}
+
+__all__ = ["CONTROLLERS", "Controller", "find_optimum"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return load(_LAZY[name])
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

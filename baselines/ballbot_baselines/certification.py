@@ -1,15 +1,27 @@
-"""Computes the certified evaluation sets that `ballbot_gym.certified` loads."""
+"""Computes the certified evaluation sets that `ballbot_gym.certified` loads.
+
+`entries` solves episodes one after the other and yields what JSON holds, so that the work can be divided and continued.
+`evaluation_set` makes the set of all entries.
+"""
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
+
+Entry = dict[str, Any]
+"""The optimum of one episode as JSON holds it: "episode" (its index), "cost", "violation", "solver", "status", and the
+optimal trajectory's "t", "x" and "u" as lists. JSON keeps every bit of a float. Where no optimum was found: "episode" and
+"error", the message."""
 
 
 def episode(task: Task, params: BallbotParams, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -17,25 +29,61 @@ def episode(task: Task, params: BallbotParams, index: int) -> tuple[np.ndarray, 
     return task.sample(np.random.default_rng([zlib.crc32(task.id.encode()), index]), params)
 
 
-def solve_episodes(task: Task, params: BallbotParams, indices: range) -> Iterator[tuple[int, Optimum | PlanError]]:
-    """The optimum of each episode, or the error that says why there is none."""
+def entries(task_name: str, indices: Iterable[int]) -> Iterator[Entry]:
+    """Solves episodes of a task with default settings for the default robot, and yields one entry for each, in order.
+
+    Raises:
+        ValueError: no task of that name.
+    """
+    task, params = make_task(task_name), default_params()
     for index in indices:
-        x0, c = episode(task, params, index)
         try:
-            yield index, find_optimum(task, params, x0, c)
+            yield _entry(index, find_optimum(task, params, *episode(task, params, index)))
         except PlanError as error:
-            yield index, error
+            yield {"episode": index, "error": str(error)}
 
 
-def evaluation_set(task: Task, params: BallbotParams, optima: list[Optimum]) -> EvaluationSet:
-    """The set of the first episodes, given all their optima in order."""
-    episodes = [episode(task, params, index) for index in range(len(optima))]
+def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) -> EvaluationSet:
+    """The set of the first episodes.
+
+    Args:
+        task: the task that the entries were computed for.
+        params: the robot.
+        entries: one for each episode, from episode 0 on, in order.
+
+    Raises:
+        PlanError: an entry has no optimum; the message names the episodes.
+        ValueError: an episode is missing or out of order.
+    """
+    failed = [f"episode {entry['episode']}: {entry['error']}" for entry in entries if "error" in entry]
+    if failed:
+        raise PlanError(f"no optimum of {task.id} for\n" + "\n".join(failed))
+    for index, entry in enumerate(entries):
+        if entry["episode"] != index:
+            raise ValueError(
+                f"entry {index} of {task.id} is of episode {entry['episode']}; give episodes 0, 1, 2, … in order"
+            )
+    episodes = [episode(task, params, index) for index in range(len(entries))]
     return EvaluationSet(
         states=np.array([x for x, _ in episodes]),
         constants=np.array([c for _, c in episodes]),
-        costs=np.array([optimum.cost for optimum in optima]),
-        durations=np.array([optimum.trajectory.duration for optimum in optima]),
-        violations=np.array([optimum.violation for optimum in optima]),
-        statuses=np.array([f"{optimum.solver}: {optimum.status}" for optimum in optima]),
-        trajectories=tuple(optimum.trajectory for optimum in optima[:TRAJECTORIES]),
+        costs=np.array([entry["cost"] for entry in entries]),
+        durations=np.array([entry["t"][-1] - entry["t"][0] for entry in entries]),
+        violations=np.array([entry["violation"] for entry in entries]),
+        statuses=np.array([f"{entry['solver']}: {entry['status']}" for entry in entries]),
+        trajectories=tuple(Trajectory(entry["t"], entry["x"], entry["u"]) for entry in entries[:TRAJECTORIES]),
     )
+
+
+def _entry(index: int, optimum: Optimum) -> Entry:
+    trajectory = optimum.trajectory
+    return {
+        "episode": index,
+        "cost": optimum.cost,
+        "violation": optimum.violation,
+        "solver": optimum.solver,
+        "status": optimum.status,
+        "t": trajectory.t.tolist(),
+        "x": trajectory.x.tolist(),
+        "u": trajectory.u.tolist(),
+    }

@@ -1,4 +1,4 @@
-"""Direct collocation: trajectory optimization between states with a free time step, as plain data and its transcription.
+"""Direct collocation: trajectory optimization between two states with a free time step. A problem is plain data.
 
     minimize    Σ_{n<N} cost(x_n, u_n, h, q)
     subject to  Hermite–Simpson:  the cubic through (x_n, f_n) and (x_{n+1}, f_{n+1}) obeys the dynamics at mid-interval,
@@ -6,8 +6,8 @@
                 equalities(x_n, u_n, q) = 0,  inequalities(x_n, u_n, q) ≥ 0 at every knot
                 bounds on x_0, x_N, leans, forces, step h and free variables q;   x_N = x_0 if periodic
 
-The transcription only supplies the defect; `ocp.OcpSolver` solves it, with the next knot as input and h and q carried along
-as states that do not change.
+This module writes the problem as a staged `Ocp`, and `ocp.OcpSolver` solves it. The input of a stage is the next knot. The
+step h and the free variables q are states that do not change.
 """
 
 import time
@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver, no_final_path
 from ballbot_baselines.optimum import FEASIBLE
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
@@ -27,8 +27,8 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
 _UNLIKE = 0.2
-"""Share of a guess's changes that its velocities may leave unexplained: smooth paths and solutions leave up to 0.09, straight
-lines 0.54 to 1."""
+"""Largest share of a guess's changes that its velocities may fail to explain, for the guess to count as a motion. Measured:
+smooth paths and solutions up to 0.09, straight lines 0.54 to 1."""
 _INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation error is measured
 
 
@@ -42,7 +42,7 @@ class Problem:
     initial: tuple[np.ndarray, np.ndarray]
     """Lower and upper bound of x_0, (8,) each; equal where it is given."""
     final: tuple[np.ndarray, np.ndarray]
-    """The same of x_N."""
+    """Lower and upper bound of x_N, (8,) each."""
     intervals: int = 40
     step: tuple[float, float] = (0.005, 0.2)
     """Bounds of h, s."""
@@ -72,9 +72,9 @@ class Guess:
 class Plan:
     """A solved `Problem`.
 
-    The trajectory has linear forces and cubic states. `violation` is the largest constraint violation, `collocation_error`
-    the largest over the intervals of ∫|ẋ(t) − f(x(t), u(t))| dt for the interpolated plan, in state units: it shrinks as
-    knots are added and says how far the plan can be believed between them.
+    The trajectory has linear forces and cubic states. `violation` is the largest constraint violation. `collocation_error`
+    is the largest ∫|ẋ(t) − f(x(t), u(t))| dt over an interval, in state units, for the interpolated plan. It measures the
+    plan's error between knots, and shrinks as knots are added.
     """
 
     cost: float
@@ -138,7 +138,7 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
         cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
         equalities=lambda s, w, p: casadi.vertcat(defect(s, w), path(problem.equalities, s)),
         inequalities=lambda s, w, p: path(problem.inequalities, s),
-        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else None,
+        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_final_path,
         final_inequalities=lambda s, p: path(problem.inequalities, s),
         initial_matrix=initial,
     )
@@ -154,9 +154,9 @@ def solve(
 ) -> Plan:
     """Solves a problem from a guess.
 
-    A guess that is no motion, as the paper's straight line from state to state, is first bent toward one: by a single Newton
-    step on the dynamics, the shortest. From the line itself the solvers take up to 12 times as many iterations, or stop at
-    an infeasible point.
+    A guess that is no motion, such as the paper's straight line from state to state, is first bent toward a motion by one
+    Newton step on the dynamics. Without that step the solvers take up to 12 times as many iterations from the line, or stop
+    at an infeasible point.
 
     Raises:
         PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
@@ -184,14 +184,14 @@ def solve(
 
 
 def _is_motion(guess: Guess) -> bool:
-    """Whether positions and leans change about as the guess's velocities and lean rates say."""
+    """Whether the guess's velocities and lean rates roughly explain how its positions and leans change."""
     changes = np.diff(guess.x[:, :4], axis=0)
     expected = 0.5 * guess.h * (guess.x[1:, 4:] + guess.x[:-1, 4:])
     return bool(np.abs(changes - expected).sum() <= _UNLIKE * (np.abs(changes) + np.abs(expected)).sum())
 
 
 def _with_given_times(bounds: Bounds, states: np.ndarray, at: _Layout) -> Bounds:
-    """Bounds that also hold the step and the free variables where a guess has them."""
+    """Bounds that also fix the step and the free variables at the guess's values."""
     lower, upper = bounds.state_lower.copy(), bounds.state_upper.copy()
     held = slice(at.h, at.start.start)
     lower[:, held] = upper[:, held] = np.clip(states[:, held], lower[0, held], upper[0, held])
@@ -206,7 +206,7 @@ def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:
     for knot, (low, high) in ((0, problem.initial), (-1, problem.final)):
         lower[knot, at.x] = np.maximum(lower[knot, at.x], low)
         upper[knot, at.x] = np.minimum(upper[knot, at.x], high)
-    # h and q stay what they are at the first knot, so they are bounded there alone.
+    # h and q do not change, so bounds at the first knot suffice.
     lower[0, at.h], upper[0, at.h] = problem.step
     for i, (low, high) in enumerate(problem.free):
         lower[0, at.q.start + i], upper[0, at.q.start + i] = low, high

@@ -3,23 +3,23 @@
 import numpy as np
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import cubic
+from ballbot_gym.paths import cubic
 
 _SMOOTHING = 0.15  # s: shorter turns of a guessed path are rounded off, because the body cannot follow them
 
 
 def straight_line(x0: np.ndarray, x1: np.ndarray, intervals: int) -> np.ndarray:
-    """(intervals+1, 8) the paper's guess: from state to state in a straight line, consistent with nothing."""
+    """(intervals+1, 8) the paper's guess: a straight line from state to state, which no motion of the robot follows."""
     return np.linspace(x0, x1, intervals + 1)
 
 
 def along_path(
     params: BallbotParams, path: np.ndarray, dt: float, start: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States and forces that follow a ground path about as the dynamics would.
+    """States and forces that approximately follow a ground path.
 
-    The lean is the one that holds the path's acceleration: tan γ = ẍ/g, and the force moves both masses. Exact for
-    constant acceleration; for the rest the solver mends it.
+    The lean balances the path's acceleration, tan γ = ẍ/g, and the force accelerates both masses. This is exact for constant
+    acceleration. For other paths the solver corrects it.
 
     Args:
         params: the robot.

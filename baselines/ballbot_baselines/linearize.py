@@ -97,6 +97,6 @@ def _blocks(horizontal: casadi.DM, n: int) -> np.ndarray:
 
 
 def _semidefinite(matrices: np.ndarray) -> np.ndarray:
-    """The nearest positive semidefinite matrices: negative curvature cannot weigh an error."""
+    """The nearest positive semidefinite matrices. Negative eigenvalues are clipped, because LQR needs Q ⪰ 0."""
     values, vectors = np.linalg.eigh(matrices)
     return (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)

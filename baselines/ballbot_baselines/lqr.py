@@ -1,8 +1,7 @@
 """Linear-quadratic regulators: about an equilibrium, along a trajectory, and around a closed motion.
 
-All use the env's own discretization: force held for control_dt, cost summed over control steps. So about an equilibrium
-the env's cost from small states is xᵀPx exactly, but for the tail beyond the episode. `continuous_lqr` is the
-continuous-time limit, as in the paper.
+All use the env's own discretization: force held for control_dt, cost summed over control steps. So near an equilibrium the
+cost of an endless episode is xᵀPx. `continuous_lqr` is the continuous-time limit, as in the paper.
 """
 
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Reference, Task
 
 _MAX_ROUNDS = 50  # around a closed motion until the Riccati equation is periodic
-_GOAL_PRICE = 10.0  # cost charged per squared goal tolerance where a reference ends away from an equilibrium
+_GOAL_PRICE = 10.0  # cost per squared goal tolerance, for references that do not end at an equilibrium
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
 
 
 def final_weight(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """(8, 8) cost-to-go at a trajectory's end: LQR's at an equilibrium, else the goal's tolerances, priced."""
+    """(8, 8) cost-to-go at a trajectory's end: LQR's at an equilibrium, else `_GOAL_PRICE` per squared goal tolerance."""
     if is_equilibrium(params, x, np.zeros(2)):
         return discrete_lqr(task, params, x, np.zeros(2), c)[1]
     return _GOAL_PRICE * goal_weight(task, x, c)
@@ -80,10 +79,10 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final:
     """Time-varying LQR, backwards from the final cost-to-go.
 
     Args:
-        a: (n, 8, 8) linear step models: of the state,
-        b: (n, 8, 2) and of the input.
-        q: (n, 8, 8) cost of each step: of the state,
-        r: (n, 2, 2) and of the input.
+        a: (n, 8, 8) slopes of the next state with respect to the state.
+        b: (n, 8, 2) slopes of the next state with respect to the input.
+        q: (n, 8, 8) cost of each step, state part.
+        r: (n, 2, 2) cost of each step, input part.
         p_final: (8, 8) cost-to-go at the end.
     """
     k, p = np.zeros((len(a), 2, 8)), np.zeros((len(a), 8, 8))
@@ -92,7 +91,7 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final:
         weighted = b[i].T @ after
         k[i] = np.linalg.solve(r[i] + weighted @ b[i], weighted @ a[i])
         after = q[i] + a[i].T @ after @ (a[i] - b[i] @ k[i])
-        after = 0.5 * (after + after.T)  # rounding would make it lopsided over hundreds of steps
+        after = 0.5 * (after + after.T)  # keeps p symmetric: rounding errors would add up over hundreds of steps
         p[i] = after
     return Gains(k, p)
 
@@ -107,7 +106,7 @@ def tracking_gains(
 
 
 def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
-    """LQR around a closed motion: Riccati backwards round after round until it is periodic."""
+    """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
     gains = Gains(np.zeros((0, 2, 8)), np.eye(8)[None])
     for _ in range(_MAX_ROUNDS):
         before, gains = gains, tracking_gains(task, params, reference.x, reference.u, c, gains.p[0])
@@ -117,10 +116,10 @@ def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.
 
 
 class LqrController:
-    """Linear control towards the task's steady reference motion, from the task's own cost.
+    """LQR about the task's reference motion, with weights from the task's own cost.
 
-    About an equilibrium the gain is constant. Along an open reference it is the time-varying LQR that arrives at its end,
-    and around a closed one the periodic LQR at the nearest of its points.
+    About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
+    gain is periodic, and the nearest point of the reference says which gain to use.
     """
 
     def __init__(self, task: Task, params: BallbotParams):

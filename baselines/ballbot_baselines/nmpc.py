@@ -3,9 +3,9 @@
     minimize    Σ_j cost(x_j, u_j, c)·h_j + ρ Σ_j s_j + V(x_N)        over u_j, |u_j| ≤ limit, and slacks s_j ≥ 0
     subject to  x_{j+1} = step(x_j, u_j, h_j),   margins(x_j, c) + s_j ≥ back-off,   x_0 the (predicted) state
 
-The plan of the whole episode, found at `reset`, supplies what lies beyond the horizon: V(x) ≈ λᵀ(x − x̄) + (x − x̄)ᵀP(x − x̄)
-about the plan's state x̄ at the horizon's end, with λ the plan's costate (the multiplier of its dynamics) and P the TVLQR
-cost-to-go along it. So on the plan the horizon changes nothing, whatever the task, and off it the step is a Newton step.
+`reset` plans the whole episode. The plan gives the cost beyond the horizon: V(x) ≈ λᵀ(x − x̄) + (x − x̄)ᵀP(x − x̄) about the
+plan's state x̄ at the horizon's end. λ is the plan's costate (the multiplier of its dynamics), and P is TVLQR's cost-to-go
+along the plan. So a robot on the plan stays on it, and a robot off the plan takes a Newton step.
 
 Every iteration linearizes dynamics and margins about the last solution, shifted by one control step, and solves one
 quadratic program by HPIPM: the sequential quadratic programming of Diehl et al., "A real-time iteration scheme for nonlinear
@@ -33,11 +33,11 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan: half of TrajoptController's for the goal
-_SLACK_PRICE = 100.0  # per unit of a violated margin and node: above what any violation gains
-_MARGINS = 2  # per node, the nearest to being violated: the others are far off, and each costs time
+_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan; for the goal it is half of TrajoptController's
+_SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
+_MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
-_LEAST_CURVATURE = 1e-6  # of inputs whose interval has shrunk to nothing
+_LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
 _QP_ITERATIONS = 30
 
@@ -93,12 +93,56 @@ class Grid:
         return np.add.reduceat(later, self.offsets[:-1], axis=0) / self.lengths[:, None]
 
 
+class _Inner:
+    """Where the parts of an inner stage (0 < j < N) stand among its entries.
+
+    The first stage has no state and no slack; the last stage has a state only.
+    """
+
+    # Variables: changes of the state and of the input, and the slack of the margins.
+    X, A, SLACK, VARIABLES = slice(0, 8), slice(8, 10), 10, 11
+    # Hessian, one dense block after the other: of the state (8, 8), of the input (2, 2), of the slack.
+    Q, R, SLACK_CURVATURE, HESSIAN = slice(0, 64), slice(64, 68), 68, 69
+    # Constraints: the gap to the next state, then the margins.
+    GAP, MARGINS = slice(0, 8), slice(8, None)
+    # Column of a state in the constraints' matrix: −1 in the gap of the stage before, the slopes of the next state, and
+    # the slopes of the margins.
+    BEFORE, NEXT, SLOPES = 0, slice(1, 9), slice(9, None)
+
+
+@dataclass(frozen=True)
+class _Matrix:
+    """Nonzeros of the constraints' matrix that belong to an inner stage, column after column.
+
+    Each of the 8 state columns has 1 + 8 + m entries (see `_Inner`), each of the 2 input columns has the 8 slopes of the
+    next state, and the slack's column has a 1 for each of the m margins.
+    """
+
+    margins: int
+
+    @property
+    def state_column(self) -> int:
+        return 1 + 8 + self.margins
+
+    @property
+    def states(self) -> slice:
+        return slice(0, 8 * self.state_column)
+
+    @property
+    def inputs(self) -> slice:
+        return slice(self.states.stop, self.states.stop + 2 * 8)
+
+    @property
+    def slack(self) -> slice:
+        return slice(self.inputs.stop, self.inputs.stop + self.margins)
+
+
 class HorizonQp:
     """The quadratic program of one iteration, for N intervals; arrays are allocated once and filled in place.
 
     Variables are changes δa_0, δx_1, δa_1, s_1, … δx_N: x_0 is known and no variable, inputs a are fractions of the force
-    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins; x_N, at which
-    CasADi's interface allows no slack, has none.
+    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins. The last stage
+    has no margins, because CasADi's interface allows no slack there.
     """
 
     def __init__(self, task: Task, params: BallbotParams, nodes: int):
@@ -158,10 +202,10 @@ class HorizonQp:
         )
         self._divide(h, g, a, low, high, z, n, m)
         # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
-        self._lower_stages[:, 10] = 0.0
-        self._h[:, 68] = _SLACK_CURVATURE
-        self._g[:, 10] = _SLACK_PRICE
-        self._high[:, 8:] = np.inf
+        self._lower_stages[:, _Inner.SLACK] = 0.0
+        self._h[:, _Inner.SLACK_CURVATURE] = _SLACK_CURVATURE
+        self._g[:, _Inner.SLACK] = _SLACK_PRICE
+        self._high[:, _Inner.MARGINS] = np.inf
 
     def _divide(
         self,
@@ -174,19 +218,20 @@ class HorizonQp:
         n: int,
         m: int,
     ) -> None:
-        """Views of the solver's arrays stage by stage; constants of the constraints' matrix are put in."""
-        self._g0, self._g, self._g_end = _stages(g, 2, n - 1, 11)
-        self._z0, self._z, self._z_end = _stages(z, 2, n - 1, 11)
-        self._h0, self._h, self._h_end = _stages(h, 4, n - 1, 69)
-        self._a0, a_stages, a_end = _stages(a, 16, n - 1, 8 * (9 + m) + 16 + m)
+        """Views of the solver's arrays stage by stage. The constants of the constraints' matrix are put in here."""
+        at, matrix, variables = _Inner, _Matrix(m), _Inner.VARIABLES
+        self._g0, self._g, self._g_end = _stages(g, 2, n - 1, variables)
+        self._z0, self._z, self._z_end = _stages(z, 2, n - 1, variables)
+        self._lower0, self._lower_stages, _ = _stages(self._lower, 2, n - 1, variables)
+        self._upper0, self._upper_stages, _ = _stages(self._upper, 2, n - 1, variables)
+        self._h0, self._h, self._h_end = _stages(h, 2 * 2, n - 1, at.HESSIAN)
         self._low0, self._low, _ = _stages(low, 8, n - 1, 8 + m)
         self._high0, self._high, _ = _stages(high, 8, n - 1, 8 + m)
-        self._a_x = a_stages[:, : 8 * (9 + m)].reshape(n - 1, 8, 9 + m)
-        self._a_u = a_stages[:, 8 * (9 + m) : 8 * (9 + m) + 16].reshape(n - 1, 2, 8)
-        self._a_x[:, :, 0], a_end[:] = -1.0, -1.0  # on the next state
-        a_stages[:, 8 * (9 + m) + 16 :] = 1.0  # on slacks
-        self._lower0, self._lower_stages, _ = _stages(self._lower, 2, n - 1, 11)
-        self._upper0, self._upper_stages, _ = _stages(self._upper, 2, n - 1, 11)
+        self._a0, a_stages, a_end = _stages(a, 2 * 8, n - 1, matrix.slack.stop)
+        self._a_x = a_stages[:, matrix.states].reshape(n - 1, 8, matrix.state_column)
+        self._a_u = a_stages[:, matrix.inputs].reshape(n - 1, 2, 8)
+        self._a_x[:, :, at.BEFORE], a_end[:] = -1.0, -1.0
+        a_stages[:, matrix.slack] = 1.0
 
     def set_weights(self, q: np.ndarray, r: np.ndarray, p: np.ndarray, slope: np.ndarray, target: np.ndarray) -> None:
         """Sets the Hessian and the cost beyond the horizon.
@@ -200,8 +245,8 @@ class HorizonQp:
         """
         r = r + _LEAST_CURVATURE * np.eye(2)
         self._h0[:] = r[0].ravel()
-        self._h[:, :64] = q[1:].reshape(-1, 64)
-        self._h[:, 64:68] = r[1:].reshape(-1, 4)
+        self._h[:, _Inner.Q] = q[1:].reshape(-1, 64)
+        self._h[:, _Inner.R] = r[1:].reshape(-1, 4)
         self._h_end[:] = 2 * p.ravel()
         self._beyond = p, slope, target
 
@@ -209,7 +254,7 @@ class HorizonQp:
         """Linearizes about (x, a), solves, and puts the solution into x[1:] and a, if there is one.
 
         Args:
-            margin: what margins keep from 0, in their own units.
+            margin: least value of the task's margins, in their own units.
         """
         x, a = self.x, self.a
         self._stage()
@@ -217,15 +262,15 @@ class HorizonQp:
             return False
         self._set_constraints(margin)
         p, slope, target = self._beyond
-        self._g0[:], self._g[:, :10] = self._gradient[0, 8:], self._gradient[1:-1]
+        self._g0[:], self._g[:, : _Inner.SLACK] = self._gradient[0, _Inner.A], self._gradient[1:-1]
         self._g_end[:] = slope + 2 * p @ (x[-1] - target)
         self._lower0[:], self._upper0[:] = -1 - a[0], 1 - a[0]
-        self._lower_stages[:, 8:10], self._upper_stages[:, 8:10] = -1 - a[1:-1], 1 - a[1:-1]
+        self._lower_stages[:, _Inner.A], self._upper_stages[:, _Inner.A] = -1 - a[1:-1], 1 - a[1:-1]
         if not (self._program() and self._program.solved and np.isfinite(self._cost[0])):
             return False
         a[0] += self._z0
-        a[1:-1] += self._z[:, 8:10]
-        x[1:-1] += self._z[:, :8]
+        a[1:-1] += self._z[:, _Inner.A]
+        x[1:-1] += self._z[:, _Inner.X]
         x[-1] += self._z_end
         return True
 
@@ -233,16 +278,18 @@ class HorizonQp:
         jacobian = self._jacobian
         gaps = self.x[1:] - self._next[:-1]
         margins, slopes = self._nearest_margins()
-        self._a0[:] = jacobian[0, 8:].ravel()
-        self._a_x[:, :, 1:9], self._a_x[:, :, 9:], self._a_u[:] = jacobian[1:-1, :8], slopes, jacobian[1:-1, 8:]
+        at = _Inner
+        self._a0[:] = jacobian[0, at.A].ravel()
+        self._a_x[:, :, at.NEXT], self._a_u[:] = jacobian[1:-1, at.X], jacobian[1:-1, at.A]
+        self._a_x[:, :, at.SLOPES] = slopes
         self._low0[:] = self._high0[:] = gaps[0]
-        self._low[:, :8] = self._high[:, :8] = gaps[1:]
-        self._low[:, 8:] = margin - margins
+        self._low[:, at.GAP] = self._high[:, at.GAP] = gaps[1:]
+        self._low[:, at.MARGINS] = margin - margins
 
     def _nearest_margins(self) -> tuple[np.ndarray, np.ndarray]:
         """(N−1, m) the least of the inner nodes' distinct margins, and their slopes (N−1, 8, m)."""
         margins, slopes = self._margin[1:-1, self.distinct], self._margin_jacobian[1:-1][:, :, self.distinct]
-        rows = self._low.shape[1] - 8
+        rows = self._low[:, _Inner.MARGINS].shape[1]
         if margins.shape[1] == rows:
             return margins, slopes
         least = np.argpartition(margins, rows - 1, axis=1)[:, :rows]
@@ -312,7 +359,7 @@ class NmpcController:
     def follow(self, plan: Optimum) -> None:
         """Takes a plan of the episode, and starts the horizon on it."""
         task, c, trajectory = self._task, self._c, plan.trajectory
-        self.plan = plan
+        self.plan, self._trajectory = plan, trajectory
         self._tracker = TvlqrController.for_task(task, self._params, trajectory, c)
         self._tracker.reset(self._start, trajectory.x[0], c)
         self._length = len(trajectory.u)
@@ -344,7 +391,7 @@ class NmpcController:
         return u
 
     def _missed_goal(self, t: float, x: np.ndarray) -> bool:
-        """Whether the plan's time is over before a first-exit goal was reached, and there is a plan that still does."""
+        """Whether the plan is over, the first-exit goal is not reached, and a new plan to it was found."""
         if not self._task.first_exit or self._lost:
             return False
         self.counts.replans += 1
@@ -365,7 +412,7 @@ class NmpcController:
         return np.asarray(x, np.float64)
 
     def _advance(self, elapsed: int) -> None:
-        """Shifts the last solution to now. It is kept as a deviation from the plan, which stays small and smooth."""
+        """Shifts the last solution to now. It is stored as its deviation from the plan, which is small and smooth."""
         for _ in range(elapsed - self._step):
             self._dx, self._da = self._shift_states @ self._dx, self._shift_inputs @ self._da
         self._step = elapsed
@@ -373,12 +420,12 @@ class NmpcController:
         at = np.minimum(elapsed + grid.offsets, n)
         self._lengths = np.diff(at)
         self._nodes = at
-        trajectory = self.plan.trajectory
+        trajectory = self._trajectory
         self._x_plan = trajectory.x[at]
         self._a_plan = (self._sums[at[1:]] - self._sums[at[:-1]]) / np.maximum(self._lengths, 1)[:, None]
 
     def _solve(self, x: np.ndarray, began: float) -> bool:
-        """Whether a solution for state x is there in time; it is then in the program's x and a."""
+        """Whether a solution for state x was found in time. It is then in the program's x and a."""
         qp, counts = self._qp, self.counts
         counts.steps += 1
         self._load(x)
@@ -392,7 +439,7 @@ class NmpcController:
             found = True
             if self._iterations == 1 or np.abs(qp.a - before).max() < self._tolerance:
                 break
-            # after the first, one more iteration takes at most as long as all so far
+            # One more iteration takes at most as long as all iterations so far.
             if self._deadline is not None and time.perf_counter() - began > 0.5 * self._deadline:
                 counts.cut += 1
                 break
@@ -402,7 +449,7 @@ class NmpcController:
         if not found:
             counts.failed += 1
             return False
-        # A late solution is no use to this step, but it is the next one's start.
+        # A late solution is not used in this step, but the next step starts from it.
         self._dx, self._da = qp.x - self._x_plan, qp.a[:-1] - self._a_plan
         if self._deadline is not None and time.perf_counter() - began > self._deadline:
             counts.late += 1
@@ -419,7 +466,7 @@ class NmpcController:
         weight = (dt * self._lengths)[:, None, None]
         end = self._nodes[-1]
         qp.set_weights(
-            self._q[at] * weight, self._r[at] * weight, self._p[end], self._slopes[end], self.plan.trajectory.x[end]
+            self._q[at] * weight, self._r[at] * weight, self._p[end], self._slopes[end], self._trajectory.x[end]
         )
 
     def _fall_back(self, x: np.ndarray) -> np.ndarray:
@@ -461,19 +508,19 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
 
 
 def _patterns(n: int, m: int) -> tuple[casadi.Sparsity, casadi.Sparsity]:
-    """Of the program's Hessian and constraints, as `HorizonQp` fills them."""
+    """Sparsity of the program's Hessian and of its constraints' matrix; `_Inner` and `_Matrix` say the order of entries."""
     state, inputs, slack = casadi.Sparsity.dense(8, 8), casadi.Sparsity.dense(2, 2), casadi.Sparsity.dense(1, 1)
     hessian = casadi.diagcat(inputs, *[state, inputs, slack] * (n - 1), state)
-    width, height = 11, 8 + m
+    width, height = _Inner.VARIABLES, 8 + m
     entries = [(i, j) for j in range(2) for i in range(8)]
     for k in range(1, n + 1):
         row, column = 8 + (k - 1) * height, 2 + (k - 1) * width
-        above = row - height if k > 1 else 0
-        own = range(row, row + height if k < n else row)
+        before = row - height if k > 1 else 0
+        own = range(row, row + height if k < n else row)  # the last stage has no constraints of its own
         for j in range(8):
-            entries += [(above + j, column + j), *((i, column + j) for i in own)]
-        entries += [(i, column + j) for j in (8, 9) for i in own[:8]]
-        entries += [(i, column + 10) for i in own[8:]]
+            entries += [(before + j, column + j), *((i, column + j) for i in own)]
+        entries += [(i, column + j) for j in (8, 9) for i in own[_Inner.GAP]]
+        entries += [(i, column + _Inner.SLACK) for i in own[_Inner.MARGINS]]
     rows, columns = zip(*entries, strict=True)
     shape = (8 + (n - 1) * height, 2 + (n - 1) * width + 8)
     return hessian, casadi.Sparsity.triplet(*shape, list(rows), list(columns))
@@ -486,20 +533,21 @@ def _stages(array: np.ndarray, first: int, count: int, width: int) -> tuple[np.n
 
 
 class _InPlace:
-    """A function that reads and writes given arrays: a call through `casadi.DM` costs as much as its work."""
+    """A function that reads and writes given arrays. A call through `casadi.DM` would take twice as long."""
 
     def __init__(self, function: casadi.Function, inputs: list[np.ndarray], outputs: list[np.ndarray]):
         self._buffer = function.buffer()[0]
-        self._inputs, self._outputs = ([memoryview(array) for array in arrays] for arrays in (inputs, outputs))
+        self._inputs, self._outputs = ([array.data for array in arrays] for arrays in (inputs, outputs))
 
     def __call__(self) -> bool:
         """Whether it ran without an error."""
         buffer = self._buffer
         # HPIPM's interface uses up the pointers it is given (seen in CasADi 3.8.2), so they are given anew.
+        # The type stubs ask for a size, but memory views bring their own.
         for i, view in enumerate(self._inputs):
-            buffer.set_arg(i, view)
+            buffer.set_arg(i, view)  # pyright: ignore[reportCallIssue]
         for i, view in enumerate(self._outputs):
-            buffer.set_res(i, view)
+            buffer.set_res(i, view)  # pyright: ignore[reportCallIssue]
         buffer._eval()
         return buffer.ret() == 0
 

@@ -6,12 +6,12 @@
                 bounds on s_k and w_k
 
 Every problem of this package has this form: shooting on the env's discretization, and Hermite–Simpson collocation with
-the next knot as input. The solvers see only stage functions and their derivatives, compiled once (`compiled.py`), so time
-and memory grow linearly with N.
+the next knot as input. `nlp.py` builds the nonlinear program and its derivatives from stage functions, which are compiled
+once (`compiled.py`). So time and memory grow linearly with N.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi
@@ -19,12 +19,29 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from ballbot_baselines.compiled import compiled
+from ballbot_baselines.nlp import Stage, StagedNlp
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
 
-_DAMPING = 1e-8  # of the Newton step toward consistency, where constraints repeat each other or have nothing to move
+_DAMPING = (
+    1e-8  # of the Newton step toward consistency, for constraints that repeat each other or have no free variables
+)
+
+
+def no_path(s: casadi.SX, w: casadi.SX, p: casadi.SX) -> casadi.SX:
+    """No constraint at the stages."""
+    return casadi.SX(0, 1)
+
+
+def no_final_path(s: casadi.SX, p: casadi.SX) -> casadi.SX:
+    """No constraint at the end."""
+    return casadi.SX(0, 1)
+
+
+def no_final_cost(s: casadi.SX, p: casadi.SX) -> casadi.SX:
+    """No cost at the end."""
+    return casadi.SX(0)
 
 
 @dataclass(frozen=True)
@@ -39,15 +56,15 @@ class Ocp:
     """(s, w, p) -> (states,)."""
     cost: StageFunction
     """(s, w, p) -> scalar."""
-    equalities: StageFunction | None = None
+    equalities: StageFunction = no_path
     """(s, w, p) -> (ne,), each 0."""
-    inequalities: StageFunction | None = None
+    inequalities: StageFunction = no_path
     """(s, w, p) -> (ni,), each ≥ 0."""
-    final_cost: FinalFunction | None = None
+    final_cost: FinalFunction = no_final_cost
     """(s, p) -> scalar."""
-    final_equalities: FinalFunction | None = None
+    final_equalities: FinalFunction = no_final_path
     """(s, p) -> (me,), each 0."""
-    final_inequalities: FinalFunction | None = None
+    final_inequalities: FinalFunction = no_final_path
     """(s, p) -> (mi,), each ≥ 0."""
     initial_matrix: np.ndarray | None = None
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
@@ -55,7 +72,7 @@ class Ocp:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lower and upper bounds: states (N+1, ns) and inputs (N, nw); ±inf where there is none."""
+    """Lower and upper bounds of states (N+1, ns) and inputs (N, nw); ±inf means no bound."""
 
     state_lower: np.ndarray
     state_upper: np.ndarray
@@ -73,9 +90,9 @@ class Bounds:
 class OcpSolution:
     """What a solver returned. Look at `success` before anything else.
 
-    `states` is (N+1, ns), `inputs` (N, nw), `violation` the largest amount by which a constraint or bound is missed, in
-    the constraint's unit, and `seconds` the wall time of this solve. `costates` (N, ns) are the slopes of the optimal cost
-    with respect to s_1 … s_N, had the episode begun there: the multipliers of the dynamics.
+    `states` is (N+1, ns) and `inputs` is (N, nw). `violation` is the largest amount by which a constraint or bound is
+    missed, in the constraint's unit. `seconds` is the wall time of this solve. `costates` (N, ns) are the multipliers of the
+    dynamics: row k is the slope, with respect to s_{k+1}, of the optimal cost from stage k+1 on.
     """
 
     success: bool
@@ -90,30 +107,6 @@ class OcpSolution:
     costates: np.ndarray
 
 
-class _Stage:
-    """A vector function of z and p with its Jacobian's and its Lagrangian Hessian's nonzeros, compiled.
-
-    Where it does not depend on p it takes none of it: so problems whose parameters differ share their compiled dynamics.
-    """
-
-    def __init__(self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, compile: bool):
-        p = p if casadi.depends_on(out, p) else casadi.SX.sym("p", 0)
-        self.params = p.shape[0]
-        multipliers = casadi.SX.sym("l", out.shape[0])
-        jacobian = casadi.jacobian(out, z)
-        hessian, gradient = casadi.hessian(casadi.dot(multipliers, out), z)
-        options = {"cse": True}
-        functions = (
-            casadi.Function("value", [z, p], [out], options),
-            casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options),
-            casadi.Function("hessian", [z, p, multipliers], [casadi.densify(gradient), _nonzeros(hessian)], options),
-        )
-        self.value, self.jacobian, self.hessian = compiled(name, functions) if compile else functions
-        self.size = out.shape[0]
-        self.jacobian_at = _triplets(jacobian)
-        self.hessian_at = _triplets(hessian)
-
-
 class OcpSolver:
     """An `Ocp` over N intervals, ready to be solved from many starts.
 
@@ -125,46 +118,29 @@ class OcpSolver:
     ):
         """Args: solver is "fatrop" (structured, fast) or "ipopt" (more robust far from a solution)."""
         self.ocp, self.intervals, self.solver = ocp, intervals, solver
-        s, w, p = (
-            casadi.SX.sym("s", ocp.states),
-            casadi.SX.sym("w", ocp.inputs),
-            casadi.SX.sym("p", ocp.params),
-        )
+        s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", ocp.states), ("w", ocp.inputs), ("p", ocp.params)))
+        equal, final_equal = ocp.equalities(s, w, p), ocp.final_equalities(s, p)
+        path = casadi.vertcat(equal, ocp.inequalities(s, w, p))
+        final_path = casadi.vertcat(final_equal, ocp.final_inequalities(s, p))
+        final_cost = ocp.final_cost(s, p)
         z = casadi.vertcat(s, w)
-        equal = [] if ocp.equalities is None else [ocp.equalities(s, w, p)]
-        unequal = [] if ocp.inequalities is None else [ocp.inequalities(s, w, p)]
-        final_equal = [] if ocp.final_equalities is None else [ocp.final_equalities(s, p)]
-        final_unequal = [] if ocp.final_inequalities is None else [ocp.final_inequalities(s, p)]
-        final_cost = 0 if ocp.final_cost is None else ocp.final_cost(s, p)
-        path, final_path = casadi.vertcat(*equal, *unequal), casadi.vertcat(*final_equal, *final_unequal)
-        dynamics = _Stage("dynamics", z, p, casadi.densify(casadi.SX(ocp.next(s, w, p))), compile=True)
-        running = _Stage(ocp.name, z, p, casadi.densify(casadi.vertcat(ocp.cost(s, w, p), path)), compile=True)
-        final = _Stage(f"{ocp.name}-final", s, p, casadi.densify(casadi.vertcat(final_cost, final_path)), compile=False)
+        dynamics = Stage("dynamics", z, p, casadi.densify(casadi.SX(ocp.next(s, w, p))), compile=True)
+        running = Stage(ocp.name, z, p, casadi.densify(casadi.vertcat(ocp.cost(s, w, p), path)), compile=True)
+        final = Stage(f"{ocp.name}-final", s, p, casadi.densify(casadi.vertcat(final_cost, final_path)), compile=False)
 
         paths, finals = path.shape[0], final_path.shape[0]
-        equal_paths, equal_finals = (casadi.vertcat(*part).shape[0] if part else 0 for part in (equal, final_equal))
-        initials = 0 if ocp.initial_matrix is None else len(ocp.initial_matrix)
-        stage_equal = [True] * (ocp.states + equal_paths) + [False] * (paths - equal_paths)
-        equality = (
-            stage_equal
-            + [True] * initials
-            + stage_equal * (intervals - 1)
-            + [True] * equal_finals
-            + [False] * (finals - equal_finals)
-        )
+        initial_matrix = np.zeros((0, ocp.states)) if ocp.initial_matrix is None else ocp.initial_matrix
+        initials = len(initial_matrix)
         self._rows, self._initials = ocp.states + paths, initials
+        of_stage = _equality(ocp.states + equal.shape[0], ocp.states + paths)
+        of_end = _equality(final_equal.shape[0], finals)
+        equality = of_stage + [True] * initials + of_stage * (intervals - 1) + of_end
         self._g_lower = np.zeros(len(equality))
         self._g_upper = np.where(equality, 0.0, np.inf)
 
-        functions = _nlp_functions(ocp, intervals, dynamics, running, final, paths)
-        oracle = casadi.Function(
-            "nlp",
-            [functions["x"], functions["p"]],
-            [functions["f"], functions["g"]],
-            ["x", "p"],
-            ["f", "g"],
-        )
-        options: dict = {"print_time": False, "error_on_fail": False, "calc_lam_p": False, "cache": functions["cache"]}
+        nlp = StagedNlp(dynamics, running, final, intervals, ocp.params, initial_matrix)
+        oracle, derivatives, for_ipopt = nlp.functions()
+        options: dict = {"print_time": False, "error_on_fail": False, "calc_lam_p": False, "cache": derivatives}
         if solver == "fatrop":
             options |= {
                 "structure_detection": "manual",
@@ -176,16 +152,14 @@ class OcpSolver:
                 "fatrop": {"print_level": 0, "tol": tolerance, "max_iter": max_iterations},
             }
         else:
-            options |= {
-                "grad_f": functions["ipopt_grad_f"],
-                "jac_g": functions["cache"]["nlp_jac_g"],
-                "hess_lag": functions["ipopt_hess_lag"],
-                "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations},
-            }
+            options |= for_ipopt
+            options["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
-        self._g, self._jac_g = functions["cache"]["nlp_g"], functions["cache"]["nlp_jac_g"]
+        self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
 
-    def solve(self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | tuple = ()) -> OcpSolution:
+    def solve(
+        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
+    ) -> OcpSolution:
         """Solves from a guess.
 
         Args:
@@ -219,7 +193,7 @@ class OcpSolver:
         )
         states, inputs = self._divide(z)
         return OcpSolution(
-            success=bool(stats["success"]) and np.isfinite(z).all(),
+            success=bool(stats["success"] and np.isfinite(z).all()),
             status=_status(self.solver, stats),
             cost=float(result["f"]),
             states=states,
@@ -232,19 +206,18 @@ class OcpSolver:
         )
 
     def toward_consistency(
-        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | tuple = ()
+        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A guess moved by the shortest Newton step toward all equality constraints, the dynamics first of all.
+        """A guess moved by the shortest Newton step toward all equality constraints.
 
-        For guesses that are consistent with nothing, as a straight line between two states: the step bends them into about
-        the nearest motion. Guesses that obey the constraints stay where they are. The step takes about as long as one or two
-        iterations.
+        Use it for guesses that violate the dynamics, such as a straight line between two states: the step bends them toward
+        the nearest motion. Guesses that obey the constraints do not change. The step takes as long as one or two iterations.
 
         Args:
             states: as `solve` takes them.
             inputs: as `solve` takes them.
             p: as `solve` takes them.
-            bounds: variables whose bounds are equal do not move from them; the others end within theirs.
+            bounds: as `solve` takes them; variables with equal bounds do not change.
 
         Returns:
             states (N+1, ns) and inputs (N, nw).
@@ -266,173 +239,19 @@ class OcpSolver:
         return np.vstack([stages[:, :ns], z[self.intervals * width :]]), stages[:, ns:].copy()
 
     def _costates(self, multipliers: np.ndarray) -> np.ndarray:
-        # Constraints are s_{k+1} − next_k = 0: raising their right-hand side moves s_{k+1}, and costs minus the multiplier.
+        # Constraints are s_{k+1} − next_k = 0. The cost's slope with respect to the right-hand side is minus the multiplier.
         first = self._rows + self._initials + self._rows * np.arange(-1, self.intervals - 1)
         first[0] = 0
         return -multipliers[first[:, None] + np.arange(self.ocp.states)]
 
 
-def _nlp_functions(ocp: Ocp, n: int, dynamics: _Stage, running: _Stage, final: _Stage, paths: int) -> dict[str, object]:
-    """The NLP and its derivatives, written as maps of the stage functions over the stages.
-
-    Variables are ordered s_0, w_0, s_1, … s_N, constraints next_0, path_0, initial, next_1, … final_path, as fatrop wants
-    them.
-    """
-    ns, width = ocp.states, ocp.states + ocp.inputs
-    rows = ns + paths
-    initial = np.zeros((0, ns)) if ocp.initial_matrix is None else ocp.initial_matrix
-    constraints = n * rows + len(initial) + final.size - 1
-    variables = n * width + ns
-    z, p = casadi.MX.sym("z", variables), casadi.MX.sym("p", ocp.params)
-    stages = casadi.reshape(z[: n * width], width, n)
-    last = z[n * width :]
-    next_states = casadi.horzcat(stages[:ns, 1:], last)
-    p_all = casadi.repmat(p, 1, n)
-
-    value_c = running.value.map(n)(stages, p_all[: running.params, :])
-    value_f = final.value(last, p[: final.params])
-    f = casadi.sum2(value_c[0, :]) + value_f[0]
-    gaps = next_states - dynamics.value.map(n)(stages, p_all[: dynamics.params, :])
-    stage_g = casadi.vertcat(gaps, value_c[1:, :])
-    initial_g = casadi.mtimes(casadi.DM(initial), stages[:ns, 0])
-    g = casadi.vertcat(stage_g[:, 0], initial_g, casadi.vec(stage_g[:, 1:]), value_f[1:, :])
-
-    jac_d = dynamics.jacobian.map(n)(stages, p_all[: dynamics.params, :])[1]
-    jac_c = running.jacobian.map(n)(stages, p_all[: running.params, :])[1]
-    jac_f = final.jacobian(last, p[: final.params])[1]
-    k = np.arange(n)[:, None]
-    first_row = k * rows + len(initial) * (k > 0)
-    final_row = n * rows + len(initial)
-    initial_row, initial_col = np.nonzero(initial)
-    (row_d, col_d), (row_c, col_c), (row_f, col_f) = dynamics.jacobian_at, running.jacobian_at, final.jacobian_at
-    is_cost, is_final_cost = row_c == 0, row_f == 0
-
-    # ∂f: row 0 of the running and the final Jacobians
-    gradient = _scatter(
-        [(k * width + col_c)[:, is_cost].ravel(), n * width + col_f[is_final_cost]],
-        [np.zeros(n * is_cost.sum(), int), np.zeros(is_final_cost.sum(), int)],
-        casadi.vertcat(_rows(jac_c, is_cost), _rows(jac_f, is_final_cost)),
-        (variables, 1),
-    )
-    # ∂g: −∂next, +1 on the next state, the path rows, the final rows
-    jacobian = _scatter(
-        [
-            (first_row + row_d).ravel(),
-            (first_row + np.arange(ns)).ravel(),
-            (first_row + ns - 1 + row_c)[:, ~is_cost].ravel(),
-            rows + initial_row,
-            final_row - 1 + row_f[~is_final_cost],
-        ],
-        [
-            (k * width + col_d).ravel(),
-            ((k + 1) * width + np.arange(ns)).ravel(),
-            (k * width + col_c)[:, ~is_cost].ravel(),
-            initial_col,
-            n * width + col_f[~is_final_cost],
-        ],
-        casadi.vertcat(
-            -casadi.vec(jac_d),
-            casadi.MX.ones(n * ns),
-            _rows(jac_c, ~is_cost),
-            casadi.MX(casadi.DM(initial[initial_row, initial_col])),
-            _rows(jac_f, ~is_final_cost),
-        ),
-        (constraints, variables),
-    )
-
-    lam_f, lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", constraints)
-    lam_initial = lam_g[rows : rows + len(initial)]
-    lam_stages = casadi.reshape(casadi.vertcat(lam_g[:rows], lam_g[rows + len(initial) : final_row]), rows, n)
-    lam_next = lam_stages[:ns, :]
-    grad_d, hess_d = dynamics.hessian.map(n)(stages, p_all[: dynamics.params, :], -lam_next)
-    grad_c, hess_c = running.hessian.map(n)(
-        stages, p_all[: running.params, :], casadi.vertcat(casadi.repmat(lam_f, 1, n), lam_stages[ns:, :])
-    )
-    grad_f, hess_f = final.hessian(last, p[: final.params], casadi.vertcat(lam_f, lam_g[final_row:]))
-    of_initial = casadi.mtimes(casadi.DM(initial.T), lam_initial)
-    shifted = casadi.vertcat(casadi.horzcat(of_initial, lam_next[:, :-1]), casadi.MX.zeros(ocp.inputs, n))
-    grad_lagrangian = casadi.vertcat(casadi.vec(grad_d + grad_c + shifted), grad_f + lam_next[:, -1])
-    hessian = _scatter(
-        [
-            (k * width + dynamics.hessian_at[0]).ravel(),
-            (k * width + running.hessian_at[0]).ravel(),
-            n * width + final.hessian_at[0],
-        ],
-        [
-            (k * width + dynamics.hessian_at[1]).ravel(),
-            (k * width + running.hessian_at[1]).ravel(),
-            n * width + final.hessian_at[1],
-        ],
-        casadi.vertcat(casadi.vec(hess_d), casadi.vec(hess_c), hess_f),
-        (variables, variables),
-    )
-    multipliers = [z, p, lam_f, lam_g]
-    names = ["x", "p", "lam_f", "lam_g"]
-    cache = {
-        "nlp_f": casadi.Function("nlp_f", [z, p], [f], ["x", "p"], ["f"]),
-        "nlp_g": casadi.Function("nlp_g", [z, p], [g], ["x", "p"], ["g"]),
-        "nlp_grad_f": casadi.Function("nlp_grad_f", [z, p], [casadi.densify(gradient)], ["x", "p"], ["grad_f_x"]),
-        # Of the parameters' multipliers nobody asks (calc_lam_p is off), but the signature has them.
-        "nlp_grad": casadi.Function(
-            "nlp_grad",
-            multipliers,
-            [f, g, lam_f * casadi.densify(gradient) + casadi.mtimes(jacobian.T, lam_g), casadi.MX(p.shape[0], 1)],
-            names,
-            ["f", "g", "grad_gamma_x", "grad_gamma_p"],
-        ),
-        "nlp_jac_g": casadi.Function("nlp_jac_g", [z, p], [g, jacobian], ["x", "p"], ["g", "jac_g_x"]),
-        "nlp_hess_l": casadi.Function(
-            "nlp_hess_l", multipliers, [grad_lagrangian, hessian], names, ["grad_gamma_x", "hess_gamma_x_x"]
-        ),
-    }
-    return {
-        "x": z,
-        "p": p,
-        "f": f,
-        "g": g,
-        "cache": cache,
-        "ipopt_grad_f": casadi.Function(
-            "nlp_grad_f", [z, p], [f, casadi.densify(gradient)], ["x", "p"], ["f", "grad_f_x"]
-        ),
-        "ipopt_hess_lag": casadi.Function(
-            "nlp_hess_l", multipliers, [casadi.triu(hessian)], names, ["triu_hess_gamma_x_x"]
-        ),
-    }
-
-
-def _scatter(rows: list[np.ndarray], cols: list[np.ndarray], values: casadi.MX, shape: tuple[int, int]) -> casadi.MX:
-    """A sparse matrix from triplets whose values add up where they meet."""
-    row, col = np.concatenate(rows), np.concatenate(cols)
-    order = np.lexsort((row, col))
-    place = col[order] * shape[0] + row[order]
-    first = np.flatnonzero(np.diff(place, prepend=-1))
-    pattern = casadi.Sparsity.triplet(*shape, row[order[first]].tolist(), col[order[first]].tolist())
-    # the matrix that sums the (at most two) sources of every entry
-    target = np.searchsorted(place[first], col * shape[0] + row)
-    if len(first) == len(place):
-        entries = values[order.tolist()]
-    else:
-        gather = casadi.Sparsity.triplet(len(first), len(place), target.tolist(), list(range(len(place))))
-        entries = casadi.mtimes(casadi.MX(casadi.DM(gather, 1.0)), values)
-    return casadi.MX(pattern, entries)
-
-
-def _rows(matrix: casadi.MX, keep: np.ndarray) -> casadi.MX:
-    """The rows to keep, column after column, as one column."""
-    return casadi.vec(matrix[np.flatnonzero(keep).tolist(), :]) if keep.any() else casadi.MX(0, 1)
-
-
-def _nonzeros(matrix: casadi.SX) -> casadi.SX:
-    return casadi.vertcat(*matrix.nonzeros()) if matrix.nnz() else casadi.SX(0, 1)
-
-
-def _triplets(matrix: casadi.SX) -> tuple[np.ndarray, np.ndarray]:
-    rows, cols = matrix.sparsity().get_triplet()
-    return np.array(rows, int), np.array(cols, int)
+def _equality(equalities: int, constraints: int) -> list[bool]:
+    """Whether each constraint is an equality; equalities come first."""
+    return [True] * equalities + [False] * (constraints - equalities)
 
 
 def _least_norm(matrix: scipy.sparse.csr_array, right: np.ndarray) -> np.ndarray:
-    """The shortest v with matrix v = right, but for `_DAMPING`; stage-wise rows make matrix·matrixᵀ a band."""
+    """The shortest v with matrix v = right, up to `_DAMPING`. Rows stand stage by stage, so matrix·matrixᵀ is banded."""
     normal = (matrix @ matrix.T).tocoo()
     below = normal.row >= normal.col
     row, col, values = normal.row[below], normal.col[below], normal.data[below]

@@ -4,8 +4,8 @@
     subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n.
 
 So an episode under physics="rk4" that follows the optimal trajectory returns minus this cost. The problem is solved by
-multiple shooting from each of the task's guessed paths, and the best solution is kept: a local optimum certified
-feasible, and as global as the guesses.
+multiple shooting from each of the task's guessed paths, and the best solution is kept. That solution is feasible and locally
+optimal. It is the global optimum if one of the guesses leads there.
 """
 
 import math
@@ -29,7 +29,7 @@ FEASIBLE = 1e-6
 
 _FREE_TIME_INTERVALS = 60
 _COARSE = 2  # control steps per interval when several guesses are compared
-_BASIN_DOUBT = 0.01  # relaxed costs nearer than this may change places on the env's grid
+_BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
 
 
@@ -37,8 +37,8 @@ _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest fi
 class Optimum:
     """The best episode found: its cost, trajectory (forces held), and what the solver said of it.
 
-    `guess` is the index of the task's guessed path that led there; `seconds` the wall time of the whole search. `costates`
-    (n, 8) are the slopes of the cost still to come with respect to the states x_1 … x_n.
+    `guess` is the index of the guessed path that led to it. `seconds` is the wall time of the whole search. `costates` (n, 8)
+    are the slopes of the remaining cost with respect to the states x_1 … x_n.
     """
 
     cost: float
@@ -54,13 +54,13 @@ class Optimum:
 
 @dataclass(frozen=True)
 class Backoff:
-    """How far a plan keeps from its limits, so that what tracks it stays within them.
+    """How far a plan stays from its limits, so that a controller that tracks it stays within them.
 
-    `margin` is in the unit of the task's margins (obstacles: m), `goal` the fraction of the goal's tolerance that is not
-    used, `force` the fraction of the force limit kept for feedback.
+    `margin` is in the unit of the task's margins (obstacles: m). `goal` is the fraction of the goal's tolerance that the plan
+    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback.
     """
 
-    # The defaults make up for the solvers' tolerance, so that optimal forces and states truly are within the limits.
+    # The defaults make up for the solvers' tolerance, so that optimal forces and states obey the limits exactly.
     margin: float = 1e-7
     goal: float = 1e-6
     force: float = 1e-7
@@ -148,7 +148,7 @@ def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
 
 
 def free_time_ocp(task: Task, params: BallbotParams) -> Ocp:
-    """A first-exit task over intervals of one free length h, the ninth state; it finds about when to arrive."""
+    """A first-exit task over intervals of one free length h, the ninth state. Its solution tells roughly when to arrive."""
     nc = len(task.constant_names)
     fixed, limit = shooting_ocp(task, params), params.force_limit
     return replace(
@@ -187,7 +187,7 @@ def _bounds(ocp: Ocp, n: int, x0: np.ndarray, backoff: Backoff) -> Bounds:
 def _solve_from(
     task: Task, params: BallbotParams, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff
 ) -> list[OcpSolution]:
-    """fatrop from guessed states (n+1, 8) and actions (n, 2), and where it fails ipopt from the same guess."""
+    """Solves with fatrop from guessed states (n+1, 8) and actions (n, 2). If fatrop fails, ipopt tries the same guess."""
     solutions = []
     for name in ("fatrop", "ipopt"):
         solver = _solver(task, params, len(a), name)
@@ -203,8 +203,8 @@ def _solve_fixed_time(
 ) -> list[tuple[int, OcpSolution]]:
     """Every solution found, with the index of the path it came from.
 
-    Where there are several paths, each is first solved with forces held for two control steps, which takes half the time
-    and tells the basins apart; those that may be the best are then solved in full.
+    With several paths, each is first solved with forces held for two control steps. That takes half the time and suffices to
+    compare the paths. Only the paths that may be the best are then solved in full.
     """
     starts = [guess.along_path(params, path, task.control_dt, start=x0) for path in paths]
     starts = [(i, x, u / params.force_limit) for i, (x, u) in enumerate(starts)]
@@ -221,7 +221,7 @@ def _contenders(
     backoff: Backoff,
     starts: list[tuple[int, np.ndarray, np.ndarray]],
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Starts at the coarse solutions that are within `_BASIN_DOUBT` of the best; all starts, if there is none."""
+    """Starts at the coarse solutions within `_BASIN_DOUBT` of the best; all starts, if no coarse solution is feasible."""
     n = task.steps // _COARSE
     solver = _solver(task, params, n, "fatrop", _COARSE)
     solved = []
@@ -238,7 +238,7 @@ def _contenders(
 
 
 def _distinct(solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, OcpSolution]]:
-    """Of feasible solutions, those within `_BASIN_DOUBT` of the best, one for each cost, the best first."""
+    """The feasible solutions within `_BASIN_DOUBT` of the best, sorted by cost, without repetitions."""
     kept: list[tuple[int, OcpSolution]] = []
     for index, solution in sorted(solved, key=lambda pair: pair[1].cost):
         contends = not kept or solution.cost < kept[0][1].cost * (1 + _BASIN_DOUBT)
@@ -250,8 +250,10 @@ def _distinct(solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, OcpSolut
 def _solve_first_exit(
     task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, paths: list[np.ndarray]
 ) -> list[tuple[int, OcpSolution]]:
-    """As `_solve_fixed_time`: first with a free interval length, which tells the basins apart and about when each arrives,
-    then with whole numbers of control steps about the best of them.
+    """Every solution found, with the index of the path it came from.
+
+    Each path is first solved with a free interval length, which gives its cost and its time of arrival. The best are then
+    solved again for whole numbers of control steps near that time.
     """
     tried = [(i, _solve_free_time(task, params, x0, c, backoff, path)) for i, path in enumerate(paths)]
     found = [t for t in tried if not is_feasible(t[1])]
@@ -280,7 +282,7 @@ def _solve_free_time(
 def _whole_steps(
     task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, relaxed: OcpSolution
 ) -> list[OcpSolution]:
-    """Arrival after a whole number of control steps: from the relaxed time, in both directions while it gets cheaper."""
+    """Solutions that arrive after whole numbers of control steps: from the relaxed time, both ways while the cost falls."""
     arrival = relaxed.states[0, 8] * _FREE_TIME_INTERVALS / task.control_dt
     steps = min(max(1, math.ceil(arrival)), task.steps)
     groups = {steps: _at_steps(task, params, c, backoff, relaxed, steps)}

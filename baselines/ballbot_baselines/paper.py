@@ -1,4 +1,4 @@
-"""The paper's three optimizations, with the weights for which reference optima are known, and its experiments.
+"""The paper's three optimizations and the problems of its figures, with the weights for which reference optima are known.
 
 "High lean angle trajectory optimization for ball balancing robots", equations (2) to (4): direct collocation with a free
 time step, costs summed over knots and not multiplied by the step, and a final-time cost S·h·N in every summand.
@@ -12,8 +12,8 @@ import numpy as np
 from ballbot_baselines import guess as guesses
 from ballbot_baselines.collocation import Guess, Plan, Problem, solve
 from ballbot_gym import ops
+from ballbot_gym.ops import squared
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.base import squared
 from ballbot_gym.tasks.orbit import steady_orbit
 
 DISTANCE_WEIGHT = 1.0  # Q0, of the squared ground distance from the destination
@@ -111,7 +111,7 @@ def circular_orbit(name: str, speed: float, intervals: int = INTERVALS) -> Probl
 
 
 def hermite_guess(x0: np.ndarray, x1: np.ndarray, duration: float) -> Callable[[BallbotParams], Guess]:
-    """A cubic ground path, with the leans that hold its accelerations and zero forces: it has no kink to iron out."""
+    """A smooth guess: a cubic ground path, the leans that balance its accelerations, and zero forces."""
 
     def make(params: BallbotParams) -> Guess:
         h = duration / INTERVALS

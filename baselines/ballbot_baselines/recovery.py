@@ -1,7 +1,7 @@
-"""What no controller can exceed: the states from which some force within the limit still brings the robot to rest.
+"""The recoverable states: those from which some force within the limit still brings the robot to rest.
 
-For one given component of the initial state (its speed, say) and all others zero but the lean γ, the largest recoverable
-lean is itself an optimal-control problem:
+No controller can recover from any other state. One component of the initial state (a speed, for example) is given, and all
+others but the lean γ are zero. The largest recoverable lean is then the solution of an optimal-control problem:
 
     maximize    γ_0        over γ_0 and forces u_k, |u_k| ≤ limit, held for control_dt
     subject to  x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k) ≥ 0,   goal(x_n) ≤ 0 at the end of the episode
@@ -21,13 +21,12 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
 _LEAN = 2  # index of γ in a state
-_REGULARIZATION = (
-    0.02  # rad; of squared actions, leans and lean rates: makes the optimum unique, and moves it by half a degree
-)
+# rad; weight of squared actions, leans and lean rates. It makes the optimum unique, and moves it by half a degree.
+_REGULARIZATION = 0.02
 _TOLERANCE = 1e-6
 _FEASIBLE = 1e-4  # SI units: at the boundary the robot hovers where rounding grows by e^7.8 a second
 _ITERATIONS = 300
-_PATIENCE = 3  # values in a row without a recoverable lean, after which it is sought no farther
+_PATIENCE = 3  # the search stops after this many values in a row without a recoverable lean
 
 
 def largest_leans(task: Task, params: BallbotParams, component: int, values: np.ndarray) -> np.ndarray:
@@ -40,8 +39,8 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
         values: (n,) ascending, in the component's SI unit.
 
     Returns:
-        (n,) rad; NaN where none was found, as where no lean at all is recoverable. Each search starts from its neighbour's
-        solution, from the value nearest 0 outward, and if that fails from standing.
+        (n,) rad; NaN where no recoverable lean was found. The search goes outward from the value nearest 0. It starts from
+        the neighbouring value's solution, and if that fails from standing.
     """
     solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
     leans = np.full(len(values), np.nan)
@@ -77,7 +76,7 @@ def _standing(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray
 
 
 def _largest_lean_ocp(task: Task, params: BallbotParams) -> Ocp:
-    """The task's problem with its initial lean free; a ninth state remembers it until the end, where it is the reward."""
+    """The task's problem with a free initial lean. The ninth state carries that lean to the end, where it is the reward."""
     fixed = shooting_ocp(task, params)
     price = _REGULARIZATION * task.control_dt
     same = np.zeros((1, 9))

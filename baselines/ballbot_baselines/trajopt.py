@@ -8,13 +8,14 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
 EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02)
-"""What plans that are to be executed keep: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the force."""
+"""How far plans for execution stay from their limits: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the
+force."""
 
 
 class TrajoptController:
-    """The optimum from the state at reset, less a back-off from its limits, tracked by TVLQR.
+    """Plans the optimum from the state at reset, with a back-off from the limits, and tracks it with TVLQR.
 
-    `plan` is the last plan. `reset` raises a PlanError where there is none.
+    `plan` is the last plan. `reset` raises a PlanError if it finds no plan.
     """
 
     def __init__(self, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):

@@ -1,1 +1,40 @@
-"""Training, evaluation and the command line."""
+"""Training, evaluation and the command line `ballbot`.
+
+Short import paths that stay where they are; each imports what it needs when it is first used:
+
+| name | what it is |
+|---|---|
+| `evaluate` | the leaderboard row of anything that acts: `ballbot_train.evaluation.evaluate.evaluate` |
+| `load_policy` | a policy file as a Controller with `predict`: `ballbot_train.policy.load_policy` |
+| `shipped_policies` | the policies that come with the package: `ballbot_train.policy_files.shipped_policies` |
+| `BallbotVecEnv` | batched environments for Stable-Baselines3: `ballbot_train.learning.sb3.BallbotVecEnv` |
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ballbot_train.evaluation.evaluate import evaluate
+    from ballbot_train.learning.sb3 import BallbotVecEnv
+    from ballbot_train.policy import load_policy
+    from ballbot_train.policy_files import shipped_policies
+
+_LAZY = {
+    "evaluate": "ballbot_train.evaluation.evaluate:evaluate",
+    "load_policy": "ballbot_train.policy:load_policy",
+    "shipped_policies": "ballbot_train.policy_files:shipped_policies",
+    "BallbotVecEnv": "ballbot_train.learning.sb3:BallbotVecEnv",
+}
+
+__all__ = ["BallbotVecEnv", "evaluate", "load_policy", "shipped_policies"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from ballbot_gym.lazy import load
+
+    return load(_LAZY[name])
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,28 +1,90 @@
-"""The command line `ballbot`, whose commands are in `ballbot_train.commands`."""
+"""The command line `ballbot`, whose commands are in `ballbot_train.commands`.
 
+`ballbot --help` imports no command; any other call imports only its own.
+"""
+
+import difflib
 import sys
+from typing import Any
 
-import tyro
 from rich.console import Console
+from rich.table import Table
 
-from ballbot_gym.rollout import PlanError
-from ballbot_train.commands import COMMANDS
-from ballbot_train.commands.train import command_line
+from ballbot_train.commands import COMMANDS, help_of
+
+_DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
+_LEAST_WIDTH = 60
 
 
 def main() -> None:
-    """Runs the command line; errors a user can cause end with one line and exit status 1."""
+    """Runs the command line; errors a user can cause end with one line and exit status 1, misused commands with 2."""
+    sys.exit(_run(sys.argv[1:]))
+
+
+def _run(arguments: list[str]) -> int:
+    """Runs what was typed after `ballbot`, and gives the exit status."""
+    errors = Console(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)
+    if not arguments:
+        _print_help()
+        return 2
+    command, *options = arguments
+    if command in ("-h", "--help"):
+        _print_help()
+        return 0
+    if command == "--version":
+        from importlib.metadata import version
+
+        sys.stdout.write(f"ballbot {version('ballbot-gym')}\n")
+        return 0
+    if command not in COMMANDS:
+        close = difflib.get_close_matches(command, COMMANDS, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
+        errors.print(f"ballbot: no command {command!r}; {hint}", style="red")
+        return 2
     try:
-        if sys.argv[1:2] == ["train"]:  # its options depend on the learner and the task
-            command_line(sys.argv[2:])
-            return
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="ballbot", description="Ballbot control, by its regret.")
-    except (ValueError, TypeError, ImportError, PlanError, OSError) as error:
-        Console(stderr=True).print(f"ballbot: {error}", style="red", markup=False)
-        sys.exit(1)
+        _call(command, options)
     except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted; the same command continues where it stopped")
-        sys.exit(130)
+        errors.print("interrupted; the same command continues where it stopped")
+        return 130
+    except ModuleNotFoundError as error:
+        errors.print(f'ballbot: {error}; pip install "ballbot-gym[train]" installs what the commands need', style="red")
+        return 1
+    except (ValueError, TypeError, ImportError, OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not _is_expected(error):
+            raise
+        errors.print(f"ballbot: {error}", style="red")
+        return 1
+    return 0
+
+
+def _call(command: str, options: list[str]) -> Any:
+    import tyro
+
+    from ballbot_gym.lazy import load
+
+    if command == "train":  # its options depend on the learner and the task
+        return load("ballbot_train.commands.train:command_line")(options)
+    return tyro.cli(load(COMMANDS[command]), args=options, prog=f"ballbot {command}")
+
+
+def _is_expected(error: RuntimeError) -> bool:
+    from ballbot_gym.rollout import PlanError
+    from ballbot_train.jobs import WorkerError
+
+    return isinstance(error, PlanError | WorkerError)
+
+
+def _print_help() -> None:
+    console = Console(markup=False, emoji=False, highlight=False)
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name in COMMANDS:
+        table.add_row(name, help_of(name))
+    console.width = max(console.width, _LEAST_WIDTH)
+    console.print(f"usage: ballbot COMMAND [OPTIONS]\n\n{_DESCRIPTION}\n\ncommands:")
+    console.print(table)
+    console.print("\n`ballbot COMMAND --help` lists the options of a command; `ballbot --version` says the version.")
 
 
 if __name__ == "__main__":

@@ -1,25 +1,22 @@
-"""What every command shares: the console, its progress bar and tables, and what a result says about its making."""
+"""What every command shares: the console, its progress bars and tables, and checks of what was typed."""
 
-import importlib.metadata
-import os
-import platform
-import subprocess
 import sys
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 # A file or pipe has no width of its own: give it one that holds the widest table.
-console = Console(width=None if sys.stdout.isatty() else 160)
+# Names and paths are data: a "[b]" or ":x:" in them is printed as it is.
+console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
 
 
 def progress_bar() -> Progress:
     """A bar per task: description, share, times."""
     columns = (
-        TextColumn("{task.description:>10}"),
+        TextColumn("{task.description:>10}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -28,7 +25,33 @@ def progress_bar() -> Progress:
     return Progress(*columns, console=console)
 
 
-def print_table(title: str, header: list[str], rows: list[list[str]]) -> None:
+class Bars:
+    """Progress bars by name."""
+
+    def __init__(self, progress: Progress):
+        self._progress = progress
+        self._bars = {}
+
+    def add(self, totals: Mapping[str, int]) -> None:
+        """Adds a bar for every name; the number is how many steps it has."""
+        for name, total in totals.items():
+            self._bars[name] = self._progress.add_task(name, total=total)
+
+    def advance(self, name: str, count: int) -> None:
+        """Moves a bar on by a number of steps."""
+        self._progress.advance(self._bars[name], count)
+
+
+@contextmanager
+def progress_bars(totals: Mapping[str, int]) -> Iterator[Bars]:
+    """Shows a bar for every name while the block runs; the numbers are how many steps each has."""
+    with progress_bar() as progress:
+        bars = Bars(progress)
+        bars.add(totals)
+        yield bars
+
+
+def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Prints a table; the first two columns are words."""
     table = Table(title=title, title_justify="left")
     for i, name in enumerate(header):
@@ -38,7 +61,7 @@ def print_table(title: str, header: list[str], rows: list[list[str]]) -> None:
     console.print(table)
 
 
-def markdown(header: list[str], rows: list[list[str]]) -> str:
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The same as a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
@@ -55,23 +78,15 @@ def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
         raise ValueError(f"{kind} {', '.join(repeated)} is given more than once; give each once")
 
 
-def about() -> dict[str, object]:
-    """What a result depends on besides its settings."""
-    packages = ("gymnasium", "numpy", "pybullet", "casadi", "scipy")
-    return {
-        "version": importlib.metadata.version("ballbot-gym"),
-        "commit": _commit(),
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in packages},
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-    }
+def check_some(kind: str, names: Sequence[str], known: Iterable[str]) -> None:
+    """As `check_names`; raises a ValueError also where there is no name at all."""
+    if not names:
+        raise ValueError(f"give at least one {kind}: {', '.join(known)}")
+    check_names(kind, names, known)
 
 
-def _commit() -> str:
-    """The checkout's commit, or "none" where the package runs without one."""
-    root = Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
-        return "none"
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty"]
-    result = subprocess.run(command, capture_output=True, text=True)
-    return result.stdout.strip() or "none"
+def check_least(least: int, **numbers: int) -> None:
+    """Raises a ValueError that names the first of the numbers that is less than `least`."""
+    for name, number in numbers.items():
+        if number < least:
+            raise ValueError(f"{name} must be at least {least}, not {number}")

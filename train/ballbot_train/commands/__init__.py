@@ -1,27 +1,34 @@
-"""The commands of `ballbot`, one file each."""
+"""The commands of `ballbot`, one file each. A command is imported when it is called.
 
-from collections.abc import Callable
+To add a command, write `NAME.py` with a function of the same name, and add one line to `COMMANDS`.
+"""
 
-from ballbot_train.commands.basins import basins
-from ballbot_train.commands.benchmark import benchmark
-from ballbot_train.commands.certify import certify
-from ballbot_train.commands.compare import compare
-from ballbot_train.commands.demos import demos
-from ballbot_train.commands.optimize import optimize
-from ballbot_train.commands.paper import paper
-from ballbot_train.commands.replay import replay
-from ballbot_train.commands.robustness import robustness
-from ballbot_train.commands.train import train
+import ast
+from importlib.util import find_spec
+from pathlib import Path
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "benchmark": benchmark,
-    "compare": compare,
-    "robustness": robustness,
-    "basins": basins,
-    "paper": paper,
-    "optimize": optimize,
-    "replay": replay,
-    "certify": certify,
-    "demos": demos,
-    "train": train,
+COMMANDS: dict[str, str] = {
+    "benchmark": "ballbot_train.commands.benchmark:benchmark",
+    "compare": "ballbot_train.commands.compare:compare",
+    "robustness": "ballbot_train.commands.robustness:robustness",
+    "basins": "ballbot_train.commands.basins:basins",
+    "paper": "ballbot_train.commands.paper:paper",
+    "optimize": "ballbot_train.commands.optimize:optimize",
+    "replay": "ballbot_train.commands.replay:replay",
+    "certify": "ballbot_train.commands.certify:certify",
+    "demos": "ballbot_train.commands.demos:demos",
+    "train": "ballbot_train.commands.train:train",
 }
+"""Every command's function, as `ballbot_gym.lazy.load` takes it."""
+
+
+def help_of(name: str) -> str:
+    """The first line of a command's docstring, read from its file without importing it."""
+    module, _, function = COMMANDS[name].partition(":")
+    spec = find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == function:
+            return (ast.get_docstring(node) or "").partition("\n")[0]
+    return ""

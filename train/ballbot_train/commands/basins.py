@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Literal
 
 from ballbot_train import jobs
-from ballbot_train.console import console, print_table, progress_bar
+from ballbot_train.console import console, print_table, progress_bars
 from ballbot_train.evaluation import basins as maps
-from ballbot_train.evaluation import evaluate
+from ballbot_train.evaluation.benchmark import controllers_of, open_run
 from ballbot_train.report import figures
 
 
@@ -32,21 +32,13 @@ def basins(
     points = min(points, 9) if quick else points
     if points < 3 or points % 2 == 0:
         raise ValueError(f"points must be odd and at least 3, not {points}")
-    chosen = evaluate.controllers_of([maps.TASK], controllers)
+    chosen = controllers_of([maps.TASK], controllers)
     names = chosen[maps.TASK]
-    facts = evaluate.begin(out, chosen, workers, physics=physics, points=points)
-    with progress_bar() as progress:
-        bars = {"boundary": progress.add_task("boundary", total=len(maps.AXES))}
-
-        def advance(name: str, count: int) -> None:
-            progress.advance(bars[name], count)
-
-        bounds = maps.boundaries(out, workers, advance)
-        work = maps.cell_jobs(bounds, names, points, physics)
-        totals = {name: sum(len(job.items) for job in work if job.group == name) for name in names}
-        bars |= {name: progress.add_task(name, total=total) for name, total in totals.items()}
-        done = jobs.run(work, out, workers, advance)
-    made = maps.maps_of(bounds, (entry for entries in done for entry in entries), names, points)
+    facts = open_run(out, chosen, workers, physics, points=points)
+    with progress_bars({maps.BOUNDARY: len(maps.AXES)}) as bars:
+        bounds = maps.boundaries(out, workers, bars.advance)
+        bars.add(maps.states_to_run(bounds, names, points, physics))
+        made = maps.run(bounds, names, points, physics, out, workers, bars.advance)
     maps.write(made, facts, out)
     picture = figures.save(figures.basin_figure(made), out / "basins.png")
     jobs.release(out)

@@ -10,8 +10,11 @@ from ballbot_gym import certified, files
 from ballbot_gym.env import make_task
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import console, markdown, print_table, progress_bar
-from ballbot_train.evaluation import basins, evaluate
+from ballbot_train.console import console, markdown, print_table, progress_bars
+from ballbot_train.evaluation import basins
+from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
+from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
 from ballbot_train.report.replay import certified_replay
@@ -44,37 +47,30 @@ def benchmark(
         out: folder of the results; an interrupted run continues here.
         workers: processes; 1 gives the cleanest times per control step.
     """
-    chosen = evaluate.controllers_of(tasks, controllers)
-    episodes = evaluate.checked_episodes(episodes, quick, few=8)
-    facts = evaluate.begin(out, chosen, workers, physics=physics, episodes=episodes, seed=seed)
-    with progress_bar() as progress:
-        bars = {task: progress.add_task(task, total=episodes * len(group)) for task, group in chosen.items()}
-        done = evaluate.benchmark(
-            chosen,
-            episodes,
-            physics,
-            out,
-            workers,
-            lambda task, count: progress.advance(bars[task], count),
-            seed,
-        )
-    recovered = basins.recovered_fractions(runs / "basins")
+    chosen = controllers_of(tasks, controllers)
+    episodes = checked_episodes(episodes, quick, few=8)
+    facts = open_run(out, chosen, workers, physics, seed, episodes=episodes)
+    with progress_bars({task: episodes * len(group) for task, group in chosen.items()}) as bars:
+        done = run_benchmark(chosen, episodes, physics, out, workers, bars.advance, seed)
+    recovered, damaged = basins.recovered_fractions(runs / "basins")
+    if damaged:
+        console.print(f"skipped: {damaged}")
     rows = [
         replace(row, recovered=recovered.get((row.task, row.controller), row.recovered))
-        for row in evaluate.leaderboard(done, seed)
+        for row in leaderboard(done, seed)
     ]
-    evaluate.write_leaderboard(rows, done, facts, out)
+    write_leaderboard(rows, done, facts, out)
     figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     pictures = [_episode_figure(task, group, physics, out) for task, group in chosen.items()]
-    table = [evaluate.cells(row) for row in rows]
-    files.write(out / "leaderboard.md", markdown(evaluate.HEADER, table))
-    sections = leaderboard_sections(evaluate.HEADER, table, done, chosen, pictures, physics, runs)
+    table = [cells(row) for row in rows]
+    files.write(out / "leaderboard.md", markdown(HEADER, table))
+    sections = leaderboard_sections(HEADER, table, done, chosen, pictures, physics, runs)
     page = write_report("ballbot-gym: leaderboard", sections, facts, out / "report.html")
     jobs.release(out)
-    print_table(f"{episodes} certified episodes per task, physics={physics}", evaluate.HEADER, table)
+    print_table(f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
     for result in done:
         if result.note:
-            console.print(f"no plan: {result.task} episode {result.episode}: {result.note}", markup=False)
+            console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")
     console.print(f"report: {page}")
 
 

@@ -1,24 +1,26 @@
 """`ballbot certify`: the certified evaluation sets anew."""
 
 import os
-from multiprocessing import get_context
 from pathlib import Path
 
 from ballbot_baselines import certification
-from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import progress_bar
-from ballbot_train.evaluation import evaluate
+from ballbot_train import jobs
+from ballbot_train.console import check_least, check_some, console, progress_bars
+from ballbot_train.provenance import provenance
+
+_CHUNK = 5  # episodes of a job
 
 
 def certify(
     tasks: tuple[str, ...] = tuple(TASKS),
     episodes: int = certified.EPISODES,
-    out: Path | None = None,
+    install: bool = False,
+    out: Path = Path("runs/certify"),
     workers: int = os.cpu_count() or 1,
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
@@ -26,34 +28,38 @@ def certify(
     Args:
         tasks: names of tasks.
         episodes: how many, from the first.
-        out: folder of the .npz files; default, in the package.
+        install: puts the finished sets into the package too, in place of those that all evaluation reads.
+        out: folder of the .npz files; an interrupted run continues here.
         workers: processes.
     """
-    evaluate.check_names("task", list(tasks), TASKS)
-    failed = []
-    with progress_bar() as progress, get_context("spawn").Pool(workers) as pool:
-        for name in tasks:
-            bar = progress.add_task(name, total=episodes)
-            optima = []
-            for index, result in enumerate(pool.imap(_certify_one, [(name, i) for i in range(episodes)], chunksize=5)):
-                progress.advance(bar)
-                if isinstance(result, str):
-                    failed.append(f"{name} episode {index}: {result}")
-                else:
-                    optima.append(result)
-            if len(optima) == episodes:
-                task = make_task(name)
-                path = certified.path_of(task) if out is None else out / certified.path_of(task).name
-                certification.evaluation_set(task, default_params(), optima).save(task, path)
-                progress.console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
-    if failed:
-        raise PlanError("no optimum for\n" + "\n".join(failed))
-
-
-def _certify_one(job: tuple[str, int]) -> Optimum | str:
-    """The optimum, or the message of why there is none: an exception would end the pool."""
-    task, params = make_task(job[0]), default_params()
-    try:
-        return find_optimum(task, params, *certification.episode(task, params, job[1]))
-    except PlanError as error:
-        return str(error)
+    check_some("task", tasks, TASKS)
+    check_least(1, episodes=episodes, workers=workers)
+    if install and episodes < certified.EPISODES:
+        raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
+    facts = provenance()
+    jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], "tasks": tasks, "episodes": episodes})
+    work = [
+        jobs.Job(f"{task}-{start:04d}", certification.entries, (task,), items, task)
+        for task in tasks
+        for start in range(0, episodes, _CHUNK)
+        for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
+    ]
+    with progress_bars(dict.fromkeys(tasks, episodes)) as bars:
+        done = jobs.run(work, out, workers, bars.advance)
+    failures, sets = [], {}
+    for name in tasks:
+        found = [entry for job, entries in zip(work, done, strict=True) if job.group == name for entry in entries]
+        errors = [f"{name} episode {i}: {entry['error']}" for i, entry in enumerate(found) if "error" in entry]
+        failures += errors
+        if not errors:
+            task = make_task(name)
+            sets[name] = certification.evaluation_set(task, default_params(), found)
+            path = sets[name].save(task, out / certified.path_of(task).name)
+            console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+    jobs.release(out)
+    if failures:
+        raise PlanError("no optimum for\n" + "\n".join(failures))
+    if install:
+        for name, evaluation_set in sets.items():
+            task = make_task(name)
+            console.print(f"installed: {evaluation_set.save(task, certified.path_of(task))}")

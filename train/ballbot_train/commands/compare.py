@@ -6,7 +6,8 @@ from typing import Any
 
 from ballbot_gym import files
 from ballbot_train.console import console, print_table
-from ballbot_train.evaluation import comparison, evaluate
+from ballbot_train.evaluation import comparison
+from ballbot_train.evaluation.results import read_results, to_json
 
 
 def compare(
@@ -28,16 +29,16 @@ def compare(
         training_margin: the same between policies with different weights, which the seed of their training makes differ.
         out: file for the same as JSON.
     """
-    runs = tuple(evaluate.read_results(path) for path in (a, b))
-    compared = comparison.compare(*runs, match, margin, training_margin)
+    runs = read_results(a), read_results(b)
+    compared = comparison.compare(runs[0], runs[1], match, margin, training_margin)
     for key in sorted(runs[0][0].keys() | runs[1][0].keys()):
         first, second = (run[0].get(key) for run in runs)
         if runs[0][0] and runs[1][0] and first != second and key != "policies":
-            console.print(f"{key}: {first} in A, {second} in B", markup=False)
+            console.print(f"{key}: {first} in A, {second} in B")
     header = ["task", "controller", "B is", "episodes", "success B − A", "regret B − A", "because"]
     print_table(f"A: {a}\nB: {b}", header, [_cells(entry) for entry in compared])
     if out is not None:
-        files.write(out, evaluate.to_json({"about": [run[0] for run in runs], "rows": compared}))
+        files.write(out, to_json({"about": [run[0] for run in runs], "rows": compared}))
 
 
 def _cells(entry: comparison.Comparison) -> list[str]:

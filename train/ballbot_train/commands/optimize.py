@@ -10,8 +10,7 @@ from ballbot_baselines.optimum import find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import console, print_table
-from ballbot_train.evaluation import evaluate
+from ballbot_train.console import check_names, console, print_table
 from ballbot_train.report import figures
 
 
@@ -38,7 +37,7 @@ def optimize(
         force_limit: N.
         out: folder of trajectory.npz and figure.png.
     """
-    evaluate.check_names("task", [task], TASKS)
+    check_names("task", [task], TASKS)
     fields = {"duration": duration, "max_tilt": None if max_tilt is None else math.radians(max_tilt)}
     params = default_params()
     if force_limit is not None:

@@ -5,19 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.collocation import Plan
-from ballbot_baselines.paper import EFFORT_WEIGHT, PAPER_PROBLEMS, REST_WEIGHT, PaperProblem
-from ballbot_baselines.tvlqr import TvlqrController
-from ballbot_gym.env import BallbotEnv
+from ballbot_baselines.paper import PAPER_PROBLEMS, PaperProblem
+from ballbot_baselines.paper_experiments import TRACKING_DT, compare_stabilization, track_plan
 from ballbot_gym.params import default_params
-from ballbot_gym.rollout import rollout, simulate
-from ballbot_train.console import console, print_table
-from ballbot_train.evaluation import evaluate
+from ballbot_train.console import check_names, console, print_table
 from ballbot_train.report import figures
-
-_PAPER_CONTROL_DT = 0.01  # s, at which the paper's plans are tracked
-_PAPER_LQR_DT = 0.001  # s: the paper's LQR is continuous
 
 
 def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
@@ -27,22 +20,17 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         out: folder of the figures and plans.
         only: names of some of the problems; default all.
     """
-    evaluate.check_names("problem", list(only), PAPER_PROBLEMS)
+    check_names("problem", list(only), PAPER_PROBLEMS)
     params = default_params()
     rows = []
     for name in only or PAPER_PROBLEMS:
         entry = PAPER_PROBLEMS[name]
-        plan = entry.solve(params)
+        tracked = track_plan(entry.solve(params), params)
+        plan = tracked.plan
         plan.trajectory.save(out / f"{name}.npz")
-        q = np.diag([1.0, 1.0, *[REST_WEIGHT] * 6])
-        tracker = TvlqrController.for_weights(params, plan.trajectory, _PAPER_CONTROL_DT, q, EFFORT_WEIGHT * np.eye(2))
-        seconds = round(plan.trajectory.duration / _PAPER_CONTROL_DT) * _PAPER_CONTROL_DT
-        done = simulate(tracker, params, plan.trajectory.x[0], seconds, _PAPER_CONTROL_DT)
-        planned = np.array([plan.trajectory.state(t) for t in done.t])
-        error = float(np.hypot(*(done.x - planned)[:, :2].T).max())
         curves = [
-            figures.Curve("plan", plan.trajectory.resampled(_PAPER_CONTROL_DT), "0.35", "--"),
-            figures.Curve("PyBullet under TVLQR", done, figures.COLORS["trajopt"]),
+            figures.Curve("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", "--"),
+            figures.Curve("PyBullet under TVLQR", tracked.executed, figures.COLORS["trajopt"]),
         ]
         figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", curves, _paper_circles(entry, plan))
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}.png")
@@ -56,7 +44,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
                 f"{tilt:.2f}",
                 f"{np.abs(plan.trajectory.u).max():.0f}",
                 f"{plan.collocation_error:.1e}",
-                f"{100 * error:.1f}",
+                f"{100 * tracked.error:.1f}",
                 plan.status,
             ]
         )
@@ -79,23 +67,20 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
 
 
 def _compare_stabilizations(names: list[str], out: Path) -> None:
-    """Figs 2 and 3 as in the paper: LQR against trajectory optimization with the same weights, Stabilize's."""
+    """Table and figures of LQR against trajectory optimization."""
     rows = []
-    slow, fast = (
-        BallbotEnv("stabilize"),
-        BallbotEnv("stabilize", control_dt=_PAPER_LQR_DT, physics_dt=_PAPER_LQR_DT / 4),
-    )
     for name in names:
         entry = PAPER_PROBLEMS[name]
-        options = {"state": entry.problem.initial[0]}
         curves = []
-        for key, env in (("lqr", fast), ("trajopt", slow)):
-            run = rollout(env, CONTROLLERS[key](env.task, env.params), options=options)
-            rate = f"{1 / env.task.control_dt:.0f} Hz"
-            curves.append(figures.Curve(f"{figures.LABELS[key]}, {rate}", run.trajectory, figures.COLORS[key]))
-            peak = math.degrees(np.abs(run.trajectory.x[:, 2:4]).max())
-            settle = f"{run.settle_time:.2f}"
-            rows.append([entry.figure, key, rate, f"{run.cost:.2f}", f"{peak:.1f}", settle, str(run.failure)])
+        for run in compare_stabilization(entry):
+            episode, rate = run.episode, f"{run.rate:.0f} Hz"
+            label = f"{figures.LABELS[run.controller]}, {rate}"
+            curves.append(figures.Curve(label, episode.trajectory, figures.COLORS[run.controller]))
+            peak = math.degrees(np.abs(episode.trajectory.x[:, 2:4]).max())
+            settle = f"{episode.settle_time:.2f}"
+            rows.append(
+                [entry.figure, run.controller, rate, f"{episode.cost:.2f}", f"{peak:.1f}", settle, str(episode.failure)]
+            )
         figure = figures.trajectory_figure(
             f"{entry.figure}: {entry.title}, LQR against trajectory optimization", curves
         )
@@ -107,7 +92,7 @@ def _compare_stabilizations(names: list[str], out: Path) -> None:
 def _paper_circles(entry: PaperProblem, plan: Plan) -> list[figures.Circle]:
     if entry.problem.periodic:
         return [figures.Circle(0, 0, float(plan.q[0]), filled=False)]
-    ball = default_params().ball_radius  # what is drawn filled touches the ball at the distance kept
+    ball = default_params().ball_radius
     return [figures.Circle(x, y, distance - ball) for x, y, distance in entry.obstacles]
 
 

@@ -1,4 +1,4 @@
-"""`ballbot replay`: an episode or trajectory files, drawn."""
+"""`ballbot replay`: pictures and films of an episode or of trajectory files."""
 
 import math
 from pathlib import Path
@@ -6,20 +6,11 @@ from typing import Literal
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import console, progress_bar
-from ballbot_train.evaluation import evaluate
-from ballbot_train.report.replay import (
-    Format,
-    Replay,
-    certified_replay,
-    file_replay,
-    film_times,
-    with_ghosts,
-    write_film,
-)
-from ballbot_train.report.replay import write_strip as _write_strip
+from ballbot_train.console import check_names, console, progress_bar
+from ballbot_train.report.film import Format, film_times, write_film, write_strip
+from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_ghosts
 
-_WIDTHS = {"mp4": 1280, "gif": 640}  # px
+_WIDTHS = {"mp4": 1280, "gif": 640, "webp": 640}  # px
 
 
 def replay(
@@ -45,15 +36,15 @@ def replay(
         controllers: names of controllers or policy files; several are shown side by side.
         episode: index of the certified episode.
         physics: "bullet" or "rk4".
-        format: png, a strip of frames; mp4 or gif, a film with tilts, forces and paths.
-        seconds: of the last frame; default the end of the episode.
-        frames: of a strip, at equal times.
+        format: png, a strip of pictures; mp4, gif or webp, a film with tilts, forces and paths.
+        seconds: time of the last picture, s; default the end of the episode.
+        frames: number of pictures in a strip, at equal times.
         fps: frames per second of a film.
-        speed: of a film; 0.5 is half as fast as life.
-        width: of a film, px; default 1280 for mp4, 640 for gif.
-        ghost_at: shows as a ghost what an expert would do from this time on, s.
+        speed: seconds of the episode per second of film; 0.5 is slow motion.
+        width: width of a film, px; default 1280 for mp4, 640 for gif and webp.
+        ghost_at: time from which a ghost shows what an expert would do, s.
         ghost_by: name of that expert.
-        out: folder of the file, which is named after task, controllers and episode.
+        out: folder of the file. The file is named after task, controllers and episode.
     """
     _check(fps >= 1, f"fps must be at least 1, not {fps}")
     _check(frames >= 1, f"frames must be at least 1, not {frames}")
@@ -64,7 +55,7 @@ def replay(
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":
-        console.print(f"picture: {_write_strip(shown, path, frames, end)}")
+        console.print(f"picture: {write_strip(shown, path, frames, end)}")
         return
     with progress_bar() as progress:
         bar = progress.add_task("frames", total=len(film_times(end, fps, speed)))
@@ -80,7 +71,7 @@ def _read(
     ghost_at: float | None,
     ghost_by: str,
 ) -> tuple[Replay, str]:
-    """What is to be shown, and the name of its file."""
+    """The replay to draw, and the name of its file."""
     if all(Path(entry).suffix == ".npz" for entry in source):
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(ghost_at is None, "a trajectory file does not say which task it is of, so it has no ghost")
@@ -88,8 +79,8 @@ def _read(
         return file_replay(paths), "-".join(path.stem for path in paths)
     _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
     task = source[0]
-    evaluate.check_names("task", [task], TASKS)
-    evaluate.check_names("expert", [ghost_by], CONTROLLERS)
+    check_names("task", [task], TASKS)
+    check_names("expert", [ghost_by], CONTROLLERS)
     _check(bool(controllers), "give at least one controller")
     shown = certified_replay(task, controllers, episode, physics)
     name = f"{task}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"

@@ -8,16 +8,16 @@ from typing import Literal
 from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import console, markdown, print_table, progress_bar
-from ballbot_train.evaluation import evaluate
-from ballbot_train.evaluation import robustness as track
+from ballbot_train.console import check_some, console, markdown, print_table, progress_bars
+from ballbot_train.evaluation import robustness as stressed
+from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
 from ballbot_train.report import figures
 
 
 def robustness(
     tasks: tuple[str, ...] = tuple(TASKS),
     controllers: tuple[str, ...] = (),
-    stresses: tuple[str, ...] = tuple(track.STRESSES),
+    stresses: tuple[str, ...] = tuple(stressed.STRESSES),
     episodes: int = 20,
     quick: bool = False,
     physics: Literal["bullet", "rk4"] = "bullet",
@@ -38,32 +38,18 @@ def robustness(
         out: folder of the results; an interrupted run continues here.
         workers: processes.
     """
-    chosen = evaluate.controllers_of(tasks, controllers)
-    evaluate.check_names("stress", stresses, track.STRESSES)
-    episodes = evaluate.checked_episodes(episodes, quick, few=3)
-    facts = evaluate.begin(out, chosen, workers, physics=physics, episodes=episodes, seed=seed)
-    runs = sum(map(len, chosen.values())) * episodes
-    with progress_bar() as progress:
-        bars = {
-            name: progress.add_task(name, total=runs * (1 if name == track.NONE else len(track.STRESSES[name].levels)))
-            for name in (track.NONE, *stresses)
-        }
-        results = track.run(
-            chosen,
-            stresses,
-            episodes,
-            physics,
-            out,
-            workers,
-            lambda name, count: progress.advance(bars[name], count),
-            seed,
-        )
-    rows = track.rows_of(results, seed)
-    track.write(rows, results, facts, out)
+    chosen = controllers_of(tasks, controllers)
+    check_some("stress", stresses, stressed.STRESSES)
+    episodes = checked_episodes(episodes, quick, few=3)
+    facts = open_run(out, chosen, workers, physics, seed, episodes=episodes)
+    with progress_bars(stressed.episodes_to_run(chosen, stresses, episodes)) as bars:
+        results = stressed.run(chosen, stresses, episodes, physics, out, workers, bars.advance, seed)
+    rows = stressed.rows_of(results, seed)
+    stressed.write(rows, results, facts, out)
     for task in chosen:
         figures.save(figures.robustness_figure(rows, task), out / "figures" / f"robustness-{task}.png")
     table = [
-        _cells(track.curve_of(rows, task, controller, name), name)
+        _cells(stressed.curve_of(rows, task, controller, name), name)
         for task, group in chosen.items()
         for name in stresses
         for controller in group
@@ -75,7 +61,7 @@ def robustness(
     console.print(f"curves: {out / 'figures'}")
 
 
-def _cells(curve: list[track.StressRow], stress: str) -> list[str]:
+def _cells(curve: list[stressed.StressRow], stress: str) -> list[str]:
     def joined(values: list[float]) -> str:
         return " · ".join(f"{value:.0f}" if math.isfinite(value) else "–" for value in values)
 

@@ -75,7 +75,7 @@ def train(
     from ballbot_gym.params import default_params
     from ballbot_train.learning import training
     from ballbot_train.learning.demonstrations import command_of
-    from ballbot_train.policy import load_network, read_about
+    from ballbot_train.policy import load_network, read_description
 
     if threads is not None:
         torch.set_num_threads(threads)
@@ -88,7 +88,7 @@ def train(
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
     if start is not None:
-        command = f"{read_about(start)['training']['command']} && {command}"
+        command = f"{read_description(start)['training']['command']} && {command}"
     config = {
         "learner": learner,
         "task": task,

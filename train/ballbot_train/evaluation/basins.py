@@ -1,4 +1,4 @@
-"""Basins of attraction: from which states each controller brings the robot to rest, of those from which it is possible.
+"""Basins of attraction: the states from which each controller brings the robot to rest, and those from which any could.
 
 A map spans the lean γ and one other component of Stabilize's initial state; the rest is zero. A state is recovered if the
 episode succeeds: at rest at the origin when it ends. It is recoverable if it lies within the boundary that
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.recovery import largest_leans
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
@@ -25,9 +24,13 @@ from ballbot_train import jobs
 from ballbot_train.evaluation.controllers import make_controller
 
 TASK = "stabilize"
+BOUNDARY = "boundary"
+"""What the search for the boundaries counts its progress for."""
 LEAN_LIMIT = 75.0  # degrees, either side
 _BOUNDARY_POINTS = 31  # its search goes from value to value, in steps that it can follow
-_DOUBT = 2.0  # degrees beyond the boundary that are run too: the boundary is as exact as its regularization
+_DOUBT = (
+    2.0  # degrees beyond the boundary that are run too, because the boundary is only as exact as its regularization
+)
 
 
 @dataclass(frozen=True)
@@ -70,20 +73,22 @@ def boundaries(out: Path, workers: int, on_progress: Callable[[str, int], None])
     Args:
         out: folder of the results.
         workers: processes.
-        on_progress: called with "boundary" and a number of finished axes.
+        on_progress: called with `BOUNDARY` and a number of finished axes.
     """
-    work = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (), (name,), "boundary") for name in AXES]
+    work = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (), (name,), BOUNDARY) for name in AXES]
     done = jobs.run(work, out, workers, on_progress)
     return {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, done, strict=True)}
 
 
 def _boundary(names: Sequence[str]) -> Iterator[jobs.Entry]:
+    from ballbot_baselines.recovery import largest_leans  # it imports CasADi
+
     for name in names:
         values = grid(name, _BOUNDARY_POINTS)[1]
         highest = np.degrees(largest_leans(make_task(TASK), default_params(), AXES[name].component, values))
         known = np.isfinite(highest)
         right = np.column_stack([highest, values])[known]
-        # −right begins at the top left, where right ends
+        # −right starts where right ends
         yield {"boundary": np.concatenate([right, -right]).tolist()}
 
 
@@ -114,6 +119,38 @@ def cell_jobs(
                 stem = f"{_slug(name)}-{_slug(controller)}-{zlib.crc32(controller.encode()):08x}-{physics}-{points}-{i:02d}"
                 work.append(jobs.Job(stem, _cells, (name, controller, physics, points), items, controller))
     return work
+
+
+def states_to_run(
+    bounds: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str
+) -> dict[str, int]:
+    """How many states `run` runs under every controller."""
+    work = cell_jobs(bounds, controllers, points, physics)
+    return {name: sum(len(job.items) for job in work if job.group == name) for name in controllers}
+
+
+def run(
+    bounds: Mapping[str, np.ndarray],
+    controllers: Sequence[str],
+    points: int,
+    physics: str,
+    out: Path,
+    workers: int,
+    on_progress: Callable[[str, int], None],
+) -> list[BasinMap]:
+    """Runs the controllers from every state within the boundaries, resumably, and makes a map for each axis.
+
+    Args:
+        bounds: as `boundaries` gives.
+        controllers: names.
+        points: along each axis of a map; odd.
+        physics: "bullet" or "rk4".
+        out: folder of the results.
+        workers: processes.
+        on_progress: called with a controller and a number of finished states.
+    """
+    done = jobs.run(cell_jobs(bounds, controllers, points, physics), out, workers, on_progress)
+    return maps_of(bounds, (entry for entries in done for entry in entries), controllers, points)
 
 
 def _cells(
@@ -159,22 +196,28 @@ def fraction(maps: Sequence[BasinMap], controller: str) -> float:
     return recovered / sum(int(np.sum(basin.recoverable)) for basin in maps)
 
 
-def write(maps: Sequence[BasinMap], about: dict[str, object], out: Path) -> None:
-    """Writes basins.json, which holds about, rows and maps, and basins.csv with a line for each state."""
+def write(maps: Sequence[BasinMap], facts: Mapping[str, Any], out: Path) -> None:
+    """Writes basins.json, which holds the facts as "about", rows and maps, and basins.csv with a line for each state."""
     rows = [
         {"task": TASK, "controller": c, "recovered": fraction(maps, c)}
         | {basin.axis: basin.fraction(c) for basin in maps}
         for c in maps[0].recovered
     ]
-    document = {"about": about, "rows": rows, "maps": [_as_json(basin) for basin in maps]}
+    document = {"about": facts, "rows": rows, "maps": [_as_json(basin) for basin in maps]}
     files.write(out / "basins.json", json.dumps(document, ensure_ascii=False) + "\n")
-    lines = ["axis,value,lean_deg,recoverable," + ",".join(maps[0].recovered)]
-    for basin in maps:
-        for i, value in enumerate(basin.values):
-            for j, lean in enumerate(basin.leans):
-                flags = (basin.recoverable[i, j], *(cells[i, j] for cells in basin.recovered.values()))
-                lines.append(f"{basin.axis},{value:g},{lean:g}," + ",".join(str(int(flag)) for flag in flags))
-    files.write(out / "basins.csv", "\n".join(lines) + "\n")
+    lines = [
+        {
+            "axis": basin.axis,
+            "value": f"{value:g}",
+            "lean_deg": f"{lean:g}",
+            "recoverable": int(basin.recoverable[i, j]),
+            **{name: int(cells[i, j]) for name, cells in basin.recovered.items()},
+        }
+        for basin in maps
+        for i, value in enumerate(basin.values)
+        for j, lean in enumerate(basin.leans)
+    ]
+    files.write_csv(out / "basins.csv", lines)
 
 
 def _as_json(basin: BasinMap) -> dict[str, Any]:
@@ -203,11 +246,20 @@ def read(folder: Path) -> list[BasinMap]:
     ]
 
 
-def recovered_fractions(folder: Path) -> dict[tuple[str, str], float]:
-    """The shares that a folder of `ballbot basins` holds, by task and controller; none where it holds none."""
+def recovered_fractions(folder: Path) -> tuple[dict[tuple[str, str], float], str]:
+    """The shares that a folder of `ballbot basins` holds.
+
+    Returns:
+        The shares by task and controller, none where the folder holds none; and why its file cannot be read, or "".
+    """
     path = folder / "basins.json"
-    rows = json.loads(path.read_text())["rows"] if path.exists() else []
-    return {(row["task"], row["controller"]): row["recovered"] for row in rows}
+    if not path.exists():
+        return {}, ""
+    try:
+        rows = json.loads(path.read_text())["rows"]
+        return {(str(row["task"]), str(row["controller"])): float(row["recovered"]) for row in rows}, ""
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        return {}, f"{path} is damaged: {error!r}"
 
 
 def _slug(text: str) -> str:

@@ -1,13 +1,13 @@
 """Two benchmarks of the same episodes, compared pair by pair: better, worse, or cannot tell.
 
-Both runs met the same episodes, so what is compared is each episode with itself: how hard it is cancels. Of the differences
-per episode, the mean and its 95 % bootstrap interval are reported, and they decide only beyond a margin:
+Both runs met the same episodes, so each episode is compared with itself, and how hard it is cancels. The mean difference per
+episode and its 95 % bootstrap interval are reported. They decide only beyond a margin:
 
-- Success decides first, if a sign test over the episodes in which only one of the two succeeded agrees: the bootstrap of a
-  handful of falls is surer than it may be. Else regret decides, over the episodes in which neither failed.
-- Episodes are not all that varies. Training a policy anew with another seed gives another policy, and one of each is a sample
-  of one: no number of episodes says which method is better. So policies with different weights must differ by more than
-  `TRAINING_MARGIN`, about what a seed changes. To compare methods more finely, train several seeds of each.
+- Success decides first, if a sign test over the episodes in which only one of the two succeeded agrees, because the bootstrap
+  interval of a handful of falls is too narrow. Otherwise regret decides, over the episodes in which neither failed.
+- Training with another seed gives another policy. Each method is represented by one seed, so no number of episodes tells the
+  methods apart. Policies with different weights must therefore differ by more than `TRAINING_MARGIN`, which is about what a
+  seed changes. To compare methods more finely, train several seeds of each.
 """
 
 import math
@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.statistics import CONFIDENCE, interval, verdict
 
 MARGIN = 0.001
@@ -27,8 +26,8 @@ MARGIN = 0.001
 TRAINING_MARGIN = 0.02
 """The same between policies that were trained separately."""
 
-_FEWEST = 8  # episodes: of fewer, a bootstrap makes too little of what it has not seen
-_SAME_OPTIMUM = 1e-6  # relative; beyond, equally numbered episodes are not the same
+_FEWEST = 8  # episodes; the bootstrap interval of fewer is too narrow
+_SAME_OPTIMUM = 1e-6  # relative; beyond this, two episodes of the same number are different ones
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,11 @@ def compare(
         seed: of the bootstrap.
 
     Raises:
-        ValueError: there is nothing to compare.
+        ValueError: there is nothing to compare, a margin is no number from 0, or a run holds an episode twice.
     """
+    for name, number in (("margin", margin), ("training_margin", training_margin)):
+        if not 0 <= number < math.inf:
+            raise ValueError(f"{name} must be a number from 0, not {number}")
     groups_a, groups_b = _groups(a[1]), _groups(b[1])
     pairs = _pairs(groups_a, groups_b, match)
     if not pairs:
@@ -100,7 +102,10 @@ Groups = dict[tuple[str, str], dict[int, Result]]
 def _groups(results: Sequence[Result]) -> Groups:
     groups: Groups = {}
     for result in results:
-        groups.setdefault((result.task, result.controller), {})[result.episode] = result
+        group = groups.setdefault((result.task, result.controller), {})
+        if result.episode in group:
+            raise ValueError(f"episode {result.episode} of {result.controller} on {result.task} is there twice")
+        group[result.episode] = result
     return groups
 
 
@@ -164,6 +169,8 @@ def _hindrance(pairs: Sequence[tuple[Result, Result]]) -> str:
 def _judge(
     wins: np.ndarray, success: tuple[float, float], regret: tuple[float, float], standing: int, margin: float
 ) -> tuple[str, str]:
+    from scipy import stats  # slow to import
+
     if len(wins) < _FEWEST:
         return "cannot tell", f"{len(wins)} episodes are too few"
     won, lost = int(np.sum(wins > 0)), int(np.sum(wins < 0))

@@ -1,17 +1,19 @@
 """The leaderboard under disturbances: how success and regret change with their severity.
 
-Nobody is told of the disturbance: experts plan for the nominal robot, ideal actuators and sensors. Regret is taken against
-the undisturbed optimum, so part of it no controller could avoid. Every controller meets the same draws.
+No controller knows of the disturbance: experts plan for the nominal robot with ideal actuators and sensors. Regret is
+measured against the undisturbed optimum, so no controller could avoid all of it. Every controller meets the same draws.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.randomization import Randomization
 from ballbot_train import jobs
-from ballbot_train.evaluation import evaluate
+from ballbot_train.evaluation.benchmark import episode_job
+from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ NONE = "none"
 
 
 @dataclass(frozen=True)
-class StressResult(evaluate.Result):
+class StressResult(Result):
     """An episode under a disturbance."""
 
     stress: str = NONE
@@ -78,7 +80,7 @@ class StressResult(evaluate.Result):
 
 
 @dataclass(frozen=True)
-class StressRow(evaluate.Row):
+class StressRow(Row):
     """A leaderboard row under a disturbance."""
 
     stress: str = NONE
@@ -88,6 +90,12 @@ class StressRow(evaluate.Row):
 def conditions(stresses: Sequence[str]) -> list[tuple[str, float]]:
     """(stress, level) of everything to run; the undisturbed once."""
     return [(NONE, 0.0), *((name, level) for name in stresses for level in STRESSES[name].levels)]
+
+
+def episodes_to_run(controllers: Mapping[str, Sequence[str]], stresses: Sequence[str], episodes: int) -> dict[str, int]:
+    """How many episodes `run` runs under every stress, the undisturbed first."""
+    each = sum(map(len, controllers.values())) * episodes
+    return {NONE: each} | {name: each * len(STRESSES[name].levels) for name in stresses}
 
 
 def run(
@@ -116,7 +124,7 @@ def run(
         (
             stress,
             level,
-            evaluate.episode_job(
+            episode_job(
                 task, name, physics, range(episodes), seed, _randomization(stress, level), f"{stress}-{level:g}", stress
             ),
         )
@@ -142,7 +150,7 @@ def rows_of(results: Sequence[StressResult], seed: int = 0) -> list[StressRow]:
     for result in results:
         groups.setdefault((result.stress, result.level, result.task, result.controller), []).append(result)
     return [
-        StressRow(**asdict(evaluate.summarize(group, seed)), stress=stress, level=level)
+        StressRow(**asdict(summarize(group, seed)), stress=stress, level=level)
         for (stress, level, *_), group in groups.items()
     ]
 
@@ -153,9 +161,9 @@ def curve_of(rows: Sequence[StressRow], task: str, controller: str, stress: str)
     return sorted(chosen, key=lambda row: row.level)
 
 
-def write(rows: Sequence[StressRow], results: Sequence[StressResult], about: dict[str, object], out: Path) -> None:
-    """Writes robustness.csv, robustness.json, which holds about, stresses and rows, and episodes.csv."""
+def write(rows: Sequence[StressRow], results: Sequence[StressResult], facts: Mapping[str, Any], out: Path) -> None:
+    """Writes robustness.csv, episodes.csv and robustness.json, which holds the facts as "about", stresses and rows."""
     labels = {name: stress.label for name, stress in STRESSES.items()}
-    files.write(out / "robustness.csv", evaluate.to_csv(rows))
-    files.write(out / "episodes.csv", evaluate.to_csv(results))
-    files.write(out / "robustness.json", evaluate.to_json({"about": about, "stresses": labels, "rows": rows}))
+    write_csv(out / "robustness.csv", rows)
+    write_csv(out / "episodes.csv", results)
+    files.write(out / "robustness.json", to_json({"about": facts, "stresses": labels, "rows": rows}))

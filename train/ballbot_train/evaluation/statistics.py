@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from scipy import stats
 
 Verdict = Literal["better", "worse", "cannot tell"]
 
@@ -30,9 +29,11 @@ def interval(values: Sequence[float] | np.ndarray, seed: int = 0) -> tuple[float
         return math.nan, math.nan
     if np.ptp(values) == 0:
         return float(values[0]), float(values[0])
+    from scipy import stats  # slow to import
+
     for method in ("BCa", "percentile"):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of degenerate data, which is looked for below
+            warnings.simplefilter("ignore")  # degenerate data make SciPy warn; they are looked for below
             result = stats.bootstrap(
                 (values,),
                 np.mean,
@@ -47,7 +48,7 @@ def interval(values: Sequence[float] | np.ndarray, seed: int = 0) -> tuple[float
 
 
 def verdict(low: float, high: float, margin: float) -> Verdict:
-    """What an interval of a difference says of which more is better; less than the margin is no difference."""
+    """What the interval of a difference says where more is better; differences up to the margin decide nothing."""
     if low > margin:
         return "better"
     if high < -margin:

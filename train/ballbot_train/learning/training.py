@@ -29,13 +29,14 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
-from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import Task
-from ballbot_train.console import about, console, progress_bar
+from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
+from ballbot_train.provenance import provenance
 
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
 
@@ -99,31 +100,16 @@ def score(network: PolicyNetwork, task: Task) -> Score:
     """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
     episodes = certified.load(task)
     batch = BallbotBatch(task, len(episodes), compile=False)
-    observation = batch.reset(
-        seed=0,
-        x=torch.as_tensor(episodes.states.T, dtype=batch.dtype),
-        c=torch.as_tensor(episodes.constants.T, dtype=batch.dtype),
-    )
-    cost = torch.zeros(len(episodes), dtype=torch.float64)
-    running = torch.ones(len(episodes), dtype=torch.bool)
-    success, failure = torch.zeros_like(running), torch.zeros_like(running)
-    with torch.no_grad():
-        for _ in range(task.steps):
-            result = batch.step(network(observation))
-            cost -= torch.where(running, result.reward, 0.0)
-            success |= running & result.success
-            failure |= running & result.failure
-            running &= ~(result.terminated | result.truncated)
-            observation = result.observation
-    ratio = cost.numpy() / episodes.costs
-    priced = np.where(success.numpy(), ratio, np.maximum(ratio, task.failure_cost / episodes.costs))
-    standing = ratio[~failure.numpy()] - 1
+    run = run_episodes(batch, network, episodes.states, episodes.constants)
+    ratio = run.cost.numpy() / episodes.costs
+    priced = np.where(run.success.numpy(), ratio, np.maximum(ratio, task.failure_cost / episodes.costs))
+    standing = ratio[~run.failure.numpy()] - 1
     return Score(
         cost_ratio=float(priced.mean()),
         regret_mean=float(standing.mean()) if standing.size else math.nan,
         regret_median=float(np.median(standing)) if standing.size else math.nan,
-        success=float(success.double().mean()),
-        failures=int(failure.sum()),
+        success=float(run.success.double().mean()),
+        failures=int(run.failure.sum()),
     )
 
 
@@ -191,7 +177,7 @@ class _Run:
             differing = [key for key in self.config if old.get(key) != json.loads(json.dumps(self.config[key]))]
             if differing:
                 raise ValueError(f"{out} holds a run with another {', '.join(differing)}; give another --out")
-        files.write(written, json.dumps(self.config | {"about": about()}, indent=1) + "\n")
+        files.write(written, json.dumps(self.config | {"about": provenance()}, indent=1) + "\n")
         if (out / "checkpoint.pt").exists():
             state = self._load_checkpoint()
             self.seconds, self.best, self.rows = state["seconds"], state["best"], state["rows"]

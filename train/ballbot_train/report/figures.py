@@ -7,12 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")  # files only: no display needed
-
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import patches
+from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
@@ -20,31 +17,12 @@ from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.basins import AXES, BasinMap
-from ballbot_train.evaluation.evaluate import Result
+from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.robustness import NONE, STRESSES, StressRow, curve_of
+from ballbot_train.report.labels import COLORS as COLORS
+from ballbot_train.report.labels import LABELS, color, label
 
-COLORS = {
-    "lqr": "#c0392b",
-    "trajopt": "#1f6fb2",
-    "nmpc": "#e08a00",
-    "bc": "#8d6e63",
-    "dagger": "#34495e",
-    "ppo": "#2e8b57",
-    "sac": "#17a2b8",
-    "shac": "#8e44ad",
-}
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
-_OTHER_COLORS = ("#6b8e23", "#b9770e", "#5d6d7e", "#d35479")
-LABELS = {
-    "lqr": "LQR",
-    "trajopt": "trajectory optimization + TVLQR",
-    "nmpc": "NMPC",
-    "bc": "behaviour cloning",
-    "dagger": "DAgger",
-    "ppo": "PPO",
-    "sac": "SAC",
-    "shac": "SHAC",
-}
 
 
 @dataclass(frozen=True)
@@ -59,7 +37,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Circle:
-    """Something round on the ground path: an obstacle if filled, else a line to follow; metres."""
+    """A circle on the ground path, m: an obstacle if filled, else a line to follow."""
 
     x: float
     y: float
@@ -69,13 +47,13 @@ class Circle:
 
 
 def marker_circles(markers: Sequence[Marker]) -> list[Circle]:
-    """What a task draws besides the robot, seen from above."""
+    """The markers of a task as circles, seen from above."""
     return [Circle(*marker.position, marker.radius, not marker.ring, marker.color[:3]) for marker in markers]
 
 
 def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Circle] = ()) -> Figure:
     """The paper's form: position, velocity and lean over time, forces over time, and the ground path."""
-    figure = plt.figure(figsize=(12, 6.2), layout="constrained")
+    figure = Figure(figsize=(12, 6.2), layout="constrained")
     figure.suptitle(title, fontsize=13)
     axes = figure.subplot_mosaic(
         [["position", "velocity", "path"], ["lean", "force", "path"]], width_ratios=[1, 1, 1.25]
@@ -100,8 +78,8 @@ def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Cir
                 )
         _plot_forces(axes["force"], curve)
         axes["path"].plot(x[:, 0], x[:, 1], curve.style, color=curve.color, lw=2, label=curve.label)
-    for key, (label, *_rest) in panels.items():
-        axes[key].set_ylabel(label)
+    for key, (y_label, *_rest) in panels.items():
+        axes[key].set_ylabel(y_label)
     axes["force"].set_ylabel("force, N")
     for key in ("lean", "force"):
         axes[key].set_xlabel("time, s")
@@ -120,11 +98,14 @@ def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Cir
 
 
 def regret_curves(results: Sequence[Result], task: str) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Of each controller on a task the regrets that it reaches (n,), in % and ascending, and the share of episodes within."""
+    """For each controller on a task: its name, its regrets (n,) in ascending order, %, and the share of episodes, %.
+
+    The k-th share is the share of episodes that end within the k-th regret.
+    """
     curves = []
     for controller in dict.fromkeys(result.controller for result in results if result.task == task):
         group = [result for result in results if (result.task, result.controller) == (task, controller)]
-        # success, not only standing: an episode that misses its goal has no regret worth the name
+        # an episode that stands but misses its goal has no meaningful regret
         regrets = np.sort([max(100 * result.regret, _LEAST_REGRET) for result in group if result.success])
         curves.append((controller, regrets, 100 * np.arange(1, len(regrets) + 1) / len(group)))
     return curves
@@ -133,7 +114,8 @@ def regret_curves(results: Sequence[Result], task: str) -> list[tuple[str, np.nd
 def regret_figure(results: Sequence[Result]) -> Figure:
     """For every task, the share of episodes that each controller finishes within a given regret."""
     tasks = list(dict.fromkeys(result.task for result in results))
-    figure, axes = plt.subplots(1, len(tasks), figsize=(4.2 * len(tasks), 3.8), layout="constrained", squeeze=False)
+    figure = Figure(figsize=(4.2 * len(tasks), 3.8), layout="constrained")
+    axes = figure.subplots(1, len(tasks), squeeze=False)
     for axis, task in zip(axes[0], tasks, strict=True):
         for i, (controller, regrets, share) in enumerate(regret_curves(results, task)):
             axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=label(controller))
@@ -156,15 +138,8 @@ def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
     """
     stresses = list(dict.fromkeys(row.stress for row in rows if row.stress != NONE))
     controllers = list(dict.fromkeys(row.controller for row in rows if row.task == task))
-    figure, axes = plt.subplots(
-        2,
-        len(stresses),
-        figsize=(2.9 * len(stresses), 5.6),
-        layout="constrained",
-        squeeze=False,
-        sharey="row",
-        sharex="col",
-    )
+    figure = Figure(figsize=(2.9 * len(stresses), 5.6), layout="constrained")
+    axes = figure.subplots(2, len(stresses), squeeze=False, sharey="row", sharex="col")
     figure.suptitle(f"{task}: success and regret under disturbances", fontsize=13)
     for i, stress in enumerate(stresses):
         above, below = axes[:, i]
@@ -191,17 +166,11 @@ def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
 
 
 def basin_figure(maps: Sequence[BasinMap]) -> Figure:
-    """From where each controller recovers, coloured; from where anything could, grey, with its boundary on top."""
+    """The initial states from which each controller recovers, coloured, on those that the force limit allows, grey."""
     controllers = list(maps[0].recovered)
-    figure, axes = plt.subplots(
-        len(maps),
-        len(controllers),
-        figsize=(max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps)),
-        layout="constrained",
-        squeeze=False,
-        sharex=True,
-        sharey="row",
-    )
+    size = (max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(maps), len(controllers), squeeze=False, sharex=True, sharey="row")
     figure.suptitle("Stabilize: initial states from which the robot comes to rest at the origin", fontsize=13)
     for basin, line in zip(maps, axes, strict=True):
         for k, (controller, axis) in enumerate(zip(controllers, line, strict=True)):
@@ -222,33 +191,21 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
     return figure
 
 
-def add_circles(axis: plt.Axes, circles: Sequence[Circle]) -> None:
+def add_circles(axis: Axes, circles: Sequence[Circle]) -> None:
     """Draws circles on a ground path, below everything else."""
     for circle in circles:
         line = "-" if circle.filled else "--"
-        shape = plt.Circle(
+        shape = patches.Circle(
             (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
         )
         axis.add_patch(shape).set_zorder(0)
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Writes a PNG and closes the figure."""
+    """Writes a figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    plt.close(figure)
     return files.write(path, buffer.getvalue())
-
-
-def color(controller: str, i: int) -> str:
-    """A controller's colour, the same in every figure."""
-    return COLORS.get(controller, _OTHER_COLORS[i % len(_OTHER_COLORS)])
-
-
-def label(controller: str) -> str:
-    """What a controller is called in figures; a policy file goes by its name."""
-    stem = Path(controller).stem
-    return LABELS.get(stem, stem)
 
 
 def _folded(text: str) -> str:
@@ -263,7 +220,7 @@ def _alpha(i: int) -> float:
     return 1.0 if i == 0 else 0.8
 
 
-def _plot_forces(axis: plt.Axes, curve: Curve) -> None:
+def _plot_forces(axis: Axes, curve: Curve) -> None:
     trajectory = curve.trajectory
     for i in range(2):
         style, common = _component_style(curve, i), {"color": curve.color, "lw": 1.2, "alpha": _alpha(i)}
@@ -273,7 +230,7 @@ def _plot_forces(axis: plt.Axes, curve: Curve) -> None:
             axis.plot(trajectory.t, trajectory.u[:, i], style, **common)
 
 
-def _finish_path(axis: plt.Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
+def _finish_path(axis: Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
     add_circles(axis, circles)
     start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
     axis.plot(*start[:2], "o", color="k", ms=5)

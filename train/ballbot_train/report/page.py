@@ -1,28 +1,34 @@
 """One self-contained HTML page: tables that sort, figures, curves, and a replay in 3D.
 
-A page is a list of `Section`s; whatever makes a section plugs in. Everything is embedded, Plotly's JavaScript included,
-so the file opens offline and can be moved. What is drawn in the page's own scripts is in `page/`.
+A page is a list of `Section`s. Everything is embedded, Plotly's JavaScript included, so the file opens offline and can be
+moved. The templates, scripts and styles are in `assets/`. The templates escape all text.
 """
 
+from __future__ import annotations
+
 import base64
-import html
+import functools
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import jinja2
 import numpy as np
-import plotly.graph_objects
-import plotly.offline
-from plotly.utils import PlotlyJSONEncoder
+from markupsafe import Markup
 
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.report.replay import Replay, Take
 
-_PAGE = Path(__file__).parent / "page"
-_REPLAY_DT = 0.02  # s, between the states that the page holds
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
+_ASSETS = Path(__file__).parent / "assets"
+_WORD_COLUMNS = 2  # of a table: the first columns hold words, the others hold numbers
+_REPLAY_DT = 0.02  # s, between the states in the page
 
 
 @dataclass(frozen=True)
@@ -30,12 +36,12 @@ class Section:
     """A part of the page."""
 
     title: str
-    body: str
-    """HTML."""
+    body: Markup | str
+    """HTML if it is a `Markup`; a plain string is text, and is escaped."""
     lead: str = ""
-    """A sentence or two above it, plain text."""
+    """One or two sentences above the body, plain text."""
     scripts: tuple[str, ...] = ()
-    """What it needs: "plotly", and files of `page/`."""
+    """The scripts that the body needs: "plotly", and names of files in `assets/`."""
 
 
 @dataclass(frozen=True)
@@ -64,82 +70,60 @@ class Panel:
     log_y: bool = False
 
 
-def write_report(title: str, sections: Iterable[Section | None], about: Mapping[str, object], path: Path) -> Path:
+def write_report(title: str, sections: Iterable[Section | None], facts: Mapping[str, object], path: Path) -> Path:
     """Writes the page.
 
     Args:
-        title: its heading.
-        sections: in their order; None, for what has no data, is left out.
-        about: what the results depend on, for the foot of the page.
-        path: of the file.
+        title: heading of the page.
+        sections: the parts in their order; a part without data is None and is left out.
+        facts: what the results depend on, such as versions; shown at the foot of the page.
+        path: path of the file.
+
+    Returns:
+        path.
     """
-    parts = [section for section in sections if section is not None]
-    scripts = list(dict.fromkeys(name for section in parts for name in section.scripts))
-    if "plotly" in scripts:
-        scripts = ["plotly", *(name for name in scripts if name != "plotly")]  # the others call it
-    links = "".join(f'<a href="#section-{i}">{html.escape(part.title)}</a>' for i, part in enumerate(parts))
-    facts = ", ".join(f"{html.escape(key)}: {html.escape(str(value))}" for key, value in about.items())
-    page = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<link rel="icon" href="data:,"><title>{html.escape(title)}</title>'
-        f"<style>{(_PAGE / 'style.css').read_text()}</style>"
-        f"{_script(scripts[0]) if scripts[:1] == ['plotly'] else ''}</head><body>"
-        f"<header><h1>{html.escape(title)}</h1><nav>{links}</nav></header>"
-        f"<main>{''.join(_section(i, part) for i, part in enumerate(parts))}</main><footer>{facts}</footer>"
-        f"{''.join(_script(name) for name in scripts if name != 'plotly')}</body></html>\n"
+    shown = [section for section in sections if section is not None]
+    names = dict.fromkeys(name for section in shown for name in section.scripts)
+    page = _render(
+        "page.html.j2",
+        title=title,
+        sections=shown,
+        facts=facts,
+        style=_asset("style.css"),
+        plotly=_plotly_script() if "plotly" in names else None,
+        scripts=[_asset(name) for name in names if name != "plotly"],
     )
     return files.write(path, page)
 
 
 def table_section(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], lead: str = "") -> Section:
-    """A table that sorts by the column pressed; its first two columns are words, and the first can be filtered."""
-
-    def cell(tag: str, i: int, content: str) -> str:
-        return f"<{tag}{' class=word' if i < 2 else ''}>{content}</{tag}>"
-
-    heads = "".join(
-        cell("th", i, f'<button type="button">{html.escape(name)}</button>') for i, name in enumerate(header)
-    )
-    body = "".join(
-        "<tr>" + "".join(cell("td", i, html.escape(text)) for i, text in enumerate(row)) + "</tr>" for row in rows
-    )
-    table = f'<table class="sortable"><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>'
-    return Section(title, f'<div class="scroll">{table}</div>', lead, ("table.js",))
+    """A table that the reader can sort by any column, and filter by the words of its first column."""
+    table = _render("table.html.j2", header=header, rows=rows, word_columns=_WORD_COLUMNS)
+    return Section(title, table, lead, ("table.js",))
 
 
 def pictures_section(title: str, pictures: Iterable[Path], lead: str = "") -> Section | None:
-    """Embedded PNGs one under another, captioned with their names; None where there are none."""
-    figures = "".join(
-        f'<figure><div class="scroll"><img alt="{html.escape(picture.stem)}" src="data:image/png;base64,'
-        f'{base64.b64encode(picture.read_bytes()).decode()}"></div>'
-        f"<figcaption>{html.escape(picture.stem.replace('-', ' '))}</figcaption></figure>"
-        for picture in pictures
-    )
-    return Section(title, f'<div class="pictures">{figures}</div>', lead) if figures else None
+    """Embedded PNGs one under another, captioned with their names; None if there are none."""
+    shown = [{"name": path.stem, "base64": base64.b64encode(path.read_bytes()).decode()} for path in pictures]
+    return Section(title, _render("pictures.html.j2", pictures=shown), lead) if shown else None
 
 
 def folder_section(title: str, folder: Path, lead: str = "") -> Section | None:
-    """The PNGs that another command left in a folder; None where there are none."""
+    """The PNGs in a folder that another command has written; None if there are none."""
     return pictures_section(title, sorted(folder.glob("*.png")), lead)
 
 
 def curves_section(title: str, panels: Sequence[Panel], lead: str = "") -> Section | None:
-    """Curves that can be zoomed and read off: robustness, learning, shares of episodes; None where there are none."""
+    """Curves that the reader can zoom and read off, under one legend; None if there are no panels."""
     if not panels:
         return None
-    figures = "".join(f'<div class="curves">{_json_script(_panel(panel).to_plotly_json())}</div>' for panel in panels)
-    labels = dict.fromkeys((line.label, line.color) for panel in panels for line in panel.lines)
-    legend = "".join(
-        f'<span><i style="background:{html.escape(color)}"></i>{html.escape(label)}</span>' for label, color in labels
-    )
-    return Section(
-        title, f'<div class="legend">{legend}</div><div class="panels">{figures}</div>', lead, ("plotly", "curves.js")
-    )
+    legend = dict.fromkeys((line.label, line.color) for panel in panels for line in panel.lines)
+    figures = [_panel(panel).to_plotly_json() for panel in panels]
+    return Section(title, _render("curves.html.j2", legend=legend, panels=figures), lead, ("plotly", "curves.js"))
 
 
 def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Section | None:
-    """Episodes in 3D, one scene per take, with play, pause, scrubbing and traces; None where there are none."""
+    """Episodes in 3D, one scene for each take, with play, pause and scrubbing; None if there are no takes."""
     replays = [replay for replay in replays if replay.takes]
     if not replays:
         return None
@@ -149,40 +133,50 @@ def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Sec
         "robot": {name: getattr(robot, name) for name in sizes},
         "episodes": [_replay_data(replay) for replay in replays],
     }
-    body = (
-        '<div class="replay"><div class="filter episodes"></div><div class="controls">'
-        '<button type="button" class="play">Play</button>'
-        '<input type="range" class="scrub" min="0" max="1" step="0.01" value="0" aria-label="time">'
-        '<span class="clock">0.00 s</span>'
-        '<label>speed <select class="speed"><option value="0.25">¼</option><option value="0.5">½</option>'
-        '<option value="1" selected>1</option><option value="2">2</option></select></label>'
-        '<label><input type="checkbox" class="follow" checked> follow</label>'
-        '<label><input type="checkbox" class="link" checked> link cameras</label></div>'
-        '<div class="stages"></div><div class="panels"><div class="tilts"></div><div class="forces"></div></div>'
-        f"{_json_script(data)}</div>"
+    return Section(title, _render("replay.html.j2", data=data), lead, ("plotly", "replay.js"))
+
+
+@functools.cache
+def _templates() -> jinja2.Environment:
+    """The templates of `assets/`, which escape every string that is not a `Markup`."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_ASSETS),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    return Section(title, body, lead, ("plotly", "replay.js"))
+    environment.policies["json.dumps_function"] = _json
+    environment.policies["json.dumps_kwargs"] = {}
+    return environment
 
 
-def _section(i: int, section: Section) -> str:
-    lead = f'<p class="lead">{html.escape(section.lead)}</p>' if section.lead else ""
-    return f'<section id="section-{i}"><h2>{html.escape(section.title)}</h2>{lead}{section.body}</section>'
+def _render(template: str, **values: object) -> Markup:
+    return Markup(_templates().get_template(template).render(values))
 
 
-def _script(name: str) -> str:
-    text = plotly.offline.get_plotlyjs() if name == "plotly" else (_PAGE / name).read_text()
-    # its names stay its own
-    return f"<script>{text}</script>" if name == "plotly" else f"<script>(() => {{\n{text}\n}})();</script>"
+def _asset(name: str) -> Markup:
+    """The text of one of this package's own scripts or styles."""
+    return Markup((_ASSETS / name).read_text(encoding="utf-8"))
 
 
-def _json_script(data: object) -> str:
-    """Data for a page's script to read."""
-    text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, cls=PlotlyJSONEncoder).replace("<", "\\u003c")
-    return f'<script type="application/json">{text}</script>'
+def _plotly_script() -> Markup:
+    import plotly.offline
+
+    return Markup(plotly.offline.get_plotlyjs())
 
 
-def _panel(panel: Panel) -> plotly.graph_objects.Figure:
-    figure = plotly.graph_objects.Figure(layout_template="none")
+def _json(data: object) -> str:
+    """Compact JSON of figures and replays; the template's `tojson` escapes it afterwards."""
+    from plotly.utils import PlotlyJSONEncoder
+
+    return json.dumps(data, separators=(",", ":"), ensure_ascii=False, cls=PlotlyJSONEncoder)
+
+
+def _panel(panel: Panel) -> Figure:
+    from plotly.graph_objects import Figure
+
+    figure = Figure(layout_template="none")
     for line in panel.lines:
         if line.low is not None and line.high is not None:
             outline = np.concatenate([line.x, np.asarray(line.x)[::-1]])

@@ -1,11 +1,13 @@
-"""The ballbot in perspective, drawn with matplotlib's polygons: clean lines at any size, and ghosts that shine through.
+"""The ballbot in perspective, drawn with polygons of matplotlib, so that lines are clean and ghosts are translucent.
 
-A sphere is a circle, and a cylinder the hull of its two end circles; what is farther from the camera is painted first.
+A sphere is drawn as a circle, and a cylinder as the hull of its two end circles. Bodies far from the camera are painted
+first.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +25,7 @@ _YAW, _PITCH, _DISTANCE = (
 )  # rad, rad, m: from behind a robot that moves along x
 _HALF_HEIGHT = 0.42  # of the view, as a tangent
 _AIM_HEIGHT = 0.55  # m above the floor
-_NEAR = 0.4  # m: what is closer to the camera's plane is not drawn
+_NEAR = 0.4  # m: points closer to the camera's plane are not drawn
 _FLOOR_REACH = 12  # m
 _LIGHT = np.array([-0.45, -0.55, 1.0]) / math.sqrt(0.45**2 + 0.55**2 + 1)  # towards the light
 _BALL = (0.16, 0.18, 0.23)
@@ -31,10 +33,13 @@ _FORCE = (0.85, 0.1, 0.55)
 _FORCE_SCALE = 1 / 400  # m/N of the arrow
 _ANGLES = np.linspace(0, 2 * math.pi, 28, endpoint=False)
 
+Rgb = tuple[float, float, float]
+Rgba = tuple[float, float, float, float]
+
 
 @dataclass(frozen=True)
 class Robot:
-    """A ballbot to draw: state x (8,), force u (2,) N if it is to be seen, colour, and opacity."""
+    """A ballbot to draw: state x (8,), colour, force u (2,), N, or None to draw no arrow, and opacity."""
 
     x: np.ndarray
     color: str
@@ -52,7 +57,7 @@ class GroundPath:
 
 
 class Camera:
-    """Looks at a point from the side and above; x and y of a picture are tangents of angles from its middle."""
+    """A camera that looks at a point from the side and above. Picture coordinates are tangents of angles from the middle."""
 
     def __init__(self, target: np.ndarray, distance: float = _DISTANCE):
         """Args: target (3,) and the distance from it, m."""
@@ -62,14 +67,14 @@ class Camera:
         self._axes = np.stack([right, np.cross(right, ahead), ahead])
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(..., 2) places in the picture of points (..., 3), and (...) their depths, m, at least `_NEAR`."""
+        """Projects points (..., 3), m, to picture coordinates (..., 2), and depths (...), m, of at least `_NEAR`."""
         seen = (np.asarray(points, np.float64) - self.eye) @ self._axes.T
         depth = np.maximum(seen[..., 2], _NEAR)
         return seen[..., :2] / depth[..., None], depth
 
 
-class Sketch:
-    """Robots, paths and markers on a chequered floor, in one axes, drawn anew for every frame."""
+class PerspectiveView:
+    """One axes with robots, paths and markers on a chequered floor. Each call of `draw` replaces its contents."""
 
     def __init__(self, axis: Axes, params: BallbotParams, markers: Sequence[Marker], aspect: float):
         """Args: aspect is the axes' width over its height."""
@@ -80,24 +85,26 @@ class Sketch:
         axis.set_facecolor("#fbfbfa")
         for spine in axis.spines.values():
             spine.set_color("0.85")
-        self._floor = axis.add_collection(PolyCollection([], lw=0))
-        self._lines = axis.add_collection(LineCollection([], capstyle="round"))
-        self._solids = axis.add_collection(PolyCollection([], lw=0.3))
-        self._solids.set_snap(False)  # else upright thin things get wavy edges
+        self._floor = PolyCollection([], lw=0)
+        self._lines = LineCollection([], capstyle="round")
+        self._solids = PolyCollection([], lw=0.3)
+        for collection in (self._floor, self._lines, self._solids):
+            axis.add_collection(collection)
+        self._solids.set_snap(False)  # snapping makes the edges of thin upright bodies wavy
         self.artists = (self._floor, self._lines, self._solids)
 
-    def show(
+    def draw(
         self,
         middle: np.ndarray,
         robots: Sequence[Robot],
         paths: Sequence[GroundPath] = (),
         zoom_out: float = 0.0,
     ) -> None:
-        """Replaces what is drawn; the camera looks at the middle (2,), m, from `zoom_out` m farther than usual."""
+        """Draws robots and paths; the camera looks at the ground point `middle` (2,), m, from `zoom_out` m farther away."""
         camera = Camera(np.array([*middle, _AIM_HEIGHT]), _DISTANCE + zoom_out)
-        self._show_floor(camera, middle)
-        self._show_lines(camera, paths)
-        solids = [(0.0, _shadow(camera, self._params, robot)) for robot in robots]  # nearest of all to the floor
+        self._draw_floor(camera, middle)
+        self._draw_lines(camera, paths)
+        solids = [(0.0, _shadow(camera, self._params, robot)) for robot in robots]  # shadows lie under all bodies
         bodies = [_marker(camera, marker) for marker in self._markers if not marker.ring]
         for robot in robots:
             bodies += _robot(camera, self._params, robot)
@@ -107,8 +114,8 @@ class Sketch:
         self._solids.set_facecolor([color for _, color in faces])
         self._solids.set_edgecolor([color if color[3] == 1 else (0, 0, 0, 0) for _, color in faces])
 
-    def _show_floor(self, camera: Camera, middle: np.ndarray) -> None:
-        """Every other square metre, fading into the distance."""
+    def _draw_floor(self, camera: Camera, middle: np.ndarray) -> None:
+        """Draws every other square metre, paler with the distance."""
         low = np.floor(middle).astype(int) - _FLOOR_REACH
         i, j = np.meshgrid(*(np.arange(start, start + 2 * _FLOOR_REACH + 1) for start in low), indexing="ij")
         dark = (i + j) % 2 == 0
@@ -118,11 +125,13 @@ class Sketch:
         places, depth = camera.project(corners)
         seen = (depth > _NEAR).all(axis=1)
         fade = np.clip(1 - depth[seen].mean(axis=1) / (_FLOOR_REACH + 2), 0, 1)
-        self._floor.set_verts(places[seen])
+        self._floor.set_verts(list(places[seen]))
         self._floor.set_facecolor([(0.80, 0.83, 0.88, 0.8 * share) for share in fade])
 
-    def _show_lines(self, camera: Camera, paths: Sequence[GroundPath]) -> None:
-        lines = [(path.points, to_rgb(path.color), "--" if path.dashed else "-", 2.2) for path in paths]
+    def _draw_lines(self, camera: Camera, paths: Sequence[GroundPath]) -> None:
+        lines: list[tuple[np.ndarray, Sequence[float], Any, float]] = [
+            (path.points, to_rgb(path.color), "--" if path.dashed else "-", 2.2) for path in paths
+        ]
         for marker in self._markers:
             if marker.ring:
                 around = marker.radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
@@ -132,7 +141,7 @@ class Sketch:
         for points, color, style, width in lines:
             places, depth = camera.project(np.column_stack([points, np.full(len(points), 0.004)]))
             for run in np.split(np.arange(len(places)), np.flatnonzero(np.diff(depth <= _NEAR)) + 1):
-                if depth[run[0]] > _NEAR:  # the part before the camera
+                if depth[run[0]] > _NEAR:  # only the part in front of the camera
                     segments.append(places[run])
                     colors.append(color)
                     styles.append(style)
@@ -143,12 +152,12 @@ class Sketch:
         self._lines.set_linewidth(widths)
 
 
-Face = tuple[np.ndarray, tuple[float, ...]]
+Face = tuple[np.ndarray, Rgba]
 """A polygon (n, 2) of the picture and its colour, RGBA."""
 
 
 def body_axis(x: np.ndarray) -> np.ndarray:
-    """(3,) along the body of state x (8,), upwards."""
+    """(3,) the upward unit vector along the body in state x (8,)."""
     gamma, theta = x[2], x[3]
     return np.array(
         [math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)],
@@ -174,11 +183,11 @@ def _marker(camera: Camera, marker: Marker) -> tuple[float, list[Face]]:
     depth, faces = _cylinder(
         camera, foot, foot + np.array([0, 0, marker.height]), marker.radius, marker.color[:3], marker.color[3]
     )
-    return (math.inf if marker.height < 0.05 else depth), faces  # a disc lies under everything
+    return (math.inf if marker.height < 0.05 else depth), faces  # a disc is painted first
 
 
 def _shadow(camera: Camera, params: BallbotParams, robot: Robot) -> list[Face]:
-    """What the body and ball keep the light from."""
+    """The shadow of ball and body on the floor."""
     ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
     top = ball + (params.com_height + params.body_length / 2) * body_axis(robot.x)
     ring = params.ball_radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES], axis=1)
@@ -208,21 +217,21 @@ def _cylinder(
     rings = [camera.project(end + radius * normals)[0] for end in (low, high)]
     (_,), (depth,) = camera.project((low + high)[None] / 2)
     faces: list[Face] = [(_hull(np.concatenate(rings)), (*_shaded(color, 0.2), alpha))]
-    if alpha == 1:  # through translucent sides the inner edges would be seen
+    if alpha == 1:  # the inner edges would show through translucent sides
         for k in range(len(normals)):
             after = (k + 1) % len(normals)
             normal = normals[k] + normals[after]
             if normal @ (camera.eye - low) > 2 * radius:
                 side = np.array([rings[0][k], rings[0][after], rings[1][after], rings[1][k]])
-                faces.append((side, (*_shaded(color, normal @ _LIGHT / np.linalg.norm(normal)), 1.0)))
+                faces.append((side, (*_shaded(color, float(normal @ _LIGHT / np.linalg.norm(normal))), 1.0)))
     for end, ring, outward in ((low, rings[0], -axis), (high, rings[1], axis)):
         if outward @ (camera.eye - end) > 0:
-            faces.append((ring, (*_shaded(color, 0.3 + outward @ _LIGHT), alpha)))
+            faces.append((ring, (*_shaded(color, float(0.3 + outward @ _LIGHT)), alpha)))
     return depth, faces
 
 
 def _arrow(camera: Camera, start: np.ndarray, vector: np.ndarray, alpha: float) -> tuple[float, list[Face]]:
-    """A level arrow, m."""
+    """A horizontal arrow from `start` along `vector`, m."""
     length = float(np.hypot(*vector))
     along, head = np.array([*vector, 0.0]) / length, min(0.16, length)
     aside = np.array([-along[1], along[0], 0.0])
@@ -246,12 +255,13 @@ def _hull(points: np.ndarray) -> np.ndarray:
     return points[ConvexHull(points, qhull_options="QJ").vertices]
 
 
-def _shaded(color: Sequence[float], light: float) -> tuple[float, ...]:
-    """From dim, where the light does not reach, to bright."""
+def _shaded(color: Sequence[float], light: float) -> Rgb:
+    """The colour, darker or lighter by the `light` that falls on it, 0 to 1."""
     return _lighter(color, -0.2 + 0.45 * min(max(light, 0.0), 1.0))
 
 
-def _lighter(color: Sequence[float], share: float) -> tuple[float, ...]:
-    """Mixed with white, or with black where share < 0."""
+def _lighter(color: Sequence[float], share: float) -> Rgb:
+    """The colour mixed with white, or with black if share < 0."""
     target = 1.0 if share > 0 else 0.0
-    return tuple(float(value + abs(share) * (target - value)) for value in color)
+    red, green, blue = (float(value + abs(share) * (target - value)) for value in color)
+    return red, green, blue

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_train.evaluation.evaluate import Result
-from ballbot_train.report import figures
+from ballbot_train.evaluation.results import Result
+from ballbot_train.report import figures, labels
 from ballbot_train.report.page import (
     Line,
     Panel,
@@ -84,7 +84,7 @@ def regret_section(results: Sequence[Result]) -> Section | None:
     for task in dict.fromkeys(result.task for result in results):
         lines = []
         for i, (name, regrets, share) in enumerate(figures.regret_curves(results, task)):
-            lines.append(Line(figures.label(name), regrets, share, figures.color(name, i), steps=True))
+            lines.append(Line(labels.label(name), regrets, share, labels.color(name, i), steps=True))
         panels.append(Panel(task, "cost above the optimum, %", "episodes that succeed, %", lines, log_x=True))
     lead = "The higher and the farther left, the better. A curve ends at the share of episodes that succeed."
     return curves_section("How close to the optimum", panels, lead)
@@ -104,8 +104,8 @@ def learning_section(runs: Path) -> Section | None:
         finite = np.array([point for point in points if np.isfinite(point).all()]).reshape(-1, 2)
         learner = str(described.get("learner"))
         again = any(line.label.startswith(f"{learner}:") for line in lines)
-        shade = figures.color("" if again else learner, len(lines))
-        lines.append(Line(f"{learner}: {path.parent.name}", *finite.T, shade))
+        shade = labels.color("" if again else learner, len(lines))
+        lines.append(Line(f"{learner}: {path.parent.name}", finite[:, 0], finite[:, 1], shade))
     panels = [
         Panel(task, "training, s", "regret, %", [line for line in lines if len(line.x)], log_y=True)
         for task, lines in tasks.items()

@@ -20,17 +20,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial import KDTree
 
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.tvlqr import TvlqrController
-from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.paths import then_stay
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.base import then_stay
 from ballbot_train.learning import schedules
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
@@ -273,19 +272,12 @@ class Dagger:
             States (steps+1, B, 8); whether the episode had ended by then (steps+1, B), so that the state has no meaning;
             and whether it failed (B,).
         """
-        task = replace(self._task, duration=(steps + 1) * self._task.control_dt)
+        task = replace(self._task, duration=steps * self._task.control_dt)
         batch = BallbotBatch(task, len(x), compile=False, params=self._params)
-        begin = (torch.as_tensor(part.T, dtype=batch.dtype) for part in (x, c))
-        observation = batch.reset(0, None, *begin)
-        history, over, failed = [x], [np.zeros(len(x), bool)], np.zeros(len(x), bool)
-        with torch.no_grad():
-            for _ in range(steps):
-                result = batch.step(self.network(observation))
-                observation = result.observation
-                failed |= result.failure.numpy() & ~over[-1]
-                over.append(over[-1] | result.terminated.numpy())
-                history.append(result.final_x.T.double().numpy())
-        return np.array(history), np.array(over), failed
+        run = run_episodes(batch, self.network, x, c, record=True)
+        history = np.concatenate([x[None], run.states.transpose(1, 2).double().numpy()])
+        over = (np.arange(steps + 1)[:, None] >= run.steps.numpy()) & run.terminated.numpy()
+        return history, over, run.failure.numpy()
 
     def _labelled(
         self, plan: Optimum, gains: np.ndarray, c: np.ndarray, cost: float, rng: np.random.Generator

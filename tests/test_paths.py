@@ -1,0 +1,55 @@
+"""Ground paths: they start and end as asked, and they are the same numbers as their formulas written out."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ballbot_gym.paths import catmull_rom, cubic, hermite_basis, then_stay
+
+
+def test_basis_is_that_of_cubic_hermite_splines():
+    spline = pytest.importorskip("scipy.interpolate").CubicHermiteSpline
+    s = np.linspace(0, 1, 11)
+    for i, polynomial in enumerate(hermite_basis(s)):
+        values, slopes = np.zeros(2), np.zeros(2)
+        (slopes if i % 2 else values)[i // 2] = 1.0
+        np.testing.assert_allclose(polynomial, spline([0, 1], values, slopes)(s), atol=1e-15)
+
+
+def test_interpolated_values_are_bit_by_bit_those_of_the_formula_written_out(rng):
+    s, (p0, v0, p1, v1), duration = np.linspace(0, 1, 41)[:, None], rng.normal(size=(4, 2)), 40 * 0.02
+    expected = (
+        (1 + 2 * s) * (1 - s) ** 2 * p0
+        + s * (1 - s) ** 2 * duration * v0
+        + s**2 * (3 - 2 * s) * p1
+        + s**2 * (s - 1) * duration * v1
+    )
+    np.testing.assert_array_equal(cubic(p0, v0, p1, v1, 40, 0.02), expected)
+
+
+def test_cubic_has_the_positions_and_velocities_asked_for_at_its_ends(rng):
+    p0, v0, p1, v1 = rng.normal(size=(4, 2))
+    dt = 1e-5
+    path = cubic(p0, v0, p1, v1, 100_000, dt)
+    np.testing.assert_array_equal(path[[0, -1]], [p0, p1])
+    np.testing.assert_allclose((path[[1, -1]] - path[[0, -2]]) / dt, [v0, v1], atol=1e-3)
+
+
+def test_curve_through_knots_meets_them_is_flat_at_its_ends_and_has_no_kinks():
+    knots_x, knots_y, h = np.array([0.0, 1.0, 2.5, 4.0]), np.array([0.0, 1.0, -1.0, 0.5]), 1e-6
+    np.testing.assert_allclose(catmull_rom(knots_x, knots_y, knots_x), knots_y, atol=1e-15)
+    before = (knots_y[1:] - catmull_rom(knots_x, knots_y, knots_x[1:] - h)) / h
+    after = (catmull_rom(knots_x, knots_y, knots_x[:-1] + h) - knots_y[:-1]) / h
+    np.testing.assert_allclose([after[0], before[-1]], 0, atol=1e-5)
+    np.testing.assert_allclose(before[:-1], after[1:], atol=1e-5)
+    np.testing.assert_allclose(after[1], (knots_y[2] - knots_y[0]) / (knots_x[2] - knots_x[0]), atol=1e-5)
+
+
+@given(length=st.integers(1, 9), steps=st.integers(0, 9))
+def test_path_that_ends_early_stays_at_its_last_point_and_a_long_one_is_cut(length, steps):
+    path = np.arange(2.0 * length).reshape(length, 2)
+    whole = then_stay(path, steps)
+    assert whole.shape == (steps + 1, 2)
+    for k, point in enumerate(whole):
+        np.testing.assert_array_equal(point, path[min(k, length - 1)])

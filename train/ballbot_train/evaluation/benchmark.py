@@ -1,0 +1,179 @@
+"""Every controller of every task on the certified episodes, in parallel processes and resumably."""
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ballbot_baselines import CONTROLLERS
+from ballbot_gym import certified
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.tasks import TASKS
+from ballbot_train import jobs
+from ballbot_train.console import check_least, check_names, check_some
+from ballbot_train.evaluation import controllers as registry
+from ballbot_train.evaluation.evaluate import iterate_episodes
+from ballbot_train.evaluation.results import Result
+from ballbot_train.policy_files import paths_of, read_description, shipped_policies, weights_digest
+from ballbot_train.provenance import provenance
+
+_CHUNK = 5  # episodes of a job
+
+
+def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str, list[str]]:
+    """The controllers to run on each task: those named that the task has; without names, all it has.
+
+    A policy is made for one task, and is left out for the others; tasks left without a controller are left out too.
+
+    Raises:
+        ValueError: a name that none of the tasks has, a name that is given twice, or no task.
+        PolicyError: a policy file that is missing or damaged.
+    """
+    check_some("task", tasks, TASKS)
+    known = {task: registry.names(make_task(task)) for task in tasks}
+    if not names:
+        return known
+    # two spellings of one path are one policy
+    identities = [str(paths_of(name)[1].resolve()) if registry.is_file(name) else name for name in names]
+    repeated = [name for i, name in enumerate(names) if identities[i] in identities[:i]]
+    if repeated:
+        raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
+    made_for = {name: read_description(name)["spec"]["task"] for name in names if registry.is_file(name)}
+    chosen = {
+        task: [
+            name
+            for name in names
+            if (made_for[name] == repr(make_task(task)) if name in made_for else name in known[task])
+        ]
+        for task in tasks
+    }
+    unused = [name for name in names if not any(name in group for group in chosen.values())]
+    if unused:
+        if unused[0] in made_for:
+            raise ValueError(f"{unused[0]} was made for {made_for[unused[0]]}, which is none of {', '.join(tasks)}")
+        check_names("controller", unused, dict.fromkeys(name for group in known.values() for name in group))
+    return {task: group for task, group in chosen.items() if group}
+
+
+def policy_digests(controllers: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """SHA-256 of the weights of every learned policy among controllers by task, under "TASK/NAME"."""
+    digests = {}
+    for task, group in controllers.items():
+        shipped = shipped_policies(make_task(task))
+        for name in group:
+            if name not in CONTROLLERS:
+                digests[f"{task}/{name}"] = weights_digest(shipped.get(name, name))
+    return digests
+
+
+def open_run(
+    out: Path,
+    controllers: Mapping[str, Sequence[str]],
+    workers: int,
+    physics: str,
+    seed: int | None = None,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Claims a folder for a run of controllers by task with some settings; `jobs.release` ends the run.
+
+    Args:
+        out: the folder.
+        controllers: names by task.
+        workers: processes; they change no result.
+        physics: "bullet" or "rk4".
+        seed: of whatever is drawn, if anything is.
+        settings: whatever else decides the results.
+
+    Returns:
+        The facts that the results name.
+
+    Raises:
+        ValueError: the folder holds an unfinished run with other settings, policies or code; another process is using it;
+            or a number is out of its range.
+    """
+    check_least(1, workers=workers)
+    settings["physics"] = physics
+    if seed is not None:
+        check_least(0, seed=seed)
+        settings["seed"] = seed
+    settings["policies"] = policy_digests(controllers)
+    facts = provenance() | settings | {"workers": workers}
+    jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
+    return facts
+
+
+def checked_episodes(episodes: int, quick: bool, few: int) -> int:
+    """How many certified episodes to run: `few` at most if quick.
+
+    Raises:
+        ValueError: there are not so many.
+    """
+    if not 1 <= episodes <= certified.EPISODES:
+        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
+    return min(episodes, few) if quick else episodes
+
+
+def benchmark(
+    controllers: Mapping[str, Sequence[str]],
+    episodes: int,
+    physics: str,
+    out: Path,
+    workers: int,
+    on_progress: Callable[[str, int], None],
+    seed: int = 0,
+) -> list[Result]:
+    """Runs the controllers of every task, in parallel processes; what an interrupted run finished is not run again.
+
+    Args:
+        controllers: names by task, as `controllers_of` gives.
+        episodes: how many of each task's certified ones.
+        physics: "bullet" or "rk4".
+        out: folder of the results.
+        workers: processes.
+        on_progress: called with a task and a number of finished episodes.
+        seed: of whatever is drawn.
+    """
+    work = [
+        episode_job(task, name, physics, range(start, min(start + _CHUNK, episodes)), seed)
+        for task, group in controllers.items()
+        for name in group
+        for start in range(0, episodes, _CHUNK)
+    ]
+    return [Result(**entry) for entries in jobs.run(work, out, workers, on_progress) for entry in entries]
+
+
+def episode_job(
+    task: str,
+    controller: str,
+    physics: str,
+    episodes: range,
+    seed: int,
+    randomization: Randomization | None = None,
+    label: str = "",
+    group: str = "",
+) -> jobs.Job:
+    """Some certified episodes under a controller by name, as a job whose entries are the fields of Results.
+
+    The label tells jobs apart that differ in their randomization; progress counts for the group, or else the task.
+    """
+    what = f"{task}-{controller}-{physics}-{label}"
+    slug = "".join(sign if sign.isalnum() else "-" for sign in what)
+    return jobs.Job(
+        name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
+        function=_episode_entries,
+        arguments=(task, controller, physics, seed, randomization),
+        items=tuple(episodes),
+        group=group or task,
+    )
+
+
+def _episode_entries(
+    task: str, controller: str, physics: str, seed: int, randomization: Randomization | None, episodes: Sequence[int]
+) -> Iterator[jobs.Entry]:
+    env = BallbotEnv(task, physics=physics, randomization=randomization)
+    made = registry.make_controller(controller, env.task, env.params)
+    for result in iterate_episodes(env, made, controller, task, episodes, seed):
+        yield asdict(result)
+    env.close()

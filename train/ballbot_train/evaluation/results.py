@@ -1,0 +1,215 @@
+"""What evaluation measures: episodes' results, rows of the leaderboard, and the files that hold them."""
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_train.evaluation.statistics import interval
+
+
+@dataclass(frozen=True)
+class Result:
+    """One certified episode under one controller; SI units, angles in degrees."""
+
+    task: str
+    controller: str
+    episode: int
+    physics: str
+    cost: float
+    optimum: float
+    success: bool
+    failure: bool
+    peak_tilt: float
+    settle_time: float
+    duration: float
+    plan_seconds: float
+    step_seconds: float
+    effort: float = math.nan
+    """Mean of |F| over the episode, N."""
+    note: str = ""
+    """Why there is no trajectory: the message of the controller that found no plan."""
+
+    @property
+    def regret(self) -> float:
+        """cost / optimum − 1; NaN for a failed episode, whose cost is a price and not a performance."""
+        return math.nan if self.failure else self.cost / self.optimum - 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """A leaderboard row. Regret, peak tilt, settle time and effort are of the episodes that did not fail."""
+
+    task: str
+    controller: str
+    episodes: int
+    success: float
+    falls: int
+    regret_mean: float
+    regret_low: float
+    """Of the mean's 95 % bootstrap interval."""
+    regret_high: float
+    regret_median: float
+    cost_mean: float
+    cost_median: float
+    peak_tilt_median: float
+    settle_time_median: float
+    effort_mean: float
+    """Mean of |F|, N."""
+    plan_ms_median: float
+    step_us_median: float
+    recovered: float = math.nan
+    """Share of the physically recoverable states from which it recovers, where `ballbot basins` measured it."""
+
+
+def summarize(results: Sequence[Result], seed: int = 0) -> Row:
+    """The leaderboard row of one controller on one task; seed is of the bootstrap."""
+    standing = [result for result in results if not result.failure]
+
+    def median(values: Iterable[float]) -> float:
+        finite = [value for value in values if math.isfinite(value)]
+        return float(np.median(finite)) if finite else math.nan
+
+    regrets = [result.regret for result in standing]
+    low, high = interval(regrets, seed)
+    return Row(
+        task=results[0].task,
+        controller=results[0].controller,
+        episodes=len(results),
+        success=float(np.mean([result.success for result in results])),
+        falls=len(results) - len(standing),
+        regret_mean=float(np.mean(regrets)) if regrets else math.nan,
+        regret_low=low,
+        regret_high=high,
+        regret_median=median(regrets),
+        cost_mean=float(np.mean([result.cost for result in results])),
+        cost_median=median(result.cost for result in results),
+        peak_tilt_median=median(result.peak_tilt for result in standing),
+        settle_time_median=median(result.settle_time for result in standing),
+        effort_mean=float(np.mean([result.effort for result in standing])) if standing else math.nan,
+        plan_ms_median=1e3 * median(result.plan_seconds for result in results),
+        step_us_median=1e6 * median(result.step_seconds for result in results),
+    )
+
+
+def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
+    """One row per task and controller, in the order of the results; seed is of the bootstrap."""
+    groups: dict[tuple[str, str], list[Result]] = {}
+    for result in results:
+        groups.setdefault((result.task, result.controller), []).append(result)
+    return [summarize(group, seed) for group in groups.values()]
+
+
+def write_leaderboard(rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path) -> None:
+    """Writes leaderboard.csv, episodes.csv and leaderboard.json, which holds the facts as "about", rows and episodes."""
+    write_csv(out / "leaderboard.csv", rows)
+    write_csv(out / "episodes.csv", results)
+    files.write(out / "leaderboard.json", to_json({"about": facts, "rows": rows, "episodes": results}))
+
+
+def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
+    """What a benchmark's facts and episodes were.
+
+    Args:
+        path: its folder, its leaderboard.json or its episodes.csv, which holds no facts.
+
+    Raises:
+        ValueError: it is none of these, or damaged.
+    """
+    path = Path(path)
+    path = path / "leaderboard.json" if path.is_dir() else path
+    try:
+        if path.suffix == ".csv":
+            text = path.read_text()
+            if not text.endswith("\n"):
+                raise ValueError("its last line is cut off")
+            return {}, [_from_csv(entry) for entry in csv.DictReader(text.splitlines())]
+        document = json.loads(path.read_text())
+        return dict(document["about"]), [_from_json(entry) for entry in document["episodes"]]
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error) as error:
+        raise ValueError(f"{path} holds no episodes of a benchmark: {error!r}") from error
+
+
+def _from_json(entry: Mapping[str, Any]) -> Result:
+    values: dict[str, Any] = {key: math.nan if value is None else value for key, value in entry.items()}
+    result = Result(**values)
+    for field in fields(Result):
+        value, kind = getattr(result, field.name), cast(Any, field.type)
+        if not isinstance(value, (int, float) if kind is float else kind):
+            raise TypeError(f"{field.name} of an episode is {value!r}")
+    return result
+
+
+def _from_csv(entry: Mapping[str, str]) -> Result:
+    truths = {"True": True, "False": False}
+    read: dict[Any, Any] = {str: str, int: int, float: float, bool: truths.__getitem__}
+    kinds = {field.name: read[field.type] for field in fields(Result)}
+    return Result(**{key: kinds[key](value) for key, value in entry.items()})
+
+
+def write_csv(path: Path, entries: Sequence[Any]) -> Path:
+    """Writes dataclass instances of one kind as CSV."""
+    return files.write_csv(path, [asdict(entry) for entry in entries])
+
+
+def to_json(document: Mapping[str, Any]) -> str:
+    """A document as JSON; its lists of dataclass instances become lists of objects, one a line, with null for NaN."""
+
+    def line(entry: Any) -> str:
+        return json.dumps({key: _or_null(value) for key, value in asdict(entry).items()}, ensure_ascii=False)
+
+    def text(value: Any) -> str:
+        if isinstance(value, list | tuple) and value and hasattr(value[0], "__dataclass_fields__"):
+            return "[\n  " + ",\n  ".join(map(line, value)) + "\n ]"
+        return json.dumps(value, ensure_ascii=False)
+
+    return "{\n" + ",\n".join(f" {json.dumps(key)}: {text(value)}" for key, value in document.items()) + "\n}\n"
+
+
+def _or_null(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+HEADER = [
+    "task",
+    "controller",
+    "success",
+    "falls",
+    "regret mean",
+    "regret median",
+    "peak tilt",
+    "settle",
+    "mean force",
+    "recovered",
+    "plan",
+    "per step",
+]
+
+
+def cells(row: Row) -> list[str]:
+    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash."""
+
+    def shown(value: float, form: str, unit: str = "") -> str:
+        return format(value, form) + unit if math.isfinite(value) else "–"
+
+    ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
+    return [
+        row.task,
+        row.controller,
+        f"{100 * row.success:.1f} %",
+        f"{row.falls}/{row.episodes}",
+        shown(row.regret_mean, ".2%") + ends,
+        shown(row.regret_median, ".2%"),
+        shown(row.peak_tilt_median, ".1f", "°"),
+        shown(row.settle_time_median, ".2f", " s"),
+        shown(row.effort_mean, ".0f", " N"),
+        shown(row.recovered, ".0%"),
+        shown(row.plan_ms_median, ".0f", " ms"),
+        shown(row.step_us_median, ".0f", " µs"),
+    ]
