@@ -143,11 +143,11 @@ def test_experts_that_take_a_back_off_get_the_one_of_the_dataset():
     env = BallbotEnv("stabilize", physics="rk4")
     x = np.array([1.0, 0, 0, 0, 0, 3, 0, 0])
     limit = {}
-    for force in (0.0, 0.3):
+    for force in (0.0, 0.6):
         expert = Expert("trajopt", env.task, env.params, Backoff(force=force))
         expert.reset(0.0, x, np.zeros(0))
         limit[force] = np.abs(expert._controller.plan.trajectory.u).max() / env.params.force_limit
-    assert limit[0.3] <= 0.7 + 1e-6 < limit[0.0]
+    assert limit[0.6] <= 0.4 + 1e-6 < limit[0.0]
     env.close()
 
 
