@@ -6,8 +6,9 @@ A policy is a function from observation to action, a Stable-Baselines3 model, a 
 import numpy as np
 import tyro
 
+from ballbot_train import evaluate
 from ballbot_train.console import print_table
-from ballbot_train.evaluation.evaluate import HEADER, cells, evaluate
+from ballbot_train.evaluation.results import HEADER, cells
 
 GAIN = np.array([[0.3, 0, 1.3, 0, 0.7, 0, 1.3, 0], [0, 0.3, 0, 1.3, 0, 0.7, 0, 1.3]])
 

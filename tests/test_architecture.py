@@ -25,9 +25,12 @@ ROOMS = ("ballbot_gym", "ballbot_baselines", "ground floor", "evaluation", "lear
 def modules(path, only_top_level=False):
     """Dotted names that the import statements of a file name, anywhere in it or at its top level only.
 
-    `from a import b` counts as a.b, because b may be a module.
+    `from a import b` counts as a.b, because b may be a module. Imports for type checkers never run and do not count.
     """
     tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
+            node.body = []
     found = set()
     for node in tree.body if only_top_level else ast.walk(tree):
         if isinstance(node, ast.Import):

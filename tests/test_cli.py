@@ -202,7 +202,7 @@ def test_only_the_command_that_is_called_is_imported():
         (["--version"], 0, "ballbot 0."),
         (["trian"], 2, "no command 'trian'; did you mean train?"),
         (["[red]x"], 2, "no command '[red]x'; the commands are benchmark, compare"),
-        (["compare"], 2, "usage: ballbot compare"),
+        (["compare"], 2, "ballbot compare"),
     ],
 )
 def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, message, tmp_path):
@@ -224,10 +224,14 @@ def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path):
     runs = tmp_path / "runs"
     (runs / "basins").mkdir(parents=True)
     (runs / "basins" / "basins.json").write_text("{")
+    (runs / "train").mkdir()
+    (runs / "train" / "config.json").write_text("{")
+    (runs / "train" / "evaluations.csv").write_text("seconds,regret_mean\n1,2\n")
     arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
     run = ballbot(*arguments, "--workers", 1, cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert "skipped: runs/basins/basins.json is damaged" in run.stdout
+    assert "skipped: runs/train/config.json" in run.stdout
     assert (runs / "benchmark" / "leaderboard.csv").exists()
 
 

@@ -13,20 +13,20 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import training
 from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
-from ballbot_train.learning.learners import bc, dagger
+from ballbot_train.learning.learners import LEARNERS, bc, dagger
 
-TINY_BC = bc.BcConfig(iterations=4, steps=20, batch=128, hidden=(16,))
+TINY_BC = bc.BcConfig(total_iterations=4, gradient_steps=20, batch_size=128, hidden=(16,))
 TINY_DAGGER = dagger.DaggerConfig(
-    iterations=4,
-    gathering=2,
-    episodes=1,
-    candidates=2,
-    drives=1,
-    longest=0.2,
-    steps=5,
-    batch=64,
+    total_iterations=4,
+    gathering_iterations=2,
+    episodes_per_iteration=1,
+    candidate_episodes=2,
+    rollouts_per_plan=1,
+    max_rollout_seconds=0.2,
+    gradient_steps=5,
+    batch_size=64,
     hidden=(8,),
-    guesses=1,
+    max_guesses=1,
 )
 
 
@@ -71,10 +71,10 @@ def test_cloning_without_demonstrations_says_what_it_needs():
         bc.make(make_task("stabilize"), default_params(), TINY_BC, 0, None)
 
 
-@pytest.mark.parametrize("learner", [bc, dagger])
+@pytest.mark.parametrize("learner", ["bc", "dagger"])
 def test_demonstrations_of_another_task_are_refused(learner, demos):
     with pytest.raises(ValueError, match="not of Orbit"):
-        learner.make(make_task("orbit"), default_params(), learner.TUNED["orbit"], 0, demos)
+        LEARNERS[learner].make(make_task("orbit"), default_params(), LEARNERS[learner].settings("orbit"), 0, demos)
 
 
 def test_cloning_goes_on_from_its_state_as_if_never_stopped(demos):
@@ -95,18 +95,18 @@ def test_dagger_goes_on_from_its_state_as_if_never_stopped(demos, demonstrated):
 def test_dagger_labels_what_it_meets_on_every_task(name):
     task = TASKS[name]()
     settings = (
-        "iterations",
-        "gathering",
-        "episodes",
-        "candidates",
-        "drives",
-        "longest",
-        "steps",
-        "batch",
+        "total_iterations",
+        "gathering_iterations",
+        "episodes_per_iteration",
+        "candidate_episodes",
+        "rollouts_per_plan",
+        "max_rollout_seconds",
+        "gradient_steps",
+        "batch_size",
         "hidden",
-        "guesses",
+        "max_guesses",
     )
-    config = replace(dagger.TUNED[name], **{field: getattr(TINY_DAGGER, field) for field in settings})
+    config = replace(LEARNERS["dagger"].settings(name), **{field: getattr(TINY_DAGGER, field) for field in settings})
     learner = dagger.Dagger(task, default_params(), config)
     figures = learner.iterate()
     assert figures["train/samples"] > 0
@@ -149,11 +149,11 @@ def test_where_the_goal_ends_the_episode_the_tube_leaves_the_freedom_that_the_op
 
 
 @pytest.mark.parametrize("name", ["stabilize", "turn"])
-def test_followers_are_labelled_by_feedback_about_the_plan_and_only_near_it(name, monkeypatch):
+def test_tracked_rollouts_are_labelled_by_feedback_about_the_plan_and_only_near_it(name, monkeypatch):
     task, params, rng = make_task(name), default_params(), np.random.default_rng(3)
     x, c = task.sample(rng, params)
     plan = find_optimum(task, params, x, c)
-    learner = dagger.Dagger(task, params, replace(TINY_DAGGER, followers=2, kept=8.0))
+    learner = dagger.Dagger(task, params, replace(TINY_DAGGER, tracked_rollouts_per_plan=2, label_seconds=8.0))
     off = 1e-3 * rng.standard_normal(8)
     met = np.stack([plan.trajectory.x, plan.trajectory.x + [*off[:4], *(off[4:] + 100)]], axis=1)
     met[2, 0] = plan.trajectory.x[2] + off
@@ -161,9 +161,9 @@ def test_followers_are_labelled_by_feedback_about_the_plan_and_only_near_it(name
     over[-1] = True
     monkeypatch.setattr(learner, "_roll", lambda x, c, steps: (met, over, np.zeros(2, bool)))
     gains = dagger.tube_gains(task, params, plan, c)
-    learner._follow([(plan, c)], [gains], rng)
+    learner._track([(plan, c)], [gains], rng)
     samples = learner._samples
-    assert len(samples) == len(plan.trajectory.u)  # none of the follower who is 100 m/s off
+    assert len(samples) == len(plan.trajectory.u)  # none of the rollout that is 100 m/s off
     expected = plan.trajectory.u / params.force_limit
     expected[2] -= gains[2] @ off / params.force_limit
     np.testing.assert_allclose(samples.actions.numpy(), np.clip(expected, -1, 1), atol=1e-6)
@@ -172,10 +172,17 @@ def test_followers_are_labelled_by_feedback_about_the_plan_and_only_near_it(name
 def test_dagger_falls_far_less_than_lqr_after_two_rounds():
     """LQR, within the limits of tanh, is where it starts; eight planned episodes and their surroundings halve its falls."""
     task, params = make_task("stabilize"), default_params()
-    small = {"iterations": 4, "gathering": 2, "episodes": 4, "candidates": 0, "batch": 256, "hidden": (64,)}
-    learner = dagger.Dagger(task, params, replace(dagger.TUNED["stabilize"], **small))
+    small = {
+        "total_iterations": 4,
+        "gathering_iterations": 2,
+        "episodes_per_iteration": 4,
+        "candidate_episodes": 0,
+        "batch_size": 256,
+        "hidden": (64,),
+    }
+    learner = dagger.Dagger(task, params, replace(LEARNERS["dagger"].settings("stabilize"), **small))
     before = training.score(learner.network, task)
-    for _ in range(small["iterations"]):
+    for _ in range(small["total_iterations"]):
         learner.iterate()
     after = training.score(learner.network, task)
     assert after.failures < 0.6 * before.failures

@@ -11,14 +11,30 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
-from ballbot_train.learning.learners.model_free import OwnRandomness, TrainingEnv
+from ballbot_train.learning.learners.model_free import ScopedRng, TrainingEnv
 from ballbot_train.policy import load_network, save_policy
 
-IMITATING = {"clone_iterations": 2, "clone_steps": 5, "clone_batch": 32, "critic_iterations": 1}
+IMITATING = {"clone_iterations": 2, "clone_gradient_steps": 5, "clone_batch_size": 32, "critic_warmup_iterations": 1}
 TINY = {
-    "ppo": ppo.PpoConfig(iterations=3, envs=4, steps=16, episode=0.4, hidden=(16, 8), batch=32, epochs=2, **IMITATING),
+    "ppo": ppo.PpoConfig(
+        rl_iterations=3,
+        num_envs=4,
+        num_steps=16,
+        episode_seconds=0.4,
+        hidden=(16, 8),
+        batch_size=32,
+        update_epochs=2,
+        **IMITATING,
+    ),
     "sac": sac.SacConfig(
-        iterations=3, envs=4, steps=8, gradient_steps=2, episode=0.2, hidden=(16, 8), batch=16, **IMITATING
+        rl_iterations=3,
+        num_envs=4,
+        num_steps=8,
+        gradient_steps=2,
+        episode_seconds=0.2,
+        hidden=(16, 8),
+        batch_size=16,
+        **IMITATING,
     ),
 }
 
@@ -92,22 +108,22 @@ def test_demonstrations_of_another_task_are_refused(name, demos):
 
 def test_every_task_has_settings_of_ppo_and_sac(task, name):
     key = type(task).__name__.lower()
-    settings = LEARNERS[name].tuned[key]
-    TrainingEnv(task, default_params(), 2, settings.episode, settings.reward_scale)
+    settings = LEARNERS[name].settings(key)
+    TrainingEnv(task, default_params(), 2, settings.episode_seconds, settings.reward_scale)
 
 
 def test_with_demonstrations_it_first_imitates_and_then_teaches_its_critic_alone(name, demos):
     learner = make(name, demos)
     cloned = parameters(run(learner, TINY[name].clone_iterations))
     assert learner._model.num_timesteps == 0
-    assert torch.equal(parameters(run(learner, TINY[name].critic_iterations)), cloned)
+    assert torch.equal(parameters(run(learner, TINY[name].critic_warmup_iterations)), cloned)
     assert learner._model.num_timesteps > 0
     assert not torch.equal(parameters(run(learner, 1)), cloned)
 
 
 def test_cloning_comes_near_the_expert(name, demos):
     learner = LEARNERS[name].make(
-        make_task("stabilize"), default_params(), replace(TINY[name], clone_steps=200), 0, demos
+        make_task("stabilize"), default_params(), replace(TINY[name], clone_gradient_steps=200), 0, demos
     )
     run(learner, TINY[name].clone_iterations)
     data = load_demos(demos, make_task("stabilize"))
@@ -137,8 +153,8 @@ def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
 
 
 def test_training_envs_never_end_together():
-    env = TrainingEnv(make_task("stabilize", max_tilt=1.5), default_params(), 5, 0.4, 300.0, 0.1)
-    env.seed(0)  # of which no robot falls
+    env = TrainingEnv(make_task("stabilize", max_tilt=1.5), default_params(), 5, 0.4, 0.1)
+    env.seed(0)  # no robot falls with this seed
     env.reset()
     ends = [env.step(np.zeros((5, 2)))[2].sum() for _ in range(20)]
     assert max(ends) == 1
@@ -146,7 +162,7 @@ def test_training_envs_never_end_together():
 
 
 def test_a_learners_random_numbers_are_its_own():
-    own = OwnRandomness()
+    own = ScopedRng()
     with own:
         first = torch.rand(3), np.random.rand(3)
     state = own.state_dict()

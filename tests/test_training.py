@@ -1,25 +1,50 @@
 """Training runs: they learn, are written as promised, and go on after an interruption as if there had been none."""
 
+import ast
+import importlib
+import inspect
+import itertools
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
+import textwrap
 import time
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from ballbot_baselines.lqr import discrete_lqr
+from ballbot_baselines.optimum import Backoff
+from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_train.commands.train import Run, command_with, parse
 from ballbot_train.learning import training
+from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS, shac
-from ballbot_train.policy import PolicyNetwork, PolicySpec
+from ballbot_train.policy import SHIPPED, PolicyNetwork, PolicySpec
 
-SETTINGS = ["iterations", "6", "evaluations", "3", "envs", "4", "window", "3", "hidden", "8", "compile", "false"]
+SETTINGS = [
+    "--total-iterations",
+    "6",
+    "--evaluations",
+    "3",
+    "--num-envs",
+    "4",
+    "--horizon",
+    "3",
+    "--hidden",
+    "8",
+    "--no-compile",
+]
 
 
 def parameters(learner):
@@ -40,7 +65,9 @@ def finishes(*arguments):
 @pytest.mark.parametrize("name", TASKS)
 def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
     task, params = TASKS[name](), default_params()
-    config = replace(shac.TUNED[name], iterations=4, envs=4, window=3, hidden=(8,), compile=False)
+    config = replace(
+        LEARNERS["shac"].settings(name), total_iterations=4, num_envs=4, horizon=3, hidden=(8,), compile=False
+    )
     whole = shac.Shac(task, params, config)
     for _ in range(4):
         whole.iterate()
@@ -58,32 +85,43 @@ def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
 def test_shac_starts_at_lqr_and_lowers_the_cost():
     """From LQR's start a few iterations of small envs already save cost on the certified episodes."""
     task, params = TASKS["stabilize"](), default_params()
-    config = replace(shac.TUNED["stabilize"], iterations=30, envs=64, window=25, hidden=(32,), compile=False)
+    config = replace(
+        LEARNERS["shac"].settings("stabilize"),
+        total_iterations=30,
+        num_envs=64,
+        horizon=25,
+        hidden=(32,),
+        compile=False,
+    )
     learner = shac.Shac(task, params, config)
     before = training.score(learner.network, task)
     assert before.success > 0.5  # LQR within the limits of tanh
-    for _ in range(config.iterations):
+    for _ in range(config.total_iterations):
         learner.iterate()
     assert training.score(learner.network, task).cost_ratio < 0.7 * before.cost_ratio
 
 
 def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
     task, params = TASKS["turn"](), default_params()
-    config = shac.ShacConfig(iterations=2, envs=4, window=3, hidden=(8,), critic_first=1, compile=False)
+    config = shac.ShacConfig(
+        total_iterations=2, num_envs=4, horizon=3, hidden=(8,), critic_warmup_iterations=1, compile=False
+    )
     donor, learner = (shac.Shac(task, params, config, seed) for seed in (1, 2))
-    learner.begin(donor.network)
+    learner.start_from(donor.network)
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()  # only the critic learns
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()
     assert not torch.equal(parameters(learner), parameters(donor))
     with pytest.raises(ValueError, match="cannot start"):
-        shac.Shac(task, params, replace(config, hidden=(9,))).begin(donor.network)
+        shac.Shac(task, params, replace(config, hidden=(9,))).start_from(donor.network)
 
 
 def test_a_critic_that_does_not_learn_stays_lqr_s_cost():
     task, params = TASKS["stabilize"](), default_params()
-    learner = shac.Shac(task, params, shac.ShacConfig(envs=4, window=3, hidden=(8,), critic_steps=0, compile=False))
+    learner = shac.Shac(
+        task, params, shac.ShacConfig(num_envs=4, horizon=3, hidden=(8,), critic_gradient_steps=0, compile=False)
+    )
     learner.iterate()
     x = 0.01 * torch.arange(8.0)
     _, p = discrete_lqr(task, params, np.zeros(8), np.zeros(2), np.zeros(0))
@@ -101,7 +139,7 @@ def test_odd_policies_are_odd():
 
 def test_a_killed_run_resumes_to_the_same_result(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    common = ["shac", "--threads", 1, "--set", *SETTINGS]
+    common = ["shac", "--threads", 1, *SETTINGS]
     finishes(*common, "--out", whole)
     process = run(*common, "--out", killed, env=os.environ | {"BALLBOT_CHECKPOINT_SECONDS": "0"})
     while not (killed / "checkpoint.pt").exists() and process.poll() is None:
@@ -121,19 +159,145 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path):
     assert "another seed" in " ".join(different.stdout.read().split())
 
 
-def test_bad_settings_are_named(tmp_path):
-    for arguments, message in (
-        (["shac", "--set", "wings", "2"], "unknown setting wings"),
-        (["shac", "--set", "envs", "many"], "setting envs cannot be 'many'"),
-        (["sorcery"], "unknown learner sorcery"),
-        (["shac", "--demos", tmp_path], "shac uses no demonstrations"),
-    ):
-        process = run(*arguments, "--out", tmp_path / "run")
-        assert process.wait() == 1
-        assert message in " ".join(process.stdout.read().split())
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["shac", "--wings", "2"], 2, "--wings"),
+        (["shac", "--num-envs", "many"], 2, "--num-envs"),
+        (["sorcery"], 1, "unknown learner sorcery"),
+        (["shac", "--task", "hop"], 1, "unknown task hop"),
+        (["shac", "--demos", "nothing"], 1, "shac uses no demonstrations"),
+        (["shac", "--threads", "0"], 1, "threads must be at least 1, not 0"),
+        (["shac", *SETTINGS, "--total-iterations", "-5"], 1, "iterations must be at least 1, not -5"),
+        (["shac", *SETTINGS, "--evaluations", "0"], 1, "evaluations must be at least 1, not 0"),
+    ],
+)
+def test_wrong_options_are_named_before_anything_is_written(arguments, status, message, tmp_path):
+    process = run(*arguments, "--out", tmp_path / "run")
+    printed, _ = process.communicate()
+    assert process.returncode == status, printed
+    assert message in " ".join(printed.split())
     assert not (tmp_path / "run").exists()
 
 
+def test_a_damaged_checkpoint_is_named(tmp_path):
+    task, params = TASKS["stabilize"](), default_params()
+    config = shac.ShacConfig(total_iterations=1, evaluations=1, num_envs=2, horizon=2, hidden=(4,), compile=False)
+    about = {"learner": "shac", "task": "stabilize"}
+    (tmp_path / "config.json").write_text(json.dumps(about))
+    for content in (b"", b"garbage", b"PK\x03\x04"):
+        (tmp_path / "checkpoint.pt").write_bytes(content)
+        with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
+            training.train(shac.Shac(task, params, config), task, about, tmp_path, resume=True)
+
+
+def parsed(command):
+    """Learner, options of the run and settings that a recorded command gives."""
+    words, calls = shlex.split(command), []
+    assert words[:2] == ["ballbot", "train"]
+    parse(words[2:], lambda *call: calls.append(call))
+    return calls[0]
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.json")), ids=lambda path: path.stem)
+def test_recorded_commands_give_the_recorded_settings(path):
+    record = json.loads(path.read_text())["training"]
+    *earlier, last = record["command"].split(" && ")
+    learner, options, settings = parsed(last)
+    assert json.loads(json.dumps(asdict(settings))) == record["settings"]
+    assert (learner, options.task, options.seed) == (record["learner"], record["task"], record["seed"])
+    assert [value and str(value) for value in (options.demos, options.start)] == [record["demos"], record["start"]]
+    for command in earlier:
+        words = shlex.split(command)
+        if words[1] == "demos":
+            given = {words[i].removeprefix("--"): words[i + 1] for i in range(2, len(words), 2)}
+            assert set(given) <= {f.name for f in fields(DemoConfig)} | {
+                "out",
+                *(f"backoff.{f.name}" for f in fields(Backoff)),
+            }
+        else:
+            parsed(command)
+
+
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_every_learner_has_settings_for_every_task(learner):
-    assert set(LEARNERS[learner].tuned) == set(TASKS)
+@pytest.mark.parametrize("task", TASKS)
+def test_a_command_with_all_settings_gives_them_again(learner, task):
+    settings = LEARNERS[learner].settings(task)
+    options = Run(task=task, seed=3)
+    assert parsed(command_with(learner, options, settings)) == (learner, options, settings)
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_help_lists_every_setting_with_the_defaults_of_the_task(learner, capsys):
+    with pytest.raises(SystemExit):
+        parse([learner, "--task", "weave", "--help"], lambda *call: None)
+    printed = capsys.readouterr().out
+    for field in fields(LEARNERS[learner].settings("weave")):
+        if field.name != "backoff":
+            assert field.name.replace("_", "-") in printed
+    assert "256 256" in " ".join(printed.split()) or learner not in ("bc", "shac")
+
+
+def test_every_setting_says_what_it_is():
+    for algorithm in LEARNERS.values():
+        module = importlib.import_module(algorithm.module)
+        documented = set()
+        for kind in getattr(module, algorithm.config).__mro__[:-1]:
+            body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
+            for statement, after in itertools.pairwise(body):
+                if isinstance(statement, ast.AnnAssign) and isinstance(after, ast.Expr):
+                    documented.add(statement.target.id)
+        assert {field.name for field in fields(getattr(module, algorithm.config))} <= documented
+
+
+def test_help_of_train_imports_no_torch():
+    command = str(SHIPPED.parent / "commands" / "train.py")  # as a file: the package may import other commands
+    code = (
+        f"import runpy, sys\nparse = runpy.run_path({command!r})['parse']\n"
+        "try: parse(['--help'], None)\nexcept SystemExit: pass\n"
+        "assert not {'torch', 'casadi', 'stable_baselines3'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+class Stand(Stabilize):
+    """A task that no learner knows."""
+
+    id = "BallbotStand-v0"
+
+
+SMALL = {
+    "bc": {"gradient_steps": 2},
+    "dagger": {
+        "episodes_per_iteration": 1,
+        "candidate_episodes": 1,
+        "rollouts_per_plan": 1,
+        "max_rollout_seconds": 0.1,
+        "gradient_steps": 2,
+        "max_guesses": 1,
+    },
+    "ppo": {"num_envs": 4, "num_steps": 8, "batch_size": 32},
+    "sac": {"num_envs": 2, "num_steps": 2, "batch_size": 4},
+    "shac": {"num_envs": 4, "horizon": 3, "compile": False},
+}
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_a_task_that_no_learner_knows_trains_with_default_settings(learner, monkeypatch):
+    monkeypatch.setitem(TASKS, "stand", Stand)
+    algorithm, module = LEARNERS[learner], importlib.import_module(LEARNERS[learner].module)
+    settings = algorithm.settings("stand")
+    assert settings == getattr(module, algorithm.config)()
+    demos = None
+    if learner == "bc":
+        steps = np.random.default_rng(0).normal(size=(20, 8))
+        shown = SimpleNamespace(observations=steps, actions=np.clip(steps[:, :2], -1, 1))
+        monkeypatch.setattr(module, "load_demos", lambda path, task: shown)
+        demos = Path("shown")
+    made = algorithm.make(make_task("stand"), default_params(), replace(settings, **SMALL.get(learner, {})), 0, demos)
+    before = parameters(made)
+    for _ in range(2):
+        made.iterate()
+    after = parameters(made)
+    assert torch.isfinite(after).all()
+    assert not torch.equal(before, after)

@@ -62,7 +62,11 @@ def _call(command: str, options: list[str]) -> Any:
 
     from ballbot_gym.lazy import load
 
-    return tyro.cli(load(COMMANDS[command]), args=options, prog=f"ballbot {command}")
+    function = load(COMMANDS[command])
+    # the options of some commands depend on what is typed, so these commands parse it themselves
+    if parse := getattr(sys.modules[function.__module__], "command_line", None):
+        return parse(options)
+    return tyro.cli(function, args=options, prog=f"ballbot {command}")
 
 
 def _is_expected(error: RuntimeError) -> bool:

@@ -17,7 +17,7 @@ from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
 def demos(
     task: str = "stabilize",
-    expert: Literal["trajopt", "nmpc", "lqr"] = "trajopt",
+    expert: str = "trajopt",
     episodes: int = 200,
     physics: Literal["bullet", "rk4"] = "bullet",
     noise: float = 0.05,
@@ -27,20 +27,20 @@ def demos(
     out: Path | None = None,
     workers: int = os.cpu_count() or 1,
 ) -> None:
-    """Rolls an expert out with exploration and writes a Minari dataset; a killed run continues when started again.
+    """Records episodes of an expert with exploration as a Minari dataset; a killed run continues when started again.
 
     Args:
         task: name of a task.
-        expert: trajopt (a plan, tracked by TVLQR), nmpc or lqr.
-        episodes: how many, each with a seed of its own.
+        expert: name of a controller, such as trajopt (a plan, tracked by TVLQR), nmpc or lqr.
+        episodes: number of episodes, each with a seed of its own.
         physics: "bullet" or "rk4".
         noise: each episode draws the standard deviation of its noise from [0, this], in units of the force limit.
         pushes: mean number per second of control steps in which a random force replaces the expert's.
         backoff: what the expert's plans keep from their limits: margins in their units, shares of the goal's tolerance
-            and of the force.
-        seed: of the dataset.
+            and of the force. Experts that take no back-off ignore it.
+        seed: seed of the dataset.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
-        workers: processes.
+        workers: number of processes.
     """
     check_names("task", [task], TASKS)
     config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed)
@@ -53,8 +53,8 @@ def demos(
     success = np.mean([fact["success"] for fact in facts])
     load = f"import minari; minari.load_dataset({folder.name!r})"
     console.print(
-        f"{len(facts)} episodes, {dataset.total_steps} steps, {100 * success:.1f} % successful in spite of what disturbed "
-        f"them\nMINARI_DATASETS_PATH={shlex.quote(str(folder.parent))} python -c {shlex.quote(load)}",
+        f"{len(facts)} episodes, {dataset.total_steps} steps, {100 * success:.1f} % successful in spite of noise and "
+        f"pushes\nMINARI_DATASETS_PATH={shlex.quote(str(folder.parent))} python -c {shlex.quote(load)}",
         markup=False,
         soft_wrap=True,
     )

@@ -1,22 +1,37 @@
-"""`ballbot train`: a policy by any learner."""
+"""`ballbot train LEARNER`: trains a policy. Every setting of the learner is an option; see `ballbot train LEARNER --help`."""
 
+import argparse
 import shlex
-import sys
-import typing
-from dataclasses import asdict, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
-import torch
+import tyro
 
-from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import check_names, console
-from ballbot_train.learning import training
-from ballbot_train.learning.demonstrations import command_of
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy import load_network, read_description
+
+
+@dataclass(frozen=True)
+class Run:
+    """Options of a run that every learner has."""
+
+    task: str = "stabilize"
+    """Name of a task."""
+    demos: Path | None = None
+    """Folder of a demonstration dataset, made by `ballbot demos`."""
+    start: Path | None = None
+    """Policy file whose weights training starts from; only for shac."""
+    seed: int = 0
+    """Seed of everything that is drawn."""
+    threads: int | None = None
+    """Threads of torch; default, torch's own choice. Another number changes the last digits."""
+    out: Path | None = None
+    """Folder of the run; default runs/train/TASK-LEARNER."""
+    resume: bool = False
+    """Continue the run in this folder, if there is one."""
 
 
 def train(
@@ -26,35 +41,50 @@ def train(
     demos: Path | None = None,
     start: Path | None = None,
     seed: int = 0,
-    set: dict[str, str] = {},  # noqa: B006 (the option's name; tyro's default, never changed)
+    settings: Any = None,
     threads: int | None = None,
     out: Path | None = None,
     resume: bool = False,
+    command: str | None = None,
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
     Args:
-        learner: name of a learner: bc, dagger, ppo, sac or shac.
+        learner: name of a learner in `LEARNERS`.
         task: name of a task.
-        demos: folder of a demonstration dataset, of `ballbot demos`.
-        start: policy file to start from, for shac.
-        seed: of everything drawn.
-        set: settings by name that replace the tuned ones, e.g. --set iterations 100 hidden 64,64.
-        threads: of torch; default, its own choice. Another number gives other last digits.
+        demos: folder of a demonstration dataset, made by `ballbot demos`.
+        start: policy file whose weights training starts from; only for shac.
+        seed: seed of everything that is drawn.
+        settings: the learner's settings; default, those tuned for the task.
+        threads: threads of torch; default, torch's own choice. Another number changes the last digits.
         out: folder of the run; default runs/train/TASK-LEARNER.
         resume: continue the run in this folder, if there is one.
+        command: the command that was typed, for the record; default, one with all settings.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
-    algorithm, problem = LEARNERS[learner], make_task(task)
+    algorithm = LEARNERS[learner]
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads must be at least 1, not {threads}")
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
-    settings = _changed(algorithm.tuned[task], set)
+
+    import torch
+
+    from ballbot_gym.env import make_task
+    from ballbot_gym.params import default_params
+    from ballbot_train.learning import training
+    from ballbot_train.learning.demonstrations import command_of
+    from ballbot_train.policy import load_network, read_description
+
     if threads is not None:
         torch.set_num_threads(threads)
+    problem = make_task(task)
+    settings = algorithm.settings(task) if settings is None else settings
     out = Path("runs") / "train" / f"{task}-{learner}" if out is None else out
-    command = shlex.join(["ballbot", *[word for word in sys.argv[1:] if word != "--resume"]])
-    # what made the demonstrations, or the policy to start from, belongs to what makes this one
+    if command is None:
+        command = command_with(learner, Run(task, demos, start, seed, threads, out), settings)
+    # the record also says how the demonstrations, or the policy to start from, were made
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
     if start is not None:
@@ -70,9 +100,9 @@ def train(
     }
     made = algorithm.make(problem, default_params(), settings, seed, demos)
     if start is not None:
-        if not hasattr(made, "begin"):
+        if not isinstance(made, training.Finetunable):
             raise ValueError(f"{learner} cannot start from a policy")
-        made.begin(load_network(start, problem))
+        made.start_from(load_network(start, problem))
     row = training.train(made, problem, config, out, resume)
     console.print(
         f"in PyBullet: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
@@ -80,28 +110,85 @@ def train(
     )
 
 
-def _changed(settings: Any, changes: dict[str, str]) -> Any:
-    """Settings with some replaced by what was typed.
+def command_line(arguments: Sequence[str]) -> None:
+    """Runs what was typed after `ballbot train`."""
+    words = ["ballbot", "train", *(word for word in arguments if word != "--resume")]
+
+    def start(learner: str, run: Run, settings: Any) -> None:
+        train(learner, settings=settings, command=shlex.join(words), **_shallow(run))
+
+    parse(arguments, start)
+
+
+def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> None:
+    """Parses what was typed after `ballbot train`.
+
+    Only the file of the learner that is named is imported. Its options are the fields of its settings, and their defaults
+    are the settings tuned for the task that is named.
+
+    Args:
+        arguments: the words.
+        call: called with the learner's name, the options of the run, and the learner's settings.
 
     Raises:
-        ValueError: a setting of that name does not exist, or cannot take that value.
+        ValueError: the learner or the task does not exist.
     """
-    kinds = typing.get_type_hints(type(settings))
-    check_names("setting", list(changes), [field.name for field in fields(settings)])
-    typed = {}
-    for name, text in changes.items():
-        kind = kinds[name]
-        try:
-            if typing.get_origin(kind) is tuple:
-                typed[name] = tuple(typing.get_args(kind)[0](part) for part in text.split(",") if part)
-            elif kind is bool:
-                typed[name] = {"true": True, "false": False}[text.lower()]
-            elif typing.get_origin(kind) is Literal:
-                typed[name] = {option: option for option in typing.get_args(kind)}[text]
-            else:
-                typed[name] = kind(text)
-        except (ValueError, KeyError) as error:
-            raise ValueError(
-                f"setting {name} cannot be {text!r}: it is of type {getattr(kind, '__name__', kind)}"
-            ) from error
-    return replace(settings, **typed)
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--task", default=Run.task)
+    task = early.parse_known_args(arguments)[0].task
+    named = arguments[0] if arguments and not arguments[0].startswith("-") else None
+    if named is not None:
+        check_names("learner", [named], LEARNERS)
+        check_names("task", [task], TASKS)
+    commands = {name: _command(name, task, call, complete=name == named) for name in LEARNERS}
+    tyro.extras.subcommand_cli_from_dict(
+        commands,
+        prog="ballbot train",
+        description="Trains a policy on the batched model, and measures it in PyBullet on the certified episodes. "
+        "`ballbot train LEARNER --help` lists the settings of a learner, with the defaults tuned for --task.",
+        args=list(arguments),
+    )
+
+
+def command_with(learner: str, run: Run, settings: Any) -> str:
+    """The command that makes a run with exactly these settings."""
+    words = ["ballbot", "train", learner]
+    for name, value in _shallow(run).items():
+        if value is not None and name != "resume":
+            words += [f"--{name}", str(value)]
+    for name, value in asdict(settings).items():
+        words += _option(name.replace("_", "-"), value)
+    return shlex.join(words)
+
+
+def _option(name: str, value: Any) -> list[str]:
+    """A setting as words of a command."""
+    if isinstance(value, bool):
+        return [f"--{name}" if value else f"--no-{name}"]
+    if isinstance(value, dict):
+        return [word for part, each in value.items() for word in _option(f"{name}.{part}", each)]
+    return [f"--{name}", *map(str, value if isinstance(value, tuple | list) else [value])]
+
+
+def _command(name: str, task: str, call: Callable[[str, Run, Any], None], complete: bool) -> Callable[..., None]:
+    """A learner's command as a function whose signature tyro reads; one that is not complete has no options yet."""
+
+    def without_options() -> None:
+        raise AssertionError("only a learner that is named is called")
+
+    function: Callable[..., None] = without_options
+    if complete:
+        settings = LEARNERS[name].settings(task)
+
+        def with_options(run: Any = Run(), settings: Any = settings) -> None:
+            call(name, run, settings)
+
+        flat = tyro.conf.arg(name="")  # options are --task and --num-envs, and not --run.task and --settings.num-envs
+        with_options.__annotations__ = {"run": Annotated[Run, flat], "settings": Annotated[type(settings), flat]}
+        function = with_options
+    function.__doc__ = f"{LEARNERS[name].description[:1].upper()}{LEARNERS[name].description[1:]}."
+    return function
+
+
+def _shallow(run: Run) -> dict[str, Any]:
+    return {field.name: getattr(run, field.name) for field in fields(run)}

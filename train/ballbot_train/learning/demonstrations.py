@@ -1,22 +1,24 @@
-"""Demonstrations: experts rolled out with exploration, kept as Minari datasets.
+"""Demonstrations: episodes of an expert with exploration, as Minari datasets.
 
-In every step the expert says what it would do, and the robot does that plus noise; now and then a push, a random force for
-one control step, replaces it, and the expert plans anew from where the push led. So the dataset shows recoveries too.
+In every control step the expert is asked for its action, and the robot executes this action plus noise. Sometimes a push, a
+random force for one control step, replaces the action. The expert then plans anew from the state after the push. So the
+dataset shows recoveries too.
 
 | in the dataset | is |
 |---|---|
-| actions (T, 2) | what was executed: the env, reset with the episode's seed, replays the episode from them |
-| infos/expert_action (T, 2) | what the expert answered in the states visited: the labels to imitate |
+| actions (T, 2) | the executed actions; the env, reset with the episode's seed, replays the episode from them |
+| infos/expert_action (T, 2) | the expert's actions in the visited states: the labels to imitate |
 | infos/state (T+1, 8) | states; order and units in `dynamics.STATE` |
-| an episode's metadata | seed, expert, physics, cost, success, failure, optimum and what follows |
+| an episode's metadata | seed, expert, physics, cost, success, failure and the following |
 
-`optimum` is the cost of the best undisturbed episode from the same start (NaN where none was found), with `solver_status`
-and `violation` of its search; `plans` counts the expert's own plans, and `plans_failed` its searches without one.
+`optimum` is the cost of the optimal undisturbed episode from the same start, NaN if none was found; `solver_status` and
+`violation` are those of its search. `plans` counts the expert's plans, and `plans_failed` its searches that found none.
 
 `load_demos` reads a dataset for learners.
 """
 
 import importlib.metadata
+import inspect
 import json
 import math
 import os
@@ -26,7 +28,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium
 import minari
@@ -34,47 +36,46 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.trajopt import EXECUTED, TrajoptController
+from ballbot_baselines import CONTROLLERS
+from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
+from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
+from ballbot_train.console import check_names
 from ballbot_train.policy import OBSERVATION_VERSION
 
-EXPERTS = ("trajopt", "nmpc", "lqr")
-"""Controllers that can be asked what they would do in any state."""
-
 _CHUNK = 5  # episodes of a job
-_SEEDS = 1_000_000  # per dataset seed: seeds of one dataset are no other's
+_SEEDS = 1_000_000  # episode seeds per dataset seed, so that datasets of different seeds share none
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """What a dataset is made of."""
+    """Settings of a dataset."""
 
     task: str = "stabilize"
     """Name of a task."""
-    expert: Literal["trajopt", "nmpc", "lqr"] = "trajopt"
-    """Who is asked."""
+    expert: str = "trajopt"
+    """Name of a controller in `CONTROLLERS`."""
     episodes: int = 200
+    """Number of episodes."""
     physics: Literal["bullet", "rk4"] = "bullet"
+    """Simulator."""
     noise: float = 0.05
     """Exploration: each episode draws the standard deviation of its noise from [0, this], in units of the force limit."""
     pushes: float = 0.5
     """Mean number per second of control steps in which a random force replaces the expert's."""
     backoff: Backoff = EXECUTED
-    """What the expert's plans keep from their limits; LQR has none."""
+    """What the expert's plans keep from their limits; experts that take no back-off ignore it."""
     seed: int = 0
+    """Seed of the dataset."""
 
     def __post_init__(self) -> None:
         make_task(self.task)
-        if self.expert not in EXPERTS:
-            raise ValueError(f"unknown expert {self.expert!r}; known: {', '.join(EXPERTS)}")
+        check_names("expert", [self.expert], CONTROLLERS)
         if not 1 <= self.episodes <= _SEEDS:
             raise ValueError(f"episodes must be 1 to {_SEEDS}, not {self.episodes}")
         for name in ("noise", "pushes"):
@@ -82,22 +83,22 @@ class DemoConfig:
                 raise ValueError(f"{name} must be finite and at least 0, not {getattr(self, name)}")
 
     def episode_seed(self, i: int) -> int:
-        """With which the env is reset in episode i."""
+        """Seed with which the env is reset in episode i."""
         return _SEEDS * (self.seed + 1) + i
 
 
 @dataclass(frozen=True)
 class Demos:
-    """n steps of demonstrations, episode after episode.
+    """n control steps of demonstrations, episode after episode.
 
     | field | shape | meaning |
     |---|---|---|
     | observations | (n, no) float32 | before the step |
-    | actions | (n, 2) float32 | the expert's answers, in [−1, 1] |
-    | rewards | (n,) float32 | of what was executed |
+    | actions | (n, 2) float32 | the expert's, in [−1, 1] |
+    | rewards | (n,) float32 | of the executed actions |
     | next_observations | (n, no) float32 | after the step; of an episode's last step too |
     | terminations, truncations | (n,) bool | the episode ended with this step |
-    | executed | (n, 2) float32 | actions executed: the expert's plus noise, in [−1, 1] |
+    | executed | (n, 2) float32 | executed actions: the expert's plus noise, in [−1, 1] |
     """
 
     observations: np.ndarray
@@ -120,7 +121,7 @@ class Recording:
     |---|---|---|
     | observations | (T+1, no) float32 | |
     | states | (T+1, 8) | order and units in `dynamics.STATE` |
-    | labels | (T, 2) float32 | the expert's answers, in [−1, 1] |
+    | labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
     | actions | (T, 2) float32 | executed |
     | rewards | (T,) | |
     | terminations, truncations | (T,) bool | |
@@ -135,17 +136,23 @@ class Recording:
     truncations: np.ndarray
 
 
+@runtime_checkable
+class Planner(Controller, Protocol):
+    """A controller that plans at `reset`, and follows `plan` afterwards."""
+
+    plan: Optimum | None
+
+
 class Expert:
-    """A controller that is asked along an episode that does not follow it, and that plans anew where told to."""
+    """A controller as a teacher: it gives its action in states of an episode that others control, and replans if told to."""
 
     def __init__(self, name: str, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
-        """Args: name: in `EXPERTS`."""
-        make: dict[str, Callable[[], Controller]] = {
-            "trajopt": lambda: TrajoptController(task, params, backoff),
-            "nmpc": lambda: NmpcController(task, params, backoff=backoff),
-            "lqr": lambda: LqrController(task, params),
-        }
-        self._task, self._params, self._controller = task, params, make[name]()
+        """Args: name: in `CONTROLLERS`; backoff: given to a controller whose constructor takes one."""
+        make = cast(Callable[..., Controller], CONTROLLERS[name])
+        controller = make(task, params)
+        if "backoff" in inspect.signature(type(controller)).parameters:
+            controller = make(task, params, backoff=backoff)
+        self._task, self._params, self._controller = task, params, controller
         self.plans = self.plans_failed = 0
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
@@ -155,15 +162,16 @@ class Expert:
         self.plans, self.plans_failed = 1, 0
 
     def replan(self, t: float, x: np.ndarray) -> None:
-        """Plans from state x (8,); keeps the plan it has where there is none."""
-        if not hasattr(self._controller, "plan"):
+        """Plans anew from state x (8,); keeps the old plan if there is no new one. Experts without plans do nothing."""
+        controller = self._controller
+        if not isinstance(controller, Planner):
             return
-        plan = self._controller.plan
+        plan = controller.plan
         try:
-            self._controller.reset(t, x, self._c)
+            controller.reset(t, x, self._c)
             self.plans, self._start = self.plans + 1, t
         except PlanError:
-            self._controller.plan = plan
+            controller.plan = plan
             self.plans_failed += 1
 
     def label(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -174,8 +182,8 @@ class Expert:
         return np.clip(force / self._params.force_limit, -1, 1).astype(np.float32)
 
     def _over(self, t: float) -> bool:
-        """Whether a first-exit goal was missed at the plan's end."""
-        plan = getattr(self._controller, "plan", None)
+        """Whether the plan has ended without reaching a first-exit goal."""
+        plan = self._controller.plan if isinstance(self._controller, Planner) else None
         return self._task.first_exit and plan is not None and t - self._start > plan.trajectory.duration - 1e-9
 
 
@@ -188,13 +196,13 @@ def record(
     seed: int | None = None,
     options: dict[str, Any] | None = None,
 ) -> tuple[Recording, dict[str, Any]]:
-    """One episode of an expert, disturbed.
+    """Records an episode of an expert under noise and pushes.
 
     Args:
-        env: what to run in.
-        expert: who is asked in every step.
+        env: the environment.
+        expert: gives the label in every control step.
         rng: of the exploration.
-        noise: as in `DemoConfig`; this episode's standard deviation is drawn.
+        noise: as in `DemoConfig`; the episode's standard deviation is drawn from [0, noise].
         pushes: as in `DemoConfig`.
         seed: as for `env.reset`.
         options: as for `env.reset`.
@@ -242,19 +250,19 @@ def record(
 
 
 def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callable[[int], None]) -> Path:
-    """Makes a dataset, in parallel processes; what a killed run finished is not done again.
+    """Makes a dataset in parallel processes. A killed run continues when it is started again.
 
     Args:
-        config: of the dataset.
-        out: its folder, whose name is the dataset's id: NAME-vNUMBER. It appears when all is there.
-        workers: processes.
-        on_progress: called with a number of episodes that are there.
+        config: settings of the dataset.
+        out: folder of the dataset, named by its id, NAME-vNUMBER. It appears when the dataset is complete.
+        workers: number of processes.
+        on_progress: called with the number of episodes that have been added.
 
     Returns:
         The folder.
 
     Raises:
-        ValueError: `out` is no dataset's name, or holds something else.
+        ValueError: `out` is not named as a dataset, or holds another one.
         PlanError: no episode could be started.
     """
     out = dataset_folder(out)
@@ -282,7 +290,7 @@ def dataset_folder(out: Path) -> Path:
     """The absolute path of a dataset's folder.
 
     Raises:
-        ValueError: its name cannot be that of a dataset.
+        ValueError: the folder's name cannot be a dataset's id.
     """
     out = Path(out).absolute()
     try:
@@ -296,11 +304,11 @@ def load_demos(path: Path, task: Task) -> Demos:
     """Reads a dataset of `ballbot demos`, all its episodes.
 
     Args:
-        path: its folder.
-        task: that it must have been made for.
+        path: folder of the dataset.
+        task: the dataset must have been made for this very task.
 
     Raises:
-        ValueError: it is no such dataset, or one of another task or observation version.
+        ValueError: there is no such dataset, or it is damaged, or of another task or observation version.
     """
     path = Path(path)
     metadata = _metadata(path)
@@ -328,10 +336,10 @@ def load_demos(path: Path, task: Task) -> Demos:
 
 
 def command_of(path: Path) -> str:
-    """The command that writes a dataset of ours anew.
+    """The command that makes a dataset of `ballbot demos` anew.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is no such dataset.
     """
     options = {"out": str(path)}
     for name, value in _metadata(path)["demos"].items():
@@ -344,7 +352,7 @@ def command_of(path: Path) -> str:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """Of a dataset of ours, else a ValueError."""
+    """Metadata of a dataset of `ballbot demos`; raises a ValueError for anything else."""
     try:
         metadata = json.loads((path / "data" / "metadata.json").read_text())
         if "demos" not in metadata:
@@ -355,15 +363,15 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
-    """Writes each episode's arrays to a file, and yields its metadata."""
+    """Writes the arrays of each episode to a file, and yields its metadata."""
     env = BallbotEnv(config.task, physics=config.physics)
     expert = Expert(config.expert, env.task, env.params, config.backoff)
     for i in episodes:
-        rng = np.random.default_rng([config.episode_seed(i), 1])  # not the numbers that the env draws
+        rng = np.random.default_rng([config.episode_seed(i), 1])  # other numbers than the env's
         try:
             recording, info = record(env, expert, rng, config.noise, config.pushes, config.episode_seed(i))
         except PlanError as error:
-            yield {"seed": config.episode_seed(i), "note": str(error)}  # an episode that nobody can demonstrate
+            yield {"seed": config.episode_seed(i), "note": str(error)}  # the expert has no plan from this start
             continue
         files.write_npz(folder / f"{i:06d}.npz", asdict(recording))
         yield {
@@ -393,15 +401,16 @@ def _optimum(env: BallbotEnv, x: np.ndarray, c: np.ndarray) -> dict[str, Any]:
 
 
 def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, out: Path) -> None:
-    """Puts the episodes together under a temporary name, and renames."""
+    """Writes the dataset under a temporary name, and renames it."""
     made = [i for i, entry in enumerate(entries) if "note" not in entry]
     if not made:
         raise PlanError(f"the expert found no plan in any of {len(entries)} episodes: {entries[0]['note']}")
     root = unfinished / "datasets"
     shutil.rmtree(root, ignore_errors=True)
-    env = gymnasium.make(make_task(config.task).id, physics=config.physics)
+    task = make_task(config.task)
+    env = gymnasium.make(task.id, physics=config.physics)
     before = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(root)  # the only way to tell Minari where
+    os.environ["MINARI_DATASETS_PATH"] = str(root)  # Minari offers no other way to choose the folder
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
@@ -410,7 +419,7 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
                 buffer=[_buffer(unfinished / "episodes" / f"{i:06d}.npz", entries[i]["seed"]) for i in made],
                 env=env,
                 algorithm_name=config.expert,
-                description=f"{config.expert} on {env.spec.id}, with exploration; see ballbot_train/demos.py.",
+                description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
                 requirements=[f"ballbot-gym>={importlib.metadata.version('ballbot-gym')}"],
                 data_format="hdf5",
             )
@@ -422,7 +431,7 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
         env.close()
     dataset.storage.update_episode_metadata([entries[i] for i in made])
     dataset.storage.update_metadata(
-        {"task": repr(make_task(config.task)), "observation_version": OBSERVATION_VERSION, "demos": asdict(config)}
+        {"task": repr(task), "observation_version": OBSERVATION_VERSION, "demos": asdict(config)}
     )
     (root / out.name).rename(out)
 

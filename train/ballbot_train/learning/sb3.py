@@ -1,4 +1,4 @@
-"""Stable-Baselines3 on the batched environments, which it does not take as Gymnasium offers them."""
+"""Stable-Baselines3 on the batched environments: it takes its own `VecEnv` and not Gymnasium's vector envs."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,12 +13,12 @@ from ballbot_gym.vector import BallbotVectorEnv
 class BallbotVecEnv(VecEnv):
     """A `BallbotVectorEnv` as a Stable-Baselines3 `VecEnv`: `PPO("MlpPolicy", BallbotVecEnv(make_vec(...)))`.
 
-    The `infos` of a step are empty for running episodes, and have, where one ended:
+    The info of a step is empty while an episode is running. When it ends, the info holds:
 
     | key | meaning |
     |---|---|
-    | terminal_observation | (no,) the observation that the episode ended with |
-    | TimeLimit.truncated | it ran out of time, so that the value of that observation still counts |
+    | terminal_observation | (no,) last observation of the episode |
+    | TimeLimit.truncated | the episode ran out of time, so learners bootstrap from the value of that observation |
     | is_success | the task's goal held at the end; logged as `rollout/success_rate` |
     | failure | a margin was violated |
 
@@ -50,6 +50,7 @@ class BallbotVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        assert self._actions is not None, "step_async comes before step_wait"
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
         listed: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]

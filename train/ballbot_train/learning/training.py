@@ -11,18 +11,18 @@ A run is a folder:
 | tensorboard/ | the learner's figures and those evaluations |
 """
 
-import csv
 import io
 import json
 import math
 import os
+import pickle
 import signal
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -42,9 +42,10 @@ _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
 
 
 class Learner(Protocol):
-    """A learning algorithm as a sequence of iterations, each a second or so.
+    """A learning algorithm as a sequence of iterations, each of about a second.
 
-    Everything that a later iteration depends on is in `state_dict`, so that a resumed learner does what it would have done.
+    `state_dict` holds everything that a later iteration depends on. So a resumed learner does exactly what it would have
+    done without the interruption.
     """
 
     iteration: int
@@ -52,20 +53,31 @@ class Learner(Protocol):
     iterations: int
     """Iterations in all."""
     evaluations: int
-    """How often, at equal distances, the policy is evaluated."""
+    """Number of evaluations, at equal distances."""
 
     @property
     def network(self) -> PolicyNetwork:
         """The policy learnt so far."""
+        ...
 
     def iterate(self) -> dict[str, float]:
         """Does one iteration; returns figures to log by name."""
+        ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain values."""
+        """The learner's state: tensors and plain values."""
+        ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
+
+
+@runtime_checkable
+class Finetunable(Protocol):
+    """A learner that can start from the weights of a policy."""
+
+    def start_from(self, network: PolicyNetwork) -> None:
+        """Takes the weights of a policy; raises a ValueError for a network of another shape."""
 
 
 @dataclass(frozen=True)
@@ -73,18 +85,19 @@ class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
 
     cost_ratio: float
-    """Mean of cost / optimum, an episode without success costing at least what failing at once costs.
-
-    The best policy has the least."""
+    """Mean of cost / optimum; an episode without success costs at least as much as failing at once. The best has least."""
     regret_mean: float
-    """Of the episodes that did not fail."""
+    """Mean of cost / optimum − 1 over the episodes that did not fail."""
     regret_median: float
+    """Median of the same."""
     success: float
+    """Share of the episodes that ended in success."""
     failures: int
+    """Number of episodes that failed."""
 
 
 def score(network: PolicyNetwork, task: Task) -> Score:
-    """Runs all certified episodes at once, some seconds faster than PyBullet one by one."""
+    """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
     episodes = certified.load(task)
     batch = BallbotBatch(task, len(episodes), compile=False)
     run = run_episodes(batch, network, episodes.states, episodes.constants)
@@ -101,19 +114,26 @@ def score(network: PolicyNetwork, task: Task) -> Score:
 
 
 def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool = False) -> evaluate.Row:
-    """Runs a learner to its end, or to Ctrl-C, which saves; then measures the best policy in PyBullet.
+    """Runs a learner to its end and measures the best policy in PyBullet. Ctrl-C saves and stops.
 
     Args:
-        learner: at its beginning.
-        task: what it learns; needs certified episodes.
-        config: what config.json says; a run resumes only with the same.
+        learner: before its first iteration.
+        task: the task; it needs certified episodes.
+        config: contents of config.json; a run resumes only with the same.
         out: folder of the run.
         resume: continue the run in `out`, if there is one.
 
+    Returns:
+        What the best policy measures in PyBullet.
+
     Raises:
-        ValueError: `out` holds another run, or one that was not to be resumed.
+        ValueError: `out` holds another run or a damaged one, it holds this run and `resume` is not given, or the learner
+            has less than one iteration or evaluation to do.
         KeyboardInterrupt: after saving.
     """
+    for name in ("iterations", "evaluations"):
+        if getattr(learner, name) < 1:
+            raise ValueError(f"{name} must be at least 1, not {getattr(learner, name)}")
     run = _Run(learner, task, config, out, resume)
     writer = SummaryWriter(str(out / "tensorboard"), purge_step=learner.iteration)
     every = max(1, learner.iterations // learner.evaluations)
@@ -121,7 +141,7 @@ def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, re
     with _interruptible() as interrupted, progress_bar() as progress:
         bar = progress.add_task(config["learner"], total=learner.iterations, completed=learner.iteration)
         if learner.iteration == 0:
-            run.score()  # so that there is a policy, and learning curves begin where it began
+            run.score()  # so that there is a policy, and learning curves show the start
         while learner.iteration < learner.iterations:
             start = time.monotonic()
             figures = learner.iterate()
@@ -144,7 +164,7 @@ def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, re
 
 
 class _Run:
-    """The folder of a run: what of it must survive."""
+    """The folder of a run."""
 
     def __init__(self, learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool):
         self.learner, self.task, self.config, self.out = learner, task, dict(config), out
@@ -159,12 +179,20 @@ class _Run:
                 raise ValueError(f"{out} holds a run with another {', '.join(differing)}; give another --out")
         files.write(written, json.dumps(self.config | {"about": provenance()}, indent=1) + "\n")
         if (out / "checkpoint.pt").exists():
-            # weights_only: tensors and plain values, nothing that runs
-            state = torch.load(out / "checkpoint.pt", weights_only=True)
-            learner.load_state_dict(state["learner"])
+            state = self._load_checkpoint()
             self.seconds, self.best, self.rows = state["seconds"], state["best"], state["rows"]
             save_policy(out / "policy", self._restored(state["policy"]), self._about())
             self._write_rows()
+
+    def _load_checkpoint(self) -> dict[str, Any]:
+        """Reads the checkpoint and gives the learner its state; a damaged one is a ValueError."""
+        path = self.out / "checkpoint.pt"
+        try:
+            state = torch.load(path, weights_only=True)  # tensors and plain values: nothing in it is executed
+            self.learner.load_state_dict(state["learner"])
+        except (OSError, EOFError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error})") from error
+        return state
 
     def score(self) -> Score:
         """Scores the present policy, and keeps it if it is the best."""
@@ -184,7 +212,7 @@ class _Run:
         return f"{100 * best['regret_mean']:.2f} % regret, {best['failures']} fail"
 
     def save(self) -> None:
-        """Writes the checkpoint, and with it the best policy, so that both are of one moment."""
+        """Writes the checkpoint, with the best policy in it, so that both are of the same iteration."""
         state = {
             "learner": self.learner.state_dict(),
             "seconds": self.seconds,
@@ -197,7 +225,7 @@ class _Run:
         files.write(self.out / "checkpoint.pt", buffer.getvalue())
 
     def measure(self) -> evaluate.Row:
-        """The best policy on the certified episodes in PyBullet; its JSON says it from now on."""
+        """Measures the best policy on the certified episodes in PyBullet, and adds the result to its JSON file."""
         network = load_network(self.out / "policy", self.task)
         env = BallbotEnv(self.task)
         controller = PolicyController(self.task, default_params(), network)
@@ -229,16 +257,12 @@ class _Run:
         }
 
     def _write_rows(self) -> None:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(self.rows[0]) if self.rows else [], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        files.write(self.out / "evaluations.csv", text.getvalue())
+        files.write_csv(self.out / "evaluations.csv", self.rows)
 
 
 @contextmanager
 def _interruptible() -> Iterator[Any]:
-    """Gives a function that says whether Ctrl-C was pressed, which within ends nothing half-way; a second one does."""
+    """Yields a function that says whether Ctrl-C was pressed. The first Ctrl-C interrupts nothing; a second one does."""
     pressed: list[int] = []
 
     def on_signal(number: int, frame: object) -> None:

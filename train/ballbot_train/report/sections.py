@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ballbot_train.console import console
 from ballbot_train.evaluation.results import Result
 from ballbot_train.report import figures, labels
 from ballbot_train.report.page import (
@@ -97,12 +98,16 @@ def learning_section(runs: Path) -> Section | None:
         config = path.with_name("config.json")
         if not config.exists():
             continue
-        described = json.loads(config.read_text())
-        rows = list(csv.DictReader(path.read_text().splitlines()))
-        lines = tasks.setdefault(str(described.get("task")), [])
-        points = [(float(row["seconds"]), 100 * float(row["regret_mean"])) for row in rows]
+        try:
+            described = json.loads(config.read_text())
+            task, learner = str(described.get("task")), str(described.get("learner"))
+            rows = list(csv.DictReader(path.read_text().splitlines()))
+            points = [(float(row["seconds"]), 100 * float(row["regret_mean"])) for row in rows]
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, csv.Error) as error:
+            console.print(f"skipped: {config} or {path.name} beside it is damaged: {error!r}")
+            continue
+        lines = tasks.setdefault(task, [])
         finite = np.array([point for point in points if np.isfinite(point).all()]).reshape(-1, 2)
-        learner = str(described.get("learner"))
         again = any(line.label.startswith(f"{learner}:") for line in lines)
         shade = labels.color("" if again else learner, len(lines))
         lines.append(Line(f"{learner}: {path.parent.name}", finite[:, 0], finite[:, 1], shade))

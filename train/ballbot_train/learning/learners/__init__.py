@@ -1,32 +1,75 @@
-"""Learning algorithms by name, one file each."""
+"""Learning algorithms by name, one file each.
 
-from collections.abc import Callable, Mapping
+A new learner is one file and one line in `LEARNERS`. Its file holds
+
+- a frozen dataclass of settings whose defaults suit any task, with a docstring under every field;
+- `TUNED`, settings by name of task, for the tasks that want others than the defaults;
+- `make(task, params, settings, seed, demos)`, which returns the learner before its first iteration (see `training.Learner`).
+"""
+
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ballbot_gym.lazy import load
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_train.learning.learners import bc, dagger, ppo, sac, shac
-from ballbot_train.learning.training import Learner
+
+if TYPE_CHECKING:
+    from ballbot_train.learning.training import Learner
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """How a learner is made."""
+    """An entry of `LEARNERS`. The learner's file, and with it torch, is imported when one of the methods is called."""
 
-    make: Callable[[Task, BallbotParams, Any, int, Path | None], Learner]
-    """(task, params, settings, seed, folder of demonstrations or None) -> learner at its beginning."""
-    tuned: Mapping[str, Any]
-    """Settings, a frozen dataclass, by name of task."""
+    module: str
+    """The file, as for an import."""
+    config: str
+    """Name of the dataclass of its settings."""
+    description: str
+    """One line for the command line."""
     demonstrations: bool
-    """Whether it can use demonstrations."""
+    """Whether the learner can use demonstrations."""
 
+    def settings(self, task: str) -> Any:
+        """The settings tuned for a task, or the defaults if the task has none.
+
+        Args:
+            task: name of a task.
+
+        Returns:
+            A frozen dataclass; `dataclasses.replace` changes some of its fields.
+        """
+        return load(f"{self.module}:TUNED").get(task, load(f"{self.module}:{self.config}")())
+
+    def make(self, task: Task, params: BallbotParams, settings: Any, seed: int, demos: Path | None) -> "Learner":
+        """Makes the learner.
+
+        Args:
+            task: to learn.
+            params: the robot.
+            settings: as of `settings`.
+            seed: of everything that the learner draws.
+            demos: folder of a dataset of demonstrations, or None.
+
+        Returns:
+            The learner before its first iteration.
+
+        Raises:
+            ValueError: the demonstrations are missing, of another task, or of no use to this learner.
+        """
+        if demos is not None and not self.demonstrations:
+            raise ValueError(f"{self.module.rpartition('.')[2]} uses no demonstrations")
+        return load(f"{self.module}:make")(task, params, settings, seed, demos)
+
+
+_HERE = __name__
 
 LEARNERS: dict[str, Algorithm] = {
-    "bc": Algorithm(bc.make, bc.TUNED, demonstrations=True),
-    "dagger": Algorithm(dagger.make, dagger.TUNED, demonstrations=True),
-    "ppo": Algorithm(ppo.make, ppo.TUNED, demonstrations=True),
-    "sac": Algorithm(sac.make, sac.TUNED, demonstrations=True),
-    "shac": Algorithm(shac.make, shac.TUNED, demonstrations=False),
+    "bc": Algorithm(f"{_HERE}.bc", "BcConfig", "behaviour cloning of demonstrations", demonstrations=True),
+    "dagger": Algorithm(f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True),
+    "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True),
+    "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True),
+    "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False),
 }

@@ -1,9 +1,9 @@
-"""What PPO and SAC share: their stages, the envs they train on, imitation, and their actors as policies."""
+"""What PPO and SAC share: stages of training, the envs they train on, imitation, and their actors as policies."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from ballbot_gym.batch import BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector import BallbotVectorEnv
+from ballbot_train.learning import schedules
 from ballbot_train.learning.demonstrations import Demos
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
@@ -25,62 +26,76 @@ from ballbot_train.policy import PolicyNetwork, PolicySpec
 class ModelFreeConfig:
     """Settings that PPO and SAC share."""
 
-    iterations: int
-    """Of reinforcement learning: `envs` times `steps` env steps each."""
-    envs: int
-    steps: int
+    rl_iterations: int
+    """Iterations of reinforcement learning, each of `num_envs * num_steps` env steps."""
+    num_envs: int
+    """Envs that are stepped together."""
+    num_steps: int
     """Control steps of each env per iteration."""
     evaluations: int = 20
-    episode: float = 4.0
-    """s, after which episodes start anew in training."""
+    """Number of evaluations on the certified episodes, at equal distances."""
+    episode_seconds: float = 4.0
+    """Duration of an episode in training, s."""
     reward_scale: float = 0.02
-    discount: float = 0.995
-    """Per control step."""
+    """Factor of every reward."""
+    gamma: float = 0.995
+    """Discount factor per control step."""
     hidden: tuple[int, ...] = (128, 128)
-    """Of actor and of critics."""
+    """Units of the hidden layers of actor and critics."""
     clone_iterations: int = 20
-    """Iterations of behaviour cloning before those of reinforcement learning, of `clone_steps` gradient steps each."""
-    clone_steps: int = 300
-    clone_batch: int = 1024
-    clone_rate: float = 2e-3
-    """Learning rate at the start, falling linearly to 0."""
-    critic_iterations: int = 10
-    """How many iterations of reinforcement learning teach the critic alone, where there are demonstrations."""
-    imitation: float = 0.0
-    """Weight of the imitation loss at the start of reinforcement learning; fades linearly to 0."""
+    """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
+    clone_gradient_steps: int = 300
+    """Gradient steps per iteration of behaviour cloning."""
+    clone_batch_size: int = 1024
+    """Demonstrated steps per gradient step, in behaviour cloning and in the imitation loss."""
+    clone_learning_rate: float = 2e-3
+    """Learning rate of behaviour cloning at the start; falls linearly to 0."""
+    critic_warmup_iterations: int = 10
+    """Iterations of reinforcement learning that train the critic alone, if there are demonstrations."""
+    imitation_weight: float = 0.0
+    """Weight of the imitation loss at the start of reinforcement learning; falls linearly to 0."""
 
 
 class ModelFree(ABC):
     """What PPO and SAC have in common; see `training.Learner`.
 
-    With demonstrations there are three stages. First the actor imitates the expert's actions (behaviour cloning). Then its
-    critic alone learns what the imitation costs, because a critic that knows nothing would spoil it. From then on it is
-    reinforcement learning, whose every gradient step also follows the gradient of an imitation loss, with a weight that
-    fades to nothing.
+    With demonstrations there are three stages. First the actor imitates the expert's actions (behaviour cloning). Then the
+    critic alone is trained, because the gradient of an untrained critic would undo the imitation. Then actor and critic are
+    trained by reinforcement learning. In this stage the gradient of an imitation loss is added to every step of the actor,
+    with a weight that falls to 0.
 
-    A resumed run does what it would have done; only the success rate of the last hundred episodes is not kept.
+    A resumed run does exactly what it would have done; only the success rate of the last hundred episodes starts anew.
     """
 
     def __init__(self, task: Task, params: BallbotParams, config: ModelFreeConfig, demos: Demos | None):
-        self.config, self.iteration, self._task, self._demos = config, 0, task, demos
+        self.iteration, self._settings, self._task, self._demos = 0, config, task, demos
         self._clone_iterations = 0 if demos is None else config.clone_iterations
-        self._critic_iterations = 0 if demos is None else config.critic_iterations
-        self.iterations, self.evaluations = config.iterations + self._clone_iterations, config.evaluations
-        self._env = TrainingEnv(task, params, config.envs, config.episode, config.reward_scale)
+        self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
+        self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
+        self._env = TrainingEnv(task, params, config.num_envs, config.episode_seconds, config.reward_scale)
 
-    def _begin(self, model: BaseAlgorithm, actor: nn.Sequential, optimizers: Sequence[torch.optim.Optimizer]) -> None:
+    def _set_model(
+        self, model: BaseAlgorithm, actor: nn.Sequential, optimizers: Sequence[torch.optim.Optimizer]
+    ) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
         self._model, self._actor, self._optimizers = model, actor, optimizers
         model.set_logger(Logger(folder=None, output_formats=[]))
         model._last_obs = self._env.reset()
-        model._last_episode_starts = np.ones(self.config.envs, bool)
-        self._imitation = None if self._demos is None else Imitation(actor, self._demos, self.config.clone_batch)
+        model._last_episode_starts = np.ones(self._settings.num_envs, bool)
+        self._imitation = (
+            None if self._demos is None else Imitation(actor, self._demos, self._settings.clone_batch_size)
+        )
         optimizers[0].register_step_pre_hook(self._add_imitation)
-        self._random = OwnRandomness()
+        self._random = ScopedRng()
+
+    @property
+    @abstractmethod
+    def network(self) -> PolicyNetwork:
+        """The policy learnt so far."""
 
     @abstractmethod
     def _imitation_scale(self) -> float:
-        """What the imitation loss, the mean squared difference of the actions, is multiplied by, besides its weight."""
+        """Factor of the imitation loss, the mean squared difference of the actions, besides its weight."""
 
     def iterate(self) -> dict[str, float]:
         with self._random:
@@ -118,59 +133,63 @@ class ModelFree(ABC):
     @property
     def _progress(self) -> float:
         """Share of the iterations of reinforcement learning that are done."""
-        return (self.iteration - self._clone_iterations) / self.config.iterations
+        return (self.iteration - self._clone_iterations) / self._settings.rl_iterations
 
     @property
     def _critic_only(self) -> bool:
-        return self.iteration < self._clone_iterations + self._critic_iterations
+        return self.iteration < self._clone_iterations + self._warmup_iterations
 
     def _clone(self) -> dict[str, float]:
         """One iteration of behaviour cloning."""
-        rate = self.config.clone_rate * (1 - self.iteration / self._clone_iterations)
-        return self._imitation.clone(self.config.clone_steps, rate)
+        assert self._imitation is not None
+        progress = self.iteration / self._clone_iterations
+        rate = schedules.linear(self._settings.clone_learning_rate, 0.0, progress)
+        return self._imitation.clone(self._settings.clone_gradient_steps, rate)
 
     def _improve(self) -> dict[str, float]:
         """One iteration of reinforcement learning."""
-        config, model = self.config, self._model
+        settings, model = self._settings, self._model
         self._actor.requires_grad_(not self._critic_only)
-        model.learn(config.envs * config.steps, log_interval=None, reset_num_timesteps=False)
+        # SB3 takes None as "never" for its own printing
+        model.learn(settings.num_envs * settings.num_steps, log_interval=cast(int, None), reset_num_timesteps=False)
         self._actor.requires_grad_(True)
         return {**model.logger.name_to_value, "train/env_steps": model.num_timesteps}
 
     def _add_imitation(self, *_: object) -> None:
-        """Adds the imitation loss's gradient to that of a step of the actor."""
+        """Adds the gradient of the imitation loss to that of a step of the actor."""
         if self._imitation is not None and not self._critic_only:
-            weight = self.config.imitation * (1 - self._progress) * self._imitation_scale()
+            weight = self._settings.imitation_weight * (1 - self._progress) * self._imitation_scale()
             (weight * self._imitation.loss()).backward()
 
 
 class TrainingEnv(VecEnvWrapper):
-    """A task's batched envs for learning: shorter episodes and scaled rewards change no optimum.
+    """A task's batched envs for learning: shorter episodes and scaled rewards.
 
-    An episode that runs out of time is truncated, and the learners count the value of where it stopped; so shorter
-    episodes only leave out rest, of which there is little to learn.
+    The optimal policy stays the same. An episode that runs out of time is truncated, and the learners bootstrap from the
+    value of its last state; so shorter episodes only leave out rest, which teaches little.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, envs: int, episode: float, reward_scale: float):
-        """Args: episode: s; reward_scale: what every reward is multiplied by."""
-        shorter = replace(task, duration=episode)
-        self._vector = BallbotVectorEnv(envs, shorter, params=params, compile=False)
+    def __init__(self, task: Task, params: BallbotParams, num_envs: int, episode_seconds: float, reward_scale: float):
+        """Args: episode_seconds: duration of an episode, s; reward_scale: factor of every reward."""
+        self._vector = BallbotVectorEnv(num_envs, replace(task, duration=episode_seconds), params=params, compile=False)
         self._scale = np.float32(reward_scale)
         super().__init__(BallbotVecEnv(self._vector))
 
     def reset(self) -> np.ndarray:
-        """Starts an episode in every env, as if each were under way for another while, so that they never end together."""
-        observation, batch = self.venv.reset(), self._vector.batch
-        under_way = torch.arange(self.num_envs) * self._vector.task.steps // self.num_envs
-        batch.state = batch.state._replace(steps=under_way)
+        """Starts an episode in every env, with step counts that differ so that the episodes never end together."""
+        observation, batch = cast(np.ndarray, self.venv.reset()), self._vector.batch
+        assert batch.state is not None
+        steps = torch.arange(self.num_envs) * self._vector.task.steps // self.num_envs
+        batch.state = batch.state._replace(steps=steps)
         return observation
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observation, reward, done, infos = self.venv.step_wait()
-        return observation, self._scale * reward, done, infos
+        return cast(np.ndarray, observation), self._scale * reward, done, infos
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Of every env: tensors."""
+        """State of every env: tensors."""
+        assert self._vector.batch.state is not None
         return self._vector.batch.state._asdict()
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
@@ -179,33 +198,33 @@ class TrainingEnv(VecEnvWrapper):
 
 
 class Imitation:
-    """How an actor learns what an expert did: behaviour cloning, and a loss to add to that of reinforcement learning."""
+    """Imitation of an expert by an actor: behaviour cloning, and a loss to add to that of reinforcement learning."""
 
-    def __init__(self, actor: nn.Module, demos: Demos, batch: int):
-        """Args: actor: observations (n, no) to mean actions (n, 2); batch: demonstrated steps per gradient step."""
-        self._actor, self._batch = actor, batch
+    def __init__(self, actor: nn.Module, demos: Demos, batch_size: int):
+        """Args: actor: observations (n, no) to mean actions (n, 2); batch_size: demonstrated steps per gradient step."""
+        self._actor, self._batch_size = actor, batch_size
         self._observations, self._labels = torch.as_tensor(demos.observations), torch.as_tensor(demos.actions)
         self._optimizer = torch.optim.Adam(actor.parameters())
 
     def loss(self) -> torch.Tensor:
-        """Mean squared difference from the expert's actions in some demonstrated states."""
-        chosen = torch.randint(len(self._labels), (self._batch,))
+        """Mean squared difference from the expert's actions in demonstrated states, drawn at random."""
+        chosen = torch.randint(len(self._labels), (self._batch_size,))
         return nn.functional.mse_loss(self._actor(self._observations[chosen]), self._labels[chosen])
 
-    def clone(self, steps: int, learning_rate: float) -> dict[str, float]:
-        """Gradient steps of behaviour cloning; returns figures to log."""
+    def clone(self, gradient_steps: int, learning_rate: float) -> dict[str, float]:
+        """Takes gradient steps of behaviour cloning; returns figures to log."""
         total = 0.0
         self._optimizer.param_groups[0]["lr"] = learning_rate
-        for _ in range(steps):
+        for _ in range(gradient_steps):
             loss = self.loss()
             self._optimizer.zero_grad()
             loss.backward()
             self._optimizer.step()
             total += float(loss.detach())
-        return {"loss/cloning": total / steps}
+        return {"loss/cloning": total / gradient_steps}
 
     def state_dict(self) -> dict[str, Any]:
-        """Of the optimizer; the actor is not its own."""
+        """State of the optimizer. The actor belongs to the model."""
         return self._optimizer.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -213,11 +232,15 @@ class Imitation:
         self._optimizer.load_state_dict(state)
 
 
-class OwnRandomness:
-    """A learner's own streams of the global random numbers of torch and NumPy, from which Stable-Baselines3 draws.
+class ScopedRng:
+    """Random numbers of a learner's own, although Stable-Baselines3 draws from the global generators of torch and NumPy.
 
-    `with` it, they go on where they stopped the last time, whatever was drawn in between.
+    Within `with rng:` the global generators continue where they stopped at the end of the last such block, whatever was
+    drawn in between.
     """
+
+    _torch: torch.Tensor
+    _numpy: tuple[str, np.ndarray, int, int, float]
 
     def __init__(self):
         self._capture()
@@ -240,11 +263,11 @@ class OwnRandomness:
         self._torch, self._numpy = state["torch"], (kind, np.array(words, np.uint32), *rest)
 
     def _capture(self) -> None:
-        self._torch, self._numpy = torch.get_rng_state(), np.random.get_state()
+        self._torch, self._numpy = torch.get_rng_state(), cast(Any, np.random.get_state())
 
 
 def as_policy(layers: Iterable[nn.Module], task: Task, **fields: Any) -> PolicyNetwork:
-    """The layers of an actor, from observation to mean action, as a policy; fields are the spec's."""
+    """Copies the layers of an actor, from observation to mean action, into a policy; fields are those of `PolicySpec`."""
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     hidden = tuple(layer.out_features for layer in linear[:-1])
     network = PolicyNetwork(PolicySpec.of(task, hidden=hidden, linear=False, **fields))

@@ -1,14 +1,14 @@
-"""Soft actor-critic, of Stable-Baselines3, from scratch or from demonstrations.
+"""Soft actor-critic by Stable-Baselines3, from scratch or from demonstrations.
 
-With demonstrations half of every batch is drawn from them and half from what the actor did itself (Ball et al., Efficient
-Online Reinforcement Learning with Offline Data, 2023); what else they do is `ModelFree`'s.
+With demonstrations, half of every batch is drawn from them and half from the actor's own steps (Ball et al., "Efficient
+online reinforcement learning with offline data", 2023). `ModelFree` says what else demonstrations do.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_train.learning import schedules
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
 from ballbot_train.policy import PolicyNetwork
@@ -27,41 +28,39 @@ from ballbot_train.policy import PolicyNetwork
 class SacConfig(ModelFreeConfig):
     """Settings of `Sac`."""
 
-    iterations: int = 200
-    envs: int = 16
-    steps: int = 63
+    rl_iterations: int = 200
+    num_envs: int = 16
+    num_steps: int = 63
     clone_iterations: int = 15
-    imitation: float = 300.0
+    imitation_weight: float = 300.0
     gradient_steps: int = 4
-    """After each control step of all envs."""
-    critics: int = 2
+    """Gradient steps after each control step of all envs."""
+    num_critics: int = 2
+    """Critics, whose smallest value counts."""
     learning_rate: float = 5e-4
-    """At the start; falls linearly to `final_rate` of it."""
-    final_rate: float = 0.1
-    batch: int = 256
-    follow: float = 0.005
+    """Learning rate at the start."""
+    final_learning_rate_fraction: float = 0.1
+    """Learning rate at the end, as a fraction of that at the start. It falls linearly."""
+    batch_size: int = 256
+    """Env steps per gradient step."""
+    tau: float = 0.005
     """Share by which the target critics move to the critics at each gradient step."""
-    entropy: float = -5.0
-    """Of the actions that the actor keeps, nats."""
-    temperature: float = 0.01
-    """Price of entropy at the start, in scaled rewards."""
-    deviation: float = 0.5
-    """Standard deviation of the actions at the start, before they are squashed."""
-    demo_deviation: float = 0.05
-    """In place of `deviation` where there are demonstrations."""
+    target_entropy: float = -5.0
+    """Entropy of the actions to which the entropy coefficient is tuned, nats."""
+    ent_coef: float = 0.01
+    """Entropy coefficient at the start, in scaled rewards per nat."""
+    std: float = 0.5
+    """Standard deviation of the actions at the start, before tanh."""
+    demo_std: float = 0.05
+    """In place of `std` if there are demonstrations."""
 
 
-TUNED: dict[str, SacConfig] = {
-    "stabilize": SacConfig(),
-    "turn": SacConfig(episode=8.0),
-    "orbit": SacConfig(),
-    "weave": SacConfig(episode=8.0),
-}
-"""By task."""
+TUNED: dict[str, SacConfig] = {"turn": SacConfig(episode_seconds=8.0), "weave": SacConfig(episode_seconds=8.0)}
+"""Settings by name of task; every other task takes the defaults."""
 
 
 class SymmetricReplay(ReplayBuffer):
-    """A replay buffer half of whose samples are demonstrations, if there are any."""
+    """A replay buffer that draws half of its samples from demonstrations, if there are any."""
 
     def __init__(self, *args: Any, demos: Demos | None, reward_scale: float, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -84,7 +83,7 @@ class SymmetricReplay(ReplayBuffer):
         return ReplayBufferSamples(*(torch.cat([a, b[chosen]]) for a, b in zip(own[:5], self._demos, strict=True)))
 
     def state_dict(self) -> dict[str, Any]:
-        """What is filled of it, the demonstrations excepted."""
+        """The steps in the buffer, without the demonstrations."""
         filled = self.buffer_size if self.full else self.pos
         return {"pos": self.pos, "full": self.full} | {
             name: torch.from_numpy(getattr(self, name)[:filled].copy()) for name in _COLUMNS
@@ -104,38 +103,42 @@ class Sac(ModelFree):
     """The learner; see `training.Learner`."""
 
     def __init__(self, task: Task, params: BallbotParams, config: SacConfig, seed: int = 0, demos: Demos | None = None):
-        """Args: demos: `Demos` to learn from too, or None."""
+        """Args: demos: demonstrations to learn from as well, or None."""
         super().__init__(task, params, config, demos)
+        self.config = config
+        rate = config.learning_rate
         model = SAC(
             "MlpPolicy",
             self._env,
-            learning_rate=lambda _: config.learning_rate * (1 - (1 - config.final_rate) * self._progress),
-            buffer_size=config.iterations * config.steps * config.envs,
+            learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
+            buffer_size=config.rl_iterations * config.num_steps * config.num_envs,
             learning_starts=0,
-            batch_size=config.batch,
-            tau=config.follow,
-            gamma=config.discount,
+            batch_size=config.batch_size,
+            tau=config.tau,
+            gamma=config.gamma,
             gradient_steps=config.gradient_steps,
             replay_buffer_class=SymmetricReplay,
             replay_buffer_kwargs={"demos": demos, "reward_scale": config.reward_scale},
-            ent_coef=f"auto_{config.temperature}",
-            target_entropy=config.entropy,
+            ent_coef=f"auto_{config.ent_coef}",
+            target_entropy=config.target_entropy,
             policy_kwargs={
                 "net_arch": list(config.hidden),
-                "n_critics": config.critics,
+                "n_critics": config.num_critics,
                 "activation_fn": torch.nn.SiLU,
             },
             seed=seed,
             device="cpu",
         )
-        actor = model.actor
-        torch.nn.init.zeros_(actor.log_std.weight)
-        deviation = config.deviation if demos is None else config.demo_deviation
-        torch.nn.init.constant_(actor.log_std.bias, math.log(deviation))
-        self._begin(
+        # with an entropy coefficient that is tuned, SB3 makes both
+        self._log_ent_coef = cast(torch.Tensor, model.log_ent_coef)
+        self._replay = cast(SymmetricReplay, model.replay_buffer)
+        actor, log_std = model.actor, cast(torch.nn.Linear, model.actor.log_std)
+        torch.nn.init.zeros_(log_std.weight)
+        torch.nn.init.constant_(log_std.bias, math.log(config.std if demos is None else config.demo_std))
+        self._set_model(
             model,
             torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
-            (actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer),
+            (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
         )
 
     @property
@@ -143,19 +146,22 @@ class Sac(ModelFree):
         return as_policy(self._actor, self._task, activation="silu", squash="tanh")
 
     def state_dict(self) -> dict[str, Any]:
-        model = self._model
-        own = {"temperature": model.log_ent_coef.detach(), "replay": model.replay_buffer.state_dict()}
+        own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}
         return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
-        self._model.log_ent_coef.data.copy_(state["temperature"])
-        self._model.replay_buffer.load_state_dict(state["replay"])
+        self._log_ent_coef.data.copy_(state["log_ent_coef"])
+        self._replay.load_state_dict(state["replay"])
 
     def _imitation_scale(self) -> float:
         return 1.0
 
 
 def make(task: Task, params: BallbotParams, config: SacConfig, seed: int, demos: Path | None) -> Sac:
-    """The learner at its beginning."""
+    """Makes the learner.
+
+    Raises:
+        ValueError: the demonstrations are of another task.
+    """
     return Sac(task, params, config, seed, None if demos is None else load_demos(demos, task))

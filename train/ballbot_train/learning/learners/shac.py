@@ -1,19 +1,20 @@
-"""Short-horizon actor-critic: the policy follows the exact gradient of cost through windows of the batched model.
+"""Short-horizon actor-critic: the policy follows the exact gradient of the cost through windows of the batched model.
 
-Each iteration rolls a window of control steps out from where the last one ended. Its loss is the window's cost and, at its
-end, what a learnt critic says is still to come; the gradient runs through physics and policy (Xu et al., Accelerated Policy
-Learning with Parallel Differentiable Simulation, 2022). Every episode's loss is divided by what the critic expects it to
-cost from its start, because regret is relative too.
+Each iteration rolls out a window of `horizon` control steps, from where the last window ended. The loss is the cost of the
+window plus the cost that a learnt critic expects after it. Its gradient runs through physics and policy (Xu et al.,
+"Accelerated policy learning with parallel differentiable simulation", 2022). Every episode's loss is divided by the cost that
+the critic expects from the episode's start, because regret is relative too.
 
-Two things in the tasks have no gradient and get one here: margins, by a penalty on coming closer than `clearance`; and the
-first exit, by letting an episode end softly, a share of it at each step the deeper it is in the goal.
+Two parts of a task have no gradient and get one here. A penalty on coming closer to a margin than `margin_clearance` stands
+for failures. For the first exit, an episode ends gradually: at each step a share of it ends that grows with the depth in the
+goal.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 
@@ -21,6 +22,8 @@ from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_train.learning import schedules
+from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 
@@ -28,45 +31,50 @@ from ballbot_train.policy import PolicyNetwork, PolicySpec
 class ShacConfig:
     """Settings of `Shac`."""
 
-    iterations: int = 4000
+    total_iterations: int = 4000
+    """Number of iterations, each of `num_envs * horizon` env steps."""
     evaluations: int = 20
-    envs: int = 512
-    window: int = 50
-    """Control steps through which the gradient runs."""
-    restart: float = 0.4
-    """Share of the envs that start a new episode after each window: the first second costs most."""
+    """Number of evaluations on the certified episodes, at equal distances."""
+    num_envs: int = 512
+    """Envs that are stepped together."""
+    horizon: int = 50
+    """Length of a window, through which the gradient runs, in control steps."""
+    reset_fraction: float = 0.4
+    """Share of the envs that start a new episode after each window, because the first second costs most."""
     hidden: tuple[int, ...] = (128, 128)
+    """Units of the hidden layers of policy and critic."""
     odd: bool = False
-    """Whether opposite observations get opposite actions, as is right where the goal is the origin and nothing in the way."""
+    """Whether opposite observations get opposite actions; only right if the goal is the origin and nothing is in the way."""
     learning_rate: float = 3e-3
-    """Of policy and critic at the start; falls along a half cosine to `final_rate` of it."""
-    start_rate: float = 5e-4
-    """In place of `learning_rate` where there is a policy to start from."""
-    critic_first: int = 40
-    """Iterations for which only the critic learns where there is a policy to start from."""
-    final_rate: float = 0.01
-    least_cost: float = 0.5
-    """An episode counts as if it cost at least this much."""
-    discount: float = 1.0
-    """Per control step; below 1 where the cost never ends."""
-    critic_steps: int = 4
-    """Gradient steps of the critic per iteration; with 0 it stays what it begins as, at an equilibrium task LQR's cost."""
+    """Learning rate of policy and critic at the start."""
+    finetune_learning_rate: float = 5e-4
+    """In place of the policy's `learning_rate` if training starts from a policy file."""
+    critic_warmup_iterations: int = 40
+    """Iterations that train the critic alone if training starts from a policy file."""
+    final_learning_rate_fraction: float = 0.01
+    """Learning rate at the end, as a fraction of that at the start. It falls along half a cosine."""
+    min_cost: float = 0.5
+    """Cheaper episodes are weighted as if they cost this much."""
+    gamma: float = 1.0
+    """Discount factor per control step; below 1 for tasks whose cost never ends."""
+    critic_gradient_steps: int = 4
+    """Gradient steps of the critic per iteration; with 0 it stays as it starts, LQR's cost on a task that ends at rest."""
     critic_stride: int = 4
-    """Of a window's steps, the critic learns from one in so many."""
-    critic_follow: float = 0.2
+    """The critic learns from every so many-th control step of a window."""
+    tau: float = 0.2
     """Share by which the target critic moves to the critic after each iteration."""
-    max_gradient: float = 1.0
+    max_grad_norm: float = 1.0
     """Norm to which the policy's gradient is clipped."""
-    failure_price: float = 1000.0
-    """What a failure costs in training, whenever it comes."""
-    clearance: float = 0.0
-    """How far from the margins the penalty begins, in the margins' units."""
-    margin_price: float = 0.0
-    """Of the squared distance by which the clearance is missed."""
+    failure_penalty: float = 1000.0
+    """Cost of a failure in training, whenever it comes."""
+    margin_clearance: float = 0.0
+    """Distance from the margins at which the penalty starts, in the margins' units."""
+    margin_penalty: float = 0.0
+    """Penalty per second and squared shortfall of the clearance; 0: none."""
     exit_softness: float = 0.0
-    """Of the first exit, in units of the goal's excess; 0 ends no episode softly."""
+    """Width of the gradual first exit, in units of the goal functions; 0: episodes end at once."""
     compile: bool = True
-    """Whether a control step is compiled, which takes half a minute once."""
+    """Whether a control step is compiled, which takes half a minute at the start."""
 
 
 _SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
@@ -75,16 +83,21 @@ _ENDLESS = 10**6  # control steps: longer than any episode in training
 TUNED: dict[str, ShacConfig] = {
     "stabilize": ShacConfig(odd=True),
     "turn": ShacConfig(exit_softness=0.3),
-    "orbit": ShacConfig(discount=0.998),
+    "orbit": ShacConfig(gamma=0.998),
     "weave": ShacConfig(
-        iterations=10_000, evaluations=25, restart=0.25, hidden=(256, 256), clearance=0.1, margin_price=3000.0
+        total_iterations=10_000,
+        evaluations=25,
+        reset_fraction=0.25,
+        hidden=(256, 256),
+        margin_clearance=0.1,
+        margin_penalty=3000.0,
     ),
 }
-"""By task."""
+"""Settings by name of task; every other task takes the defaults."""
 
 
 class _Record(NamedTuple):
-    """What one step of a window leaves for the critic."""
+    """What the critic learns from in one step of a window."""
 
     observation: torch.Tensor
     """(B, no) before the step."""
@@ -97,7 +110,7 @@ class _Record(NamedTuple):
 
 
 class Critic(torch.nn.Module):
-    """Cost still to come: observations (B, no) to (B,), in multiples of what LQR would pay at an equilibrium task."""
+    """Expected cost from observations (B, no), (B,); on a task that ends at rest a multiple of LQR's cost."""
 
     def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...]):
         super().__init__()
@@ -111,6 +124,7 @@ class Critic(torch.nn.Module):
         torch.nn.init.zeros_(last.bias)
         self.mlp = torch.nn.Sequential(*layers, last)
         gain = equilibrium_gain(task, params)
+        self.p: torch.Tensor | None
         self.register_buffer("p", None if gain is None else torch.tensor(gain[1], dtype=torch.float32))
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
@@ -127,22 +141,18 @@ class Shac:
     def __init__(self, task: Task, params: BallbotParams, config: ShacConfig, seed: int = 0):
         torch.manual_seed(seed)  # for the networks' first weights
         self._random = torch.Generator().manual_seed(seed)
-        self.config, self.iteration, self._started = config, 0, False
-        self.iterations, self.evaluations = config.iterations, config.evaluations
-        self.task = replace(task, duration=_ENDLESS * task.control_dt)  # windows end episodes, the task does not
+        self.config, self.iteration, self._finetuning = config, 0, False
+        self.iterations, self.evaluations = config.total_iterations, config.evaluations
+        self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
         self._network = PolicyNetwork(PolicySpec.of(task, hidden=config.hidden, odd=config.odd))
-        for part in self._network.linear.parameters():
-            torch.nn.init.zeros_(part)
-        if (gain := equilibrium_gain(task, params)) is not None:
-            with torch.no_grad():
-                self._network.linear.weight[:, :8] = torch.tensor(gain[0])
+        start_as_lqr(self._network, task, params)
         self.critic = Critic(task, params, config.hidden)
         self.target = Critic(task, params, config.hidden)
         self.target.load_state_dict(self.critic.state_dict())
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), config.learning_rate, betas=(0.7, 0.95))
-        self._batch = BallbotBatch(self.task, config.envs, compile=False, params=params)
-        self._start = self._batch.reset(seed=seed)  # (B, no) what the running episodes started from
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
+        self._start = self._batch.reset(seed=seed)  # (B, no) first observations of the running episodes
         step = self._one_step
         self._step = torch.compile(step, fullgraph=True, dynamic=False) if config.compile else step
 
@@ -150,43 +160,43 @@ class Shac:
     def network(self) -> PolicyNetwork:
         return self._network
 
-    def begin(self, network: PolicyNetwork) -> None:
-        """Takes a policy's weights to start from, in place of LQR's or none.
+    def start_from(self, network: PolicyNetwork) -> None:
+        """Takes the weights of a policy, to be improved.
 
         Raises:
-            ValueError: its network is built otherwise.
+            ValueError: its network differs in shape from this one.
         """
         if network.spec != self._network.spec:
             raise ValueError(
-                f"a policy of {network.spec} cannot start one of {self._network.spec}; --set hidden or odd"
+                f"a policy of {network.spec} cannot start one of {self._network.spec}; give --hidden, --odd or --no-odd"
             )
         self._network.load_state_dict(network.state_dict())
-        self._started = True
+        self._finetuning = True
 
     def iterate(self) -> dict[str, float]:
         config = self.config
-        rate = (config.start_rate if self._started else config.learning_rate) * self._annealed()
+        rate = self._annealed(config.finetune_learning_rate if self._finetuning else config.learning_rate)
         self._policy_optimizer.param_groups[0]["lr"] = rate
-        self._critic_optimizer.param_groups[0]["lr"] = config.learning_rate * self._annealed()
+        self._critic_optimizer.param_groups[0]["lr"] = self._annealed(config.learning_rate)
         with torch.no_grad():
-            weight = 1 / self.target(self._start).clamp(min=config.least_cost)
-        state = BatchState(*(part.detach() for part in self._batch.state))
+            weight = 1 / self.target(self._start).clamp(min=config.min_cost)
+        state = BatchState(*(part.detach() for part in self._state))
         start = self._start
-        loss, alive, discount = torch.zeros(config.envs), torch.ones(config.envs), torch.ones(config.envs)
+        loss, alive, discount = torch.zeros(config.num_envs), torch.ones(config.num_envs), torch.ones(config.num_envs)
         log: list[_Record] = []
-        for _ in range(config.window):
+        for _ in range(config.horizon):
             state, start, alive, discount, loss, record = self._step(state, start, alive, discount, loss)
             log.append(record)
         last = self._batch.observe(state)
         loss = weight * (loss + discount * alive * self.target(last))
         self._policy_optimizer.zero_grad()
         loss.mean().backward()
-        norm = torch.nn.utils.clip_grad_norm_(self._network.parameters(), config.max_gradient)
-        if torch.isfinite(norm) and not (self._started and self.iteration < config.critic_first):
+        norm = torch.nn.utils.clip_grad_norm_(self._network.parameters(), config.max_grad_norm)
+        if torch.isfinite(norm) and not (self._finetuning and self.iteration < config.critic_warmup_iterations):
             self._policy_optimizer.step()
         critic_loss = self._learn_values(log, last.detach())
         self._batch.state = BatchState(*(part.detach() for part in state))
-        old = torch.rand(config.envs, generator=self._random) < config.restart
+        old = torch.rand(config.num_envs, generator=self._random) < config.reset_fraction
         fresh = self._batch.reset(mask=old)
         self._start = torch.where(old[:, None], fresh, start.detach())
         self.iteration += 1
@@ -208,7 +218,7 @@ class Shac:
             "target": self.target.state_dict(),
             "policy_optimizer": self._policy_optimizer.state_dict(),
             "critic_optimizer": self._critic_optimizer.state_dict(),
-            "batch": list(self._batch.state),
+            "batch": list(self._state),
             "start": self._start,
             "random": self._random.get_state(),
         }
@@ -223,9 +233,14 @@ class Shac:
         self._batch.state, self._start = BatchState(*state["batch"]), state["start"]
         self._random.set_state(state["random"])
 
-    def _annealed(self) -> float:
-        share = self.iteration / self.config.iterations
-        return self.config.final_rate + (1 - self.config.final_rate) * (1 + math.cos(math.pi * share)) / 2
+    @property
+    def _state(self) -> BatchState:
+        return cast(BatchState, self._batch.state)  # reset in __init__
+
+    def _annealed(self, rate: float) -> float:
+        """A learning rate in the present iteration."""
+        progress = self.iteration / self.config.total_iterations
+        return schedules.cosine(rate, self.config.final_learning_rate_fraction, progress)
 
     def _one_step(
         self,
@@ -241,15 +256,16 @@ class Shac:
         new, result = self._batch.transition(state, self._network(observation))
         x, c = result.final_x.unbind(0), state.c.unbind(0)
         cost = task.cost(state.x.unbind(0), result.force.unbind(0), c) * task.control_dt
-        cost = cost + config.failure_price * result.failure
+        cost = cost + config.failure_penalty * result.failure
         shaped = cost
-        if config.margin_price:
+        if config.margin_penalty:
             for margin in task.margins(x, c):
-                shaped = shaped + config.margin_price * task.control_dt * (config.clearance - margin).clamp(min=0) ** 2
+                shortfall = (config.margin_clearance - margin).clamp(min=0)
+                shaped = shaped + config.margin_penalty * task.control_dt * shortfall**2
         loss = loss + discount * alive * shaped
         if config.exit_softness:
             alive = alive * torch.sigmoid(torch.stack(task.goal(x, c)).amax(0) / config.exit_softness)
-        discount = discount * config.discount
+        discount = discount * config.gamma
         done = result.terminated
         alive, discount = torch.where(done, 1.0, alive), torch.where(done, 1.0, discount)
         start = torch.where(done[:, None], result.observation, start)
@@ -257,15 +273,15 @@ class Shac:
         return new, start, alive, discount, loss, record
 
     def _learn_values(self, log: list["_Record"], last: torch.Tensor) -> float:
-        """Fits the critic to what the window cost from each of its steps on; returns the loss.
+        """Fits the critic to the cost of the window from each of its steps on; returns the loss.
 
-        Physics and policy are deterministic, so the longest return is the best: there is no variance to trade for bias.
+        Physics and policy are deterministic, so the longest return has least bias and no variance.
         """
         config = self.config
         with torch.no_grad():
             ahead, wanted = self.target(last), []
             for record in reversed(log):
-                ahead = record.cost + config.discount * torch.where(record.exited | record.failed, 0.0, ahead)
+                ahead = record.cost + config.gamma * torch.where(record.exited | record.failed, 0.0, ahead)
                 wanted.append(ahead)
             stride = min(config.critic_stride, len(log))
             chosen = slice(int(torch.randint(stride, (), generator=self._random)), None, stride)
@@ -273,9 +289,9 @@ class Shac:
             observations = torch.cat([record.observation for record in log[chosen]])
         total = 0.0
         order = torch.randperm(len(wanted), generator=self._random)
-        for part in order.chunk(config.critic_steps) if config.critic_steps else ():
+        for part in order.chunk(config.critic_gradient_steps) if config.critic_gradient_steps else ():
             value = self.critic(observations[part])
-            # relative errors: what costs little must be known as well as what costs much
+            # relative errors: small costs matter as much as great ones
             loss = torch.nn.functional.smooth_l1_loss(value.clamp(min=1e-6).log(), wanted[part].clamp(min=1e-6).log())
             self._critic_optimizer.zero_grad()
             loss.backward()
@@ -283,10 +299,10 @@ class Shac:
             total += float(loss.detach())
         with torch.no_grad():
             for kept, learnt in zip(self.target.parameters(), self.critic.parameters(), strict=True):
-                kept.lerp_(learnt, config.critic_follow)
-        return total / max(1, config.critic_steps)
+                kept.lerp_(learnt, config.tau)
+        return total / max(1, config.critic_gradient_steps)
 
 
 def make(task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: Path | None) -> Shac:
-    """The learner at its beginning; it uses no demonstrations."""
+    """Makes the learner; it uses no demonstrations."""
     return Shac(task, params, config, seed)

@@ -1,0 +1,96 @@
+"""Supervised fitting: labelled observations, and a policy network that is fitted to them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ballbot_baselines.lqr import equilibrium_gain
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+from ballbot_train.policy import PolicyNetwork, PolicySpec
+
+
+@dataclass
+class Samples:
+    """n labelled observations, to which others can be added.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | observations | (n, no) float32 | |
+    | actions | (n, 2) float32 | the labels, in [−1, 1] |
+    | weights | (n,) float32 | of the squared errors |
+    """
+
+    observations: torch.Tensor
+    actions: torch.Tensor
+    weights: torch.Tensor
+
+    @classmethod
+    def of(cls, observations: np.ndarray, actions: np.ndarray, weights: np.ndarray | None = None) -> "Samples":
+        """Makes samples of arrays; weights default to 1."""
+        weights = np.ones(len(actions)) if weights is None else weights
+        return cls(*(torch.as_tensor(np.asarray(part, np.float32)) for part in (observations, actions, weights)))
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def add(self, other: "Samples") -> None:
+        """Appends the other samples."""
+        self.observations = torch.cat([self.observations, other.observations])
+        self.actions = torch.cat([self.actions, other.actions])
+        self.weights = torch.cat([self.weights, other.weights])
+
+
+class Fit:
+    """Fits a policy network to samples: Adam on the weighted mean squared error of its actions."""
+
+    def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...], seed: int):
+        """The network starts as LQR if the task ends at rest in an equilibrium, and at zero otherwise."""
+        torch.manual_seed(seed)
+        self.network = PolicyNetwork(PolicySpec.of(task, hidden=hidden))
+        start_as_lqr(self.network, task, params)
+        self._optimizer = torch.optim.Adam(self.network.parameters())
+
+    def run(
+        self, samples: Samples, gradient_steps: int, batch_size: int, learning_rate: float, rng: np.random.Generator
+    ) -> float:
+        """Takes gradient steps on batches that rng draws; returns their mean loss."""
+        self._optimizer.param_groups[0]["lr"] = learning_rate
+        total = 0.0
+        for _ in range(gradient_steps):
+            drawn = torch.as_tensor(rng.integers(len(samples), size=min(batch_size, len(samples))))
+            error = (self.network(samples.observations[drawn]) - samples.actions[drawn]) ** 2
+            weights = samples.weights[drawn]
+            loss = (weights * error.mean(1)).sum() / weights.sum()
+            self._optimizer.zero_grad()
+            loss.backward()
+            self._optimizer.step()
+            total += float(loss.detach())
+        return total / gradient_steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights and the optimizer's state: tensors and plain values."""
+        return {"network": self.network.state_dict(), "optimizer": self._optimizer.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes back to a state."""
+        self.network.load_state_dict(state["network"])
+        self._optimizer.load_state_dict(state["optimizer"])
+
+
+def start_as_lqr(network: PolicyNetwork, task: Task, params: BallbotParams) -> None:
+    """Sets the network's linear part to LQR's gain, or to zero if the task does not end at rest in an equilibrium.
+
+    Raises:
+        ValueError: the network has no linear part.
+    """
+    if network.linear is None:
+        raise ValueError("a network without a linear part cannot start as LQR")
+    with torch.no_grad():
+        for part in network.linear.parameters():
+            part.zero_()
+        if (gain := equilibrium_gain(task, params)) is not None:
+            network.linear.weight[:, :8] = torch.tensor(gain[0])
