@@ -310,7 +310,7 @@ def test_bad_reset_mask_is_refused(mask, error, message, make_vec):
         ("stabilize", {"stat": 1}, "unknown reset options"),
         ("stabilize", {"state": np.zeros(7)}, "state must be finite"),
         ("stabilize", {"state": np.full((2, 8), np.nan)}, "state must be finite"),
-        ("stabilize", {"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a margin"),
+        ("stabilize", {"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a limit"),
         ("orbit", {"constants": {"tempo": 1.0}}, "no constants"),
         ("orbit", {"constants": [[0.5, 1.0], [2.0, 1.0]]}, "radius must exceed"),
     ],
