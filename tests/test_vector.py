@@ -576,7 +576,7 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
         batch.reset(seed=0)
         batch.step(torch.zeros(4, 2))
         batch.step(torch.zeros(4, 2))
-    assert [record.name for record in caplog.records] == ["ballbot_gym.vector"]
+    assert [record.name for record in caplog.records] == ["ballbot_gym.batch"]
     assert "no such compiler" in caplog.text
     assert not batch.compiled
     must = BallbotBatch("stabilize", 4, compile=True)
