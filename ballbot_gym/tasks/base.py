@@ -11,6 +11,7 @@ from ballbot_gym import dynamics, ops
 from ballbot_gym.ops import Vector, squared
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.tasks.symmetry import Mirror
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,10 @@ class Task(ABC):
     """Mean return on the certified episodes, with default fields, at a mean regret of 10 %."""
     NOT_THE_PROBLEM: ClassVar[frozenset[str]] = frozenset({"survival_reward", "arena_radius", "arena_factor"})
     """Fields that move no optimum: they shape rewards, or bound where no optimum goes."""
+    mirrors: ClassVar[tuple[Mirror, ...]] = ()
+    """Its mirror images; with no change they form a group."""
+    frame: ClassVar[str | None] = None
+    """Name in `symmetry.FRAMES` of a frame in which the task looks the same wherever it takes place, or None."""
     constant_draws: ClassVar[int] = 0
     """Uniform numbers that `draw_constants` takes."""
     state_draws: ClassVar[int] = 0
@@ -202,6 +207,14 @@ class Task(ABC):
         x = (distance, distance, lean, lean, speed, speed, rate, rate)
         force = (2 * params.force_limit,) * 2  # twice, for randomized actuators
         return self.cost(x, force, (0.0,) * len(self.constant_names))
+
+    def observation_signs(self, mirror: Mirror) -> tuple[int, ...]:
+        """The sign that each observed quantity takes in the mirror, found by observing a state and its mirror image."""
+        rng = np.random.default_rng(0)
+        x, c = rng.uniform(0.1, 0.9, 8), rng.uniform(1.0, 2.0, len(self.constant_names))
+        seen = self.observe(tuple(x), tuple(c))
+        mirrored = self.observe(tuple(x * mirror.state), tuple(c * (mirror.constants or 1)))
+        return tuple(1 if math.isclose(a, b, abs_tol=1e-12) else -1 for a, b in zip(seen, mirrored, strict=True))
 
     def markers(self, c: np.ndarray) -> list[Marker]:
         """What to draw besides the robot."""

@@ -1,7 +1,7 @@
 """BallbotOrbit-v0: ride a circle at a commanded speed."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from ballbot_gym.ops import Vector, between, scaled, squared
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.base import Reference, Task
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.tasks.symmetry import HALF_TURN, MIRROR_X, MIRROR_Y
 
 _GUESS_SECONDS = 1.5  # how long a guessed path takes to reach its speed
 
@@ -88,6 +89,12 @@ class Orbit(Task):
     """How far from the origin the ball may go, in radii of the circle; above 1."""
 
     id = "BallbotOrbit-v0"
+    mirrors = (
+        replace(MIRROR_X, constants=(1, -1)),
+        replace(MIRROR_Y, constants=(1, -1)),
+        replace(HALF_TURN, constants=(1, 1)),
+    )
+    frame = "radial"
     observation_scale = (3.0, 3.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 1.0, 5.0, 5.0, 3.0, 5.0)
     constant_names = ("radius", "speed")
     constant_draws = 3

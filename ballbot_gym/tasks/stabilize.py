@@ -12,6 +12,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic, then_stay
 from ballbot_gym.tasks.base import Reference, Task
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.tasks.symmetry import HALF_TURN, MIRROR_X, MIRROR_Y
 
 _GUESS_SECONDS = 2.5  # how long a guessed path takes to come to rest
 
@@ -77,6 +78,7 @@ class Stabilize(Task):
 
     state_draws = 8
     id = "BallbotStabilize-v0"
+    mirrors = (MIRROR_X, MIRROR_Y, HALF_TURN)
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0)
     reward_threshold = 771.5
 

@@ -1,7 +1,7 @@
 """BallbotWeave-v0: through a slalom of round obstacles, and to rest behind it."""
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from ballbot_gym.paths import catmull_rom, then_stay
 from ballbot_gym.tasks.base import Reference, Task
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import at_rest
+from ballbot_gym.tasks.symmetry import MIRROR_Y
 
 MAX_OBSTACLES = 5
 
@@ -82,6 +83,7 @@ class Weave(Task):
     """How far from the goal the ball may go, m."""
 
     id = "BallbotWeave-v0"
+    mirrors = (replace(MIRROR_Y, constants=(1, -1) + (1, -1, 1) * MAX_OBSTACLES),)
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0) + (5.0, 5.0, 1.0) * MAX_OBSTACLES
     margin_names = ("tilt", *(f"obstacle {i}" for i in range(MAX_OBSTACLES)))
     constant_names = ("goal_x", "goal_y") + tuple(

@@ -21,6 +21,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.policy_files import (
     OBSERVATION_VERSION,
     SHIPPED,
@@ -51,17 +52,21 @@ _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.S
 class PolicyNetwork(torch.nn.Module):
     """action = squash(W o + MLP(o)): the sum of a linear part, which LQR's gain can initialize, and a network.
 
-    Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit.
+    Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit. With a frame, o and the
+    action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so it mirrors exactly.
     """
 
     def __init__(self, spec: PolicySpec):
         super().__init__()
         self.spec = spec
-        self.linear = torch.nn.Linear(spec.observations, 2, bias=not spec.odd) if spec.linear else None
-        widths = (spec.observations, *spec.hidden)
+        self._frame = None if spec.frame is None else FRAMES[spec.frame]
+        self._mirrors = [tuple(torch.tensor(signs, dtype=torch.float32) for signs in mirror) for mirror in spec.mirrors]
+        inputs = spec.observations if self._frame is None else self._frame.size
+        self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd) if spec.linear else None
+        widths = (inputs, *spec.hidden)
         layers: list[torch.nn.Module] = []
-        for inputs, outputs in itertools.pairwise(widths):
-            layers += [torch.nn.Linear(inputs, outputs, bias=not spec.odd), _ACTIVATIONS[spec.activation]()]
+        for fan_in, fan_out in itertools.pairwise(widths):
+            layers += [torch.nn.Linear(fan_in, fan_out, bias=not spec.odd), _ACTIVATIONS[spec.activation]()]
         last = torch.nn.Linear(widths[-1], 2, bias=not spec.odd)
         if spec.linear:  # so that the policy starts as its linear part
             for part in last.parameters():
@@ -74,8 +79,17 @@ class PolicyNetwork(torch.nn.Module):
 
     def raw(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 2) before it is squashed."""
-        output = self.mlp(observation)
-        return output if self.linear is None else output + self.linear(observation)
+        if self._frame is not None:
+            features, back = self._frame.features(observation.unbind(-1))
+            return torch.stack(back(self._sum(torch.stack(features, -1)).unbind(-1)), -1)
+        total = self._sum(observation)
+        for signs, action_signs in self._mirrors:
+            total = total + action_signs * self._sum(signs * observation)
+        return total / (1 + len(self._mirrors)) if self._mirrors else total
+
+    def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
+        output = self.mlp(inputs)
+        return output if self.linear is None else output + self.linear(inputs)
 
 
 class PolicyController(ActionController):
@@ -123,7 +137,7 @@ def load_network(path: str | Path, task: Task) -> PolicyNetwork:
     weights_path, description_path = paths_of(path)
     described = read_description(path)["spec"]
     try:
-        spec = PolicySpec(**(described | {"hidden": tuple(described["hidden"])}))
+        spec = PolicySpec.read(described)
         weights = safetensors.torch.load(weights_path.read_bytes())
     except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
         raise PolicyError(f"{description_path} is not a policy: {error}") from error

@@ -5,11 +5,13 @@ A policy is two files: weights in `NAME.safetensors` and their description in `N
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.symmetry import FRAMES
 
 OBSERVATION_VERSION = 1
 """Raised whenever what any task observes changes, so that older policies are refused instead of misled."""
@@ -38,9 +40,25 @@ class PolicySpec:
     """Whether a linear part is added to the network's output."""
     odd: bool = False
     """Whether opposite observations get opposite actions, exactly: no biases. Needs an odd activation."""
+    frame: str | None = None
+    """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
+    mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = ()
+    """Signs of the observation and of the action in each mirror image over which the network's output is averaged."""
     squash: Literal["tanh", "clip"] = "tanh"
     """How the sum is brought into [−1, 1]."""
     observation_version: int = OBSERVATION_VERSION
+
+    @classmethod
+    def read(cls, described: Mapping[str, Any]) -> "PolicySpec":
+        """The spec that a policy's JSON file describes, where JSON has lists in place of tuples.
+
+        Raises:
+            KeyError, TypeError, ValueError: it describes none.
+        """
+        mirrors = tuple((tuple(signs), tuple(action)) for signs, action in described.get("mirrors", ()))
+        if described.get("frame") not in (None, *FRAMES):
+            raise ValueError(f"no frame {described['frame']!r}; known: {', '.join(FRAMES)}")
+        return cls(**(dict(described) | {"hidden": tuple(described["hidden"]), "mirrors": mirrors}))
 
     @classmethod
     def of(cls, task: Task, **fields: Any) -> "PolicySpec":

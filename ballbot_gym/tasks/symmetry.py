@@ -1,0 +1,85 @@
+"""Symmetries of tasks, declared once, for learners and policies: mirror images, and frames of reference.
+
+A policy that respects a symmetry learns one situation where another policy learns two or a whole circle of them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from ballbot_gym import ops
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A mirror image: the motion with flipped signs is a motion of the same cost, with the same limits and goal.
+
+    Each field holds 1 or −1 for every component.
+    """
+
+    state: tuple[int, ...]
+    """(8,) signs of the state."""
+    action: tuple[int, int]
+    """Signs of the force."""
+    constants: tuple[int, ...] = ()
+    """(nc,) signs of the episode's constants."""
+
+
+MIRROR_X = Mirror((-1, 1, -1, 1, -1, 1, -1, 1), (-1, 1))
+"""x and everything along it change their sign."""
+MIRROR_Y = Mirror((1, -1, 1, -1, 1, -1, 1, -1), (1, -1))
+"""y and everything along it change their sign."""
+HALF_TURN = Mirror((-1,) * 8, (-1, -1))
+"""Both mirrors one after the other: a rotation by 180°."""
+
+Back = Callable[[tuple[Any, Any]], tuple[Any, Any]]
+"""Turns an action in a frame into the action in the world."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of reference that moves with the robot."""
+
+    size: int
+    """Number of features."""
+    features: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], Back]]
+    """Observation, as a tuple of its entries -> features (size), and the way back for actions."""
+
+
+def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
+    """Orbit's observation as seen from the ball: outwards is forwards, and the commanded motion goes to the left.
+
+    The body's axis is rotated instead of the angles γ and θ, because a rotation about the vertical takes axis to axis
+    exactly. The body's inertia about its own axis, 1 % of the other, is what the symmetry leaves out.
+    """
+    x, y, gamma, theta, vx, vy, gamma_dot, theta_dot, radius_error, ex, ey, radius, speed = observation
+    distance = ops.sqrt(x * x + y * y + 1e-12)
+    cos, sin = x / distance, y / distance
+    side = ops.where(speed < 0, -1.0, 1.0)
+
+    def rotated(a: Any, b: Any) -> tuple[Any, Any]:
+        return cos * a + sin * b, side * (cos * b - sin * a)
+
+    sin_gamma, cos_gamma = ops.sin(gamma), ops.cos(gamma)
+    sin_theta, cos_theta = ops.sin(theta), ops.cos(theta)
+    axis_x_rate = cos_gamma * cos_theta * gamma_dot - sin_gamma * sin_theta * theta_dot
+    features = (
+        distance,
+        *rotated(sin_gamma * cos_theta, sin_theta),
+        *rotated(vx, vy),
+        *rotated(axis_x_rate, cos_theta * theta_dot),
+        radius_error,
+        *rotated(ex, ey),
+        radius,
+        side * speed,
+    )
+
+    def back(action: tuple[Any, Any]) -> tuple[Any, Any]:
+        outwards, along = action[0], side * action[1]
+        return cos * outwards - sin * along, sin * outwards + cos * along
+
+    return features, back
+
+
+FRAMES: dict[str, Frame] = {"radial": Frame(12, _radial)}
+"""Every frame by the name that tasks and policy files give."""

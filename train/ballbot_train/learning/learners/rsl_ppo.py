@@ -1,0 +1,295 @@
+"""Proximal policy optimization by rsl_rl on thousands of batched envs, from scratch.
+
+What makes the tasks learnable, besides rewards that pay for living (see `ballbot_gym.tasks.base.Task`):
+
+- The critic sees, besides the observation, the products of all pairs of its entries, and it has a linear path. The value of
+  a control problem is nearly a quadratic form. A tanh network alone fits it badly near the goal, and so the robot rests
+  beside the goal.
+- The standard deviation of the actions and the step size fall on a schedule. PPO left to itself narrows the distribution
+  before the hardest starts are learnt.
+- The actor sees a task's symmetries: in its frame, or averaged over its mirror images.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from ballbot_gym.batch import BallbotBatch, BatchState
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_train.learning import schedules
+from ballbot_train.learning.learners.model_free import ScopedRng
+from ballbot_train.policy import PolicyNetwork, PolicySpec
+
+_GROUPS = {"actor": ["policy"], "critic": ["policy"]}
+_RETAINED = 0.9  # of the averaged actor per iteration
+
+
+@dataclass(frozen=True)
+class RslPpoConfig:
+    """Settings of `RslPpo`."""
+
+    total_iterations: int = 400
+    """Iterations, each of `num_envs * num_steps` env steps."""
+    evaluations: int = 20
+    """Number of evaluations on the certified episodes, at equal distances."""
+    num_envs: int = 2048
+    """Envs that are stepped together."""
+    num_steps: int = 24
+    """Control steps of each env per iteration."""
+    episode_seconds: float = 4.0
+    """Duration of an episode in training, s. Time-outs are bootstrapped, and the first episodes start at staggered times."""
+    reward_scale: float = 0.02
+    """Factor of every reward."""
+    gamma: float = 0.995
+    """Discount factor per control step."""
+    gae_lambda: float = 0.95
+    """λ of generalized advantage estimation."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the actor's hidden layers."""
+    critic_hidden: tuple[int, ...] = (64, 64)
+    """Units of the critic's hidden layers."""
+    products: bool = True
+    """Whether the critic sees the products of all pairs of observed quantities."""
+    symmetry: Literal["none", "odd", "mirrors", "frame"] = "none"
+    """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
+    over the task's mirror images, or it sees and acts in the task's frame."""
+    learning_rate: float = 2e-3
+    """Step size at the start."""
+    final_learning_rate: float = 5e-5
+    """Step size at the end. It falls geometrically."""
+    std: float = 0.2
+    """Standard deviation of the actions at the start, in units of the force limit. It is not learnt."""
+    final_std: float = 0.02
+    """Standard deviation at the end. It falls geometrically."""
+    update_epochs: int = 5
+    """Passes over the rollouts of an iteration."""
+    num_mini_batches: int = 16
+    """Gradient steps of a pass."""
+    clip_range: float = 0.2
+    """Range to which the ratio of new and old probability is clipped, about 1."""
+    max_grad_norm: float = 1.0
+    """Norm to which the gradients of actor and critic are clipped."""
+
+
+TUNED: dict[str, RslPpoConfig] = {
+    "stabilize": RslPpoConfig(symmetry="odd"),
+    "orbit": RslPpoConfig(symmetry="frame", total_iterations=600),
+    "weave": RslPpoConfig(
+        symmetry="mirrors", episode_seconds=8.0, hidden=(128, 128), critic_hidden=(128, 128), total_iterations=800
+    ),
+    "turn": RslPpoConfig(episode_seconds=8.0, total_iterations=800),
+}
+"""Settings by name of task."""
+
+
+class Actor(MLPModel):
+    """rsl_rl's model around a policy network, whose output is the mean of the actions."""
+
+    def __init__(self, observations: TensorDict, network: PolicyNetwork, std: float):
+        distribution = {
+            "class_name": "rsl_rl.modules.distribution:GaussianDistribution",
+            "init_std": std,
+            "learn_std": False,
+        }
+        super().__init__(observations, _GROUPS, "actor", 2, (1,), distribution_cfg=distribution)
+        self.network = network
+        self.mlp = _Raw(network)
+
+    def set_std(self, std: float) -> None:
+        """Sets the standard deviation of both actions."""
+        assert self.distribution is not None
+        self.distribution.std_param.data.fill_(std)
+
+
+class _Raw(torch.nn.Module):
+    """A policy network before its output is squashed."""
+
+    def __init__(self, network: PolicyNetwork):
+        super().__init__()
+        self._network = (network,)  # in a tuple, so that its parameters are registered once
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return self._network[0].raw(observation)
+
+
+class Critic(MLPModel):
+    """rsl_rl's model on an observation, in the task's frame if it has one, and on the products of its entries."""
+
+    def __init__(self, observations: TensorDict, hidden: tuple[int, ...], frame: str | None, products: bool):
+        self._frame = None if frame is None else FRAMES[frame]
+        size = observations["policy"].shape[-1] if self._frame is None else self._frame.size
+        self._pairs = torch.triu_indices(size, size) if products else None
+        self._inputs = size + (0 if self._pairs is None else self._pairs.shape[1])
+        super().__init__(observations, _GROUPS, "critic", 1, hidden, activation="tanh")
+        self.linear = torch.nn.Linear(self._inputs, 1)
+        with torch.no_grad():
+            self.linear.weight.zero_()
+            self.linear.bias.zero_()
+            last = [layer for layer in self.mlp if isinstance(layer, torch.nn.Linear)][-1]
+            last.weight.mul_(0.1)
+
+    def _get_latent_dim(self) -> int:
+        return self._inputs
+
+    def get_latent(self, obs: TensorDict, masks: Any = None, hidden_state: Any = None) -> torch.Tensor:
+        """(B, inputs) what the network sees."""
+        seen = obs["policy"]
+        if self._frame is not None:
+            seen = torch.stack(self._frame.features(seen.unbind(-1))[0], -1)
+        if self._pairs is None:
+            return seen
+        first, second = self._pairs
+        return torch.cat([seen, seen[:, first] * seen[:, second]], -1)
+
+    def forward(self, obs: TensorDict, masks: Any = None, hidden_state: Any = None, **_: Any) -> torch.Tensor:
+        """(B, 1) values."""
+        seen = self.get_latent(obs)
+        return self.mlp(seen) + self.linear(seen)
+
+
+class RslPpo:
+    """The learner; see `training.Learner`."""
+
+    def __init__(self, task: Task, params: BallbotParams, config: RslPpoConfig, seed: int = 0):
+        """Raises a ValueError if the task does not have the symmetry that the settings ask for."""
+        self.config, self.iteration = config, 0
+        self.iterations, self.evaluations = config.total_iterations, config.evaluations
+        torch.manual_seed(seed)
+        self._random = ScopedRng()
+        with self._random:
+            shorter = replace(task, duration=config.episode_seconds)
+            self._batch = BallbotBatch(shorter, config.num_envs, compile=False, params=params)
+            self._observation = self._batch.reset(seed=seed)
+            assert self._batch.state is not None
+            steps = torch.randint(shorter.steps, (config.num_envs,))
+            self._batch.state = self._batch.state._replace(steps=steps)
+            spec = spec_for(task, config)
+            seen = self._seen()
+            self._actor = Actor(seen, PolicyNetwork(spec), config.std)
+            with torch.no_grad():  # so that the first policy does next to nothing
+                self._actor.network.mlp[-1].weight.mul_(0.1)
+            self._average = PolicyNetwork(spec)
+            self._average.load_state_dict(self._actor.network.state_dict())
+            self._ppo = PPO(
+                self._actor,
+                Critic(seen, config.critic_hidden, spec.frame, config.products),
+                RolloutStorage("rl", config.num_envs, config.num_steps, seen, (2,)),
+                num_learning_epochs=config.update_epochs,
+                num_mini_batches=config.num_mini_batches,
+                clip_param=config.clip_range,
+                gamma=config.gamma,
+                lam=config.gae_lambda,
+                entropy_coef=0.0,
+                learning_rate=config.learning_rate,
+                max_grad_norm=config.max_grad_norm,
+                schedule="fixed",
+            )
+
+    @property
+    def network(self) -> PolicyNetwork:
+        """The average of the actor's last iterations, which is better than any one of them."""
+        return self._average
+
+    def iterate(self) -> dict[str, float]:
+        with self._random:
+            return self._iterate()
+
+    def _iterate(self) -> dict[str, float]:
+        config = self.config
+        progress = self.iteration / max(1, self.iterations - 1)
+        rate = schedules.geometric(config.learning_rate, config.final_learning_rate, progress)
+        std = schedules.geometric(config.std, config.final_std, progress)
+        for group in self._ppo.optimizer.param_groups:
+            group["lr"] = rate
+        self._actor.set_std(std)
+        ended = failed = paid = 0.0
+        with torch.no_grad():
+            for _ in range(config.num_steps):
+                step = self._batch.step(self._ppo.act(self._seen()))
+                self._observation = step.observation
+                done = step.terminated | step.truncated
+                self._ppo.process_env_step(
+                    self._seen(), config.reward_scale * step.reward, done, {"time_outs": step.truncated.float()}
+                )
+                ended, failed = ended + float(done.sum()), failed + float(step.failure.sum())
+                paid += float(step.reward.mean())
+            self._ppo.compute_returns(self._seen())
+        losses = self._ppo.update()
+        with torch.no_grad():
+            share = max(1 - _RETAINED, 1 / (1 + self.iteration))  # the first iterations start the average
+            for kept, new in zip(self._average.parameters(), self._actor.network.parameters(), strict=True):
+                kept.lerp_(new, share)
+        self.iteration += 1
+        return {
+            **{f"loss/{name}": float(value) for name, value in losses.items()},
+            "train/reward": paid / config.num_steps,
+            "train/failure_rate": failed / max(1.0, ended),
+            "train/learning_rate": rate,
+            "train/std": std,
+            "train/env_steps": self.iteration * config.num_envs * config.num_steps,
+        }
+
+    def _seen(self) -> TensorDict:
+        return TensorDict({"policy": self._observation}, batch_size=[len(self._observation)])
+
+    def state_dict(self) -> dict[str, Any]:
+        assert self._batch.state is not None
+        return {
+            "iteration": self.iteration,
+            "actor": self._actor.state_dict(),
+            "critic": self._ppo.critic.state_dict(),
+            "average": self._average.state_dict(),
+            "optimizer": self._ppo.optimizer.state_dict(),
+            "batch": list(self._batch.state),
+            "observation": self._observation,
+            "random": self._random.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.iteration = state["iteration"]
+        self._actor.load_state_dict(state["actor"])
+        self._ppo.critic.load_state_dict(state["critic"])
+        self._average.load_state_dict(state["average"])
+        self._ppo.optimizer.load_state_dict(state["optimizer"])
+        self._batch.state, self._observation = BatchState(*state["batch"]), state["observation"]
+        self._random.load_state_dict(state["random"])
+
+
+def spec_for(task: Task, config: RslPpoConfig) -> PolicySpec:
+    """The shape of the policy.
+
+    Raises:
+        ValueError: the task does not have the symmetry that the settings ask for.
+    """
+    fields: dict[str, Any] = {"hidden": config.hidden, "linear": False, "squash": "clip"}
+    if config.symmetry == "odd":
+        if not any(set(mirror.state) == {-1} for mirror in task.mirrors):
+            raise ValueError(f'{task.id} is not odd; give "none", "mirrors" or "frame" as its symmetry')
+        fields["odd"] = True
+    elif config.symmetry == "mirrors":
+        if not task.mirrors:
+            raise ValueError(f'{task.id} has no mirror images; give "none" as its symmetry')
+        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
+    elif config.symmetry == "frame":
+        if task.frame is None:
+            raise ValueError(f'{task.id} has no frame; give "none" or "mirrors" as its symmetry')
+        fields["frame"] = task.frame
+    return PolicySpec.of(task, **fields)
+
+
+def make(task: Task, params: BallbotParams, config: RslPpoConfig, seed: int, demos: Path | None) -> RslPpo:
+    """Makes the learner; it uses no demonstrations.
+
+    Raises:
+        ValueError: the task does not have the symmetry that the settings ask for.
+    """
+    return RslPpo(task, params, config, seed)
