@@ -81,7 +81,8 @@ class PolicyNetwork(torch.nn.Module):
         """(..., 2) before it is squashed."""
         if self._frame is not None:
             features, back = self._frame.features(observation.unbind(-1))
-            return torch.stack(back(self._sum(torch.stack(features, -1)).unbind(-1)), -1)
+            action = self._sum(torch.stack(features, -1))
+            return torch.stack(back((action[..., 0], action[..., 1])), -1)
         total = self._sum(observation)
         for signs, action_signs in self._mirrors:
             total = total + action_signs * self._sum(signs * observation)

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
@@ -106,8 +107,13 @@ class Actor(MLPModel):
 
     def set_std(self, std: float) -> None:
         """Sets the standard deviation of both actions."""
-        assert self.distribution is not None
+        assert isinstance(self.distribution, GaussianDistribution)
         self.distribution.std_param.data.fill_(std)
+
+
+def last_layer(network: torch.nn.Module) -> torch.nn.Linear:
+    """The last linear layer of a network."""
+    return [layer for layer in network.modules() if isinstance(layer, torch.nn.Linear)][-1]
 
 
 class _Raw(torch.nn.Module):
@@ -134,8 +140,7 @@ class Critic(MLPModel):
         with torch.no_grad():
             self.linear.weight.zero_()
             self.linear.bias.zero_()
-            last = [layer for layer in self.mlp if isinstance(layer, torch.nn.Linear)][-1]
-            last.weight.mul_(0.1)
+            last_layer(self.mlp).weight.mul_(0.1)
 
     def _get_latent_dim(self) -> int:
         return self._inputs
@@ -176,7 +181,7 @@ class RslPpo:
             seen = self._seen()
             self._actor = Actor(seen, PolicyNetwork(spec), config.std)
             with torch.no_grad():  # so that the first policy does next to nothing
-                self._actor.network.mlp[-1].weight.mul_(0.1)
+                last_layer(self._actor.network.mlp).weight.mul_(0.1)
             self._average = PolicyNetwork(spec)
             self._average.load_state_dict(self._actor.network.state_dict())
             self._ppo = PPO(
