@@ -59,7 +59,8 @@ def test_it_goes_on_from_its_state_as_if_never_stopped(task):
 def test_the_critic_alone_fits_a_quadratic_form_with_its_linear_path():
     observation = torch.randn(200, 8)
     seen = TensorDict({"policy": observation}, batch_size=[200])
-    critic = rsl_ppo.Critic(seen, (8,), None, products=True)
+    critic = rsl_ppo.Critic(seen, (8,), None, products=True, value=4.0)
+    torch.testing.assert_close(critic(seen), torch.full((200, 1), 4.0), atol=0.5, rtol=0)
     inputs = critic.get_latent(seen)
     form = torch.randn(8, 8)
     wanted = ((observation @ form) * observation).sum(1)

@@ -130,7 +130,10 @@ class _Raw(torch.nn.Module):
 class Critic(MLPModel):
     """rsl_rl's model on an observation, in the task's frame if it has one, and on the products of its entries."""
 
-    def __init__(self, observations: TensorDict, hidden: tuple[int, ...], frame: str | None, products: bool):
+    def __init__(
+        self, observations: TensorDict, hidden: tuple[int, ...], frame: str | None, products: bool, value: float
+    ):
+        """Args: value: of every state at the start."""
         self._frame = None if frame is None else FRAMES[frame]
         size = observations["policy"].shape[-1] if self._frame is None else self._frame.size
         self._pairs = torch.triu_indices(size, size) if products else None
@@ -139,7 +142,7 @@ class Critic(MLPModel):
         self.linear = torch.nn.Linear(self._inputs, 1)
         with torch.no_grad():
             self.linear.weight.zero_()
-            self.linear.bias.zero_()
+            self.linear.bias.fill_(value)
             last_layer(self.mlp).weight.mul_(0.1)
 
     def _get_latent_dim(self) -> int:
@@ -179,6 +182,8 @@ class RslPpo:
             self._batch.state = self._batch.state._replace(steps=steps)
             spec = spec_for(task, config)
             seen = self._seen()
+            # living for ever without cost: PPO clips how fast values change, and this is far from 0
+            value = config.reward_scale * task.survival_reward * task.control_dt / (1 - config.gamma)
             self._actor = Actor(seen, PolicyNetwork(spec), config.std)
             with torch.no_grad():  # so that the first policy does next to nothing
                 last_layer(self._actor.network.mlp).weight.mul_(0.1)
@@ -186,7 +191,7 @@ class RslPpo:
             self._average.load_state_dict(self._actor.network.state_dict())
             self._ppo = PPO(
                 self._actor,
-                Critic(seen, config.critic_hidden, spec.frame, config.products),
+                Critic(seen, config.critic_hidden, spec.frame, config.products, value),
                 RolloutStorage("rl", config.num_envs, config.num_steps, seen, (2,)),
                 num_learning_epochs=config.update_epochs,
                 num_mini_batches=config.num_mini_batches,
