@@ -27,6 +27,7 @@ from ballbot_gym import BallbotEnv, certified, files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
 from ballbot_gym.randomization import Disturbance, Randomization
+from ballbot_gym.tasks import TASKS as TASK_NAMES
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train import evaluate, jobs, load_policy
 from ballbot_train.cli import _run
@@ -134,7 +135,7 @@ TASKS = [
     (task("stabilize", control_dt=0), "control_dt must be positive and finite, not 0"),
     (task("stabilize", max_tilt=math.pi / 2), "max_tilt must be below 90°"),
     (task("stabilize", max_tilt=-0.1), "max_tilt must be positive and finite"),
-    (task("stabilize", failure_cost=math.inf), "failure_cost must be positive and finite, not inf"),
+    (task("stabilize", rest_weight=math.inf), "rest_weight must be positive and finite, not inf"),
     (task("stabilize", effort_weight=-1.0), "effort_weight must be positive and finite"),
     (task("stabilize", effort_weight=10**400), "effort_weight must be positive and finite"),
     (task("turn", max_speed=200.0), "max_speed 200 must be in order, and at most 12 m/s"),
@@ -496,7 +497,7 @@ def dataset(metadata=None):
     return read
 
 
-DESCRIBED = {"demos": {}, "task": make_task("stabilize").problem(), "observation_version": 1}
+DESCRIBED = {"demos": {}, "task": repr(make_task("stabilize")), "observation_version": 1}
 
 DEMOS = [
     (dataset(), 'is no dataset of "ballbot demos"'),
@@ -697,6 +698,12 @@ def test_what_is_typed_wrong_ends_with_a_message_and_a_status_and_writes_nothing
     assert "Traceback" not in said
     assert status in (1, 2)
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", TASK_NAMES)
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_the_settings_tuned_for_every_task_make_sense(learner, name):
+    check_settings(LEARNERS[learner].settings(name))
 
 
 def test_a_pipe_is_not_read(tmp_path):

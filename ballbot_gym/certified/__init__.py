@@ -77,7 +77,7 @@ def load(task: str | Task, path: str | Path | None = None) -> EvaluationSet:
     """The evaluation set of a task.
 
     Args:
-        task: a name in `TASKS`, or a Task that is the very problem the set was computed for; its pay and its arena may differ.
+        task: a name in `TASKS`, or a Task that is the very problem of the set; its pay and its arena may differ.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
 
     Raises:
