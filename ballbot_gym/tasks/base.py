@@ -14,7 +14,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.symmetry import Mirror
 
-MAX_STEPS = 100_000
+MAX_STEPS = 1_000_000
 """Control steps in the longest episode that a task may have."""
 
 
