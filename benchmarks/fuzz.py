@@ -105,10 +105,12 @@ def _urdf(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]
 
 
 def _policy(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    from ballbot_train.policy import SHIPPED, PolicyError, load_policy
+    from ballbot_gym.env import make_task
+    from ballbot_train.policy import PolicyError, PolicyNetwork, PolicySpec, load_policy, save_policy
 
-    paths = [Path(shutil.copy(SHIPPED / f"turn-shac.{end}", folder / f"mine.{end}")) for end in ("json", "safetensors")]
-    return paths, lambda: load_policy(paths[0], "turn"), (PolicyError,)
+    network = PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,)))
+    path = save_policy(folder / "mine", network, {"measured": {"regret_mean": 0.1}})
+    return [path, path.with_suffix(".safetensors")], lambda: load_policy(path, "turn"), (PolicyError,)
 
 
 def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
