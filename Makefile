@@ -3,8 +3,9 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
+TRIALS := benchmarks/soak.py benchmarks/faults.py benchmarks/fuzz.py
 
-.PHONY: demo test test-slow bench docs certify clean
+.PHONY: demo test test-slow bench soak faults fuzz docs certify clean
 
 demo: $(VENV)/installed
 	$(BIN)/ballbot benchmark --episodes 25 --out runs/demo
@@ -20,7 +21,19 @@ test-slow: $(VENV)/installed
 
 bench: $(VENV)/installed
 	$(BIN)/pip install -c constraints.txt -e ".[bench]"
-	for script in benchmarks/*.py; do $(BIN)/python $$script; done
+	for script in $(filter-out $(TRIALS),$(wildcard benchmarks/*.py)); do $(BIN)/python $$script; done
+
+# millions of steps and a thousand environments: time and memory must not grow
+soak: $(VENV)/installed
+	$(BIN)/python benchmarks/soak.py
+
+# every long command is killed fifty times, and meets full disks, read-only folders, a second run and dead workers
+faults: $(VENV)/installed
+	$(BIN)/python benchmarks/faults.py
+
+# every reader is given mutations of valid files, ten minutes each
+fuzz: $(VENV)/installed
+	$(BIN)/python benchmarks/fuzz.py
 
 # the documentation as a site
 docs: $(VENV)/installed

@@ -19,8 +19,8 @@ import torch
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.randomization import Randomization, actuate
+from ballbot_gym.params import BallbotParams, checked_params
+from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.tasks import Task
 
 _log = logging.getLogger(__name__)
@@ -175,8 +175,8 @@ class BallbotBatch:
         if compile not in (True, False, "auto"):
             raise ValueError(f'compile must be True, False or "auto", not {compile!r}')
         self.task = make_task(task, **task_fields)
-        self.params = default_params() if params is None else params
-        self.randomization = Randomization() if randomization is None else randomization
+        self.params = checked_params(params)
+        self.randomization = checked_randomization(randomization)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
         for name in _Robot._fields:

@@ -11,11 +11,13 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.randomization import Disturbance, Randomization
+from ballbot_gym.params import BallbotParams, checked_params
+from ballbot_gym.randomization import Disturbance, Randomization, checked_randomization
 from ballbot_gym.scene import Scene
 from ballbot_gym.simulator import PHYSICS, State
 from ballbot_gym.tasks import TASKS, Task
+
+_LARGEST = 1e6  # of any number that reset takes
 
 
 class BallbotEnv(gymnasium.Env):
@@ -75,17 +77,17 @@ class BallbotEnv(gymnasium.Env):
         self._spec: EnvSpec | None = None
         self._scene: Scene | None = None
         self._state: State = ()  # until the first reset
-        if physics not in PHYSICS:
+        if not isinstance(physics, str) or physics not in PHYSICS:
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         self.task = make_task(task, **task_fields)
-        self.params = default_params() if params is None else params
+        self.params = checked_params(params)
         self.physics = physics
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.randomization = Randomization() if randomization is None else randomization
+        self.randomization = checked_randomization(randomization)
         self._disturbance = (
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )
@@ -111,7 +113,7 @@ class BallbotEnv(gymnasium.Env):
         """
         self._check_open()
         super().reset(seed=seed)
-        x, c = self._draw(dict(options or {}))
+        x, c = self._draw({} if options is None else options)
         self._constants, self._constants_array = tuple(c.tolist()), c
         self._state = tuple(x.tolist())
         if self._disturbance is not None:
@@ -216,6 +218,9 @@ class BallbotEnv(gymnasium.Env):
 
     def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Initial state and constants. Those that the options do not give are drawn."""
+        if not isinstance(options, dict):
+            raise ValueError(f"options must be a dict with 'state' and 'constants', not {options!r}")
+        options = dict(options)
         state, constants = options.pop("state", None), options.pop("constants", None)
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; known: 'state', 'constants'")
@@ -332,7 +337,7 @@ def make_task(task: str | Task, **task_fields: Any) -> Task:
         if task_fields:
             raise ValueError(f"fields {sorted(task_fields)} cannot be given together with a Task; use replace()")
         return task
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"unknown task {task!r}; known: {', '.join(map(repr, TASKS))}")
     known = {field.name for field in dataclasses.fields(TASKS[task])}
     for name in task_fields.keys() & _REPLACED.keys():
@@ -350,4 +355,6 @@ def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:
         vector = np.zeros(())
     if vector.shape != (size,) or not np.isfinite(vector).all():
         raise ValueError(f"{what} must be {size} finite numbers, not {value!r}")
+    if (np.abs(vector) > _LARGEST).any():
+        raise ValueError(f"{what} must be numbers within ±{_LARGEST:g}, not {value!r}")
     return vector

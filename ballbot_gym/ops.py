@@ -7,6 +7,7 @@ Python and for a batch on an accelerator.
 
 import functools
 import math
+import numbers
 import sys
 from types import ModuleType
 from typing import Any
@@ -107,3 +108,8 @@ def stack(parts: tuple[Any, ...], like: Vector) -> Vector:
 
 def _is_casadi(v: Any) -> bool:
     return type(v).__module__.partition(".")[0] == "casadi"
+
+
+def is_number(value: object) -> bool:
+    """Whether something is one real number, and no truth value."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)

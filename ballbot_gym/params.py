@@ -2,9 +2,13 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
+
+from ballbot_gym import files
+from ballbot_gym.ops import is_number
 
 _PACKAGE = Path(__file__).parent
 _IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf" / "ballbot.urdf", _PACKAGE.parent / "urdf" / "ballbot.urdf"
@@ -20,6 +24,8 @@ _CHAIN = {
     "gamma": ("continuous", (0.0, 1.0, 0.0), "ball", "yoke"),
     "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "body"),
 }
+_NO_NUMBER = (str, bytes, bool, dict, list, tuple, type(None))
+_FILE_LIMIT = 16 * 2**20  # bytes
 _MASSLESS_LINKS = ("slide", "yoke")
 
 
@@ -39,6 +45,9 @@ class BallbotParams:
     | inertia, axial_inertia | of the body about its centre of mass, across and along its axis | kg·m² |
     | force_limit | largest force on the ball along each axis | N |
     | gravity | | m/s² |
+
+    Raises:
+        ValueError: a field is no number, or not positive and finite; the message names it.
     """
 
     ball_mass: float
@@ -51,6 +60,15 @@ class BallbotParams:
     axial_inertia: float
     force_limit: float
     gravity: float = STANDARD_GRAVITY
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, _NO_NUMBER):
+                raise ValueError(f"BallbotParams: {field.name} must be a number, not {value!r}")
+            # batches of robots hold tensors, whose values are not looked at
+            if is_number(value) and not 0 < value < math.inf:
+                raise ValueError(f"BallbotParams: {field.name} must be positive and finite, not {value}")
 
     @cached_property
     def total_mass(self) -> float:
@@ -133,16 +151,33 @@ def default_params() -> BallbotParams:
     return BallbotParams.from_urdf()
 
 
+def checked_params(params: Any) -> BallbotParams:
+    """The robot that was given, or the paper's for None.
+
+    Raises:
+        TypeError: it is something else, such as a dict of fields.
+    """
+    if params is None:
+        return default_params()
+    if not isinstance(params, BallbotParams):
+        raise TypeError(
+            "params must be a BallbotParams, for instance dataclasses.replace(default_params(), body_mass=12.0), "
+            f"not {params!r}"
+        )
+    return params
+
+
 class _Urdf:
     """A parsed URDF. Its methods raise a `UrdfError` that names what is missing."""
 
     def __init__(self, path: Path):
         self.path = path
         try:
-            self.root = ElementTree.parse(path).getroot()
-        except FileNotFoundError:
-            raise UrdfError(f"{path}: no such URDF file") from None
-        except ElementTree.ParseError as error:
+            self.root = ElementTree.fromstring(files.read(path, _FILE_LIMIT))
+        except files.FileError as error:
+            raise UrdfError(f"{error}; give the path of a URDF") from None
+        # an unknown encoding is a LookupError, or a ValueError if it is one of several bytes
+        except (ElementTree.ParseError, LookupError, ValueError, RecursionError) as error:
             raise UrdfError(f"{path}: not well-formed XML: {error}") from None
 
     def error(self, text: str) -> UrdfError:
@@ -155,10 +190,12 @@ class _Urdf:
         return element
 
     def _named(self, tag: str, name: str) -> ElementTree.Element:
-        element = self.root.find(f"{tag}[@name='{name}']")
-        if element is None:
+        elements = self.root.findall(f"{tag}[@name='{name}']")
+        if not elements:
             raise self.error(f"{tag} '{name}' is missing")
-        return element
+        if len(elements) > 1:
+            raise self.error(f"{tag} '{name}' is there {len(elements)} times; it must be there once")
+        return elements[0]
 
     def _child(self, tag: str, name: str, query: str) -> ElementTree.Element:
         element = self._named(tag, name).find(query)
@@ -184,7 +221,7 @@ class _Urdf:
             vector = tuple(float(part) for part in text.split())
         except ValueError:
             vector = ()
-        if len(vector) != 3:
+        if len(vector) != 3 or not all(map(math.isfinite, vector)):
             raise self.error(f"{where}: xyz = '{text}' is not three numbers")
         return vector
 

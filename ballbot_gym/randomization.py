@@ -11,8 +11,12 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import ops
-from ballbot_gym.ops import between
+from ballbot_gym.ops import between, is_number
 from ballbot_gym.params import BallbotParams
+
+_LARGEST = 1e6  # of any number
+_LARGEST_FACTOR = 1e3
+_MOST_DELAY_STEPS = 1000  # every one of them is remembered, and takes time in every step
 
 Range = tuple[float, float]
 """(low, high), both included; drawn uniformly."""
@@ -65,12 +69,19 @@ class Randomization:
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(field.default, float):
-                if not (math.isfinite(value) and value >= 0):
-                    raise ValueError(f"Randomization: {field.name} must be finite and at least 0, not {value}")
+                if not is_number(value):
+                    raise ValueError(f"Randomization: {field.name} must be a number, not {value!r}")
+                if not 0 <= value <= _LARGEST:
+                    raise ValueError(
+                        f"Randomization: {field.name} must be finite and at least 0, and at most {_LARGEST:g}, not {value}"
+                    )
                 continue
             low, high = _pair(field.name, value)
             if not (math.isfinite(high) and low <= high):
                 raise ValueError(f"Randomization: {field.name} must be a finite range (low, high), not {value}")
+            largest = _LARGEST_FACTOR if field.default == (1.0, 1.0) else _LARGEST
+            if high > largest:
+                raise ValueError(f"Randomization: {field.name} must be at most {largest:g}, not {value}")
             if low < 0 or (low == 0 and field.default == (1.0, 1.0)):
                 bound = "positive factors" if field.default == (1.0, 1.0) else "at least 0"
                 raise ValueError(f"Randomization: {field.name} must be {bound}, not {value}")
@@ -112,9 +123,14 @@ class Randomization:
         """`actuator_delay` in control steps of control_dt seconds.
 
         Raises:
-            ValueError: it is not whole control steps.
+            ValueError: it is not whole control steps, or too many.
         """
         low, high = (round(seconds / control_dt) for seconds in self.actuator_delay)
+        if high > _MOST_DELAY_STEPS:
+            raise ValueError(
+                f"Randomization: actuator_delay {self.actuator_delay} s must be at most {_MOST_DELAY_STEPS} control steps "
+                f"of {control_dt} s"
+            )
         if not all(
             math.isclose(steps * control_dt, seconds, rel_tol=1e-9, abs_tol=1e-12)
             for steps, seconds in zip((low, high), self.actuator_delay, strict=True)
@@ -164,6 +180,21 @@ class Randomization:
         return tuple(
             value + std * normal if std else value for value, std, normal in zip(x, self.noise, normals(z), strict=True)
         )
+
+
+def checked_randomization(randomization: Any) -> Randomization:
+    """The randomization that was given, or none for None.
+
+    Raises:
+        TypeError: it is something else, such as a dict of fields.
+    """
+    if randomization is None:
+        return Randomization()
+    if not isinstance(randomization, Randomization):
+        raise TypeError(
+            f"randomization must be a Randomization, for instance Randomization(lean_noise=0.01), not {randomization!r}"
+        )
+    return randomization
 
 
 class Disturbance:
@@ -235,6 +266,8 @@ def normals(z: tuple[Any, ...]) -> tuple[Any, ...]:
 def _pair(name: str, value: Any) -> Range:
     try:
         low, high = value
+        if not (is_number(low) and is_number(high)):
+            raise TypeError
         return float(low), float(high)
     except (TypeError, ValueError):
         raise ValueError(f"Randomization: {name} must be a finite range (low, high), not {value!r}") from None

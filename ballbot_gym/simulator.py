@@ -3,19 +3,26 @@
 `BulletSimulator` loads the URDF into PyBullet; `Rk4Simulator` integrates the closed form and needs no PyBullet.
 """
 
+import ctypes
 import math
+import os
+import sys
 import tempfile
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol
 
 from ballbot_gym import dynamics
+from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
 
 State = tuple[float, ...]
 """(8,) state as a tuple of floats; order and units in `dynamics.STATE`."""
 
+_MOST_SUBSTEPS = 10_000
 _JOINTS = ("x", "y", "gamma", "theta")
 
 
@@ -128,7 +135,8 @@ PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": Bull
 def import_pybullet() -> ModuleType:
     """PyBullet, or an ImportError that says what to do."""
     try:
-        import pybullet
+        with _silenced() if "pybullet" not in sys.modules else nullcontext():  # it prints when it was built
+            import pybullet
     except ImportError as error:
         raise ImportError(
             'PyBullet is not installed. Install it with "pip install pybullet" (wheels exist up to Python 3.11), or use '
@@ -140,6 +148,27 @@ def import_pybullet() -> ModuleType:
             '"pip install --force-reinstall --only-binary=:all: pybullet", or install NumPy first and build again.'
         )
     return pybullet
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Drops what C code prints within the block."""
+    # C buffers what it prints into a pipe, so its buffer must be emptied before and after
+    flush = getattr(ctypes.CDLL(None), "fflush", lambda _: None) if os.name == "posix" else lambda _: None
+    kept: dict[int, int] = {}
+    flush(None)
+    with open(os.devnull, "wb") as nothing:
+        for stream in (1, 2):
+            with suppress(OSError):  # it is closed, so nothing can be printed to it
+                kept[stream] = os.dup(stream)
+                os.dup2(nothing.fileno(), stream)
+    try:
+        yield
+    finally:
+        flush(None)
+        for stream, original in kept.items():
+            os.dup2(original, stream)
+            os.close(original)
 
 
 def connect(bullet: ModuleType, mode: int) -> int:
@@ -183,7 +212,12 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
 
 
 def _whole_substeps(control_dt: float, physics_dt: float) -> int:
-    substeps = round(control_dt / physics_dt) if physics_dt > 0 else 0
+    if not is_number(physics_dt):
+        raise ValueError(f"physics_dt must be a number of seconds, not {physics_dt!r}")
+    substeps = round(control_dt / physics_dt) if physics_dt > control_dt / (_MOST_SUBSTEPS + 0.5) else 0
     if substeps < 1 or not math.isclose(substeps * physics_dt, control_dt, rel_tol=1e-9):
-        raise ValueError(f"physics_dt = {physics_dt} s must be a whole fraction of control_dt = {control_dt} s")
+        raise ValueError(
+            f"physics_dt = {physics_dt} s must be a whole fraction of control_dt = {control_dt} s, and at least "
+            f"1/{_MOST_SUBSTEPS} of it"
+        )
     return substeps

@@ -1,7 +1,5 @@
 """Trajectory: states and forces over time, with interpolation and a file format."""
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +7,9 @@ import numpy as np
 
 from ballbot_gym import dynamics, files
 from ballbot_gym.paths import hermite_basis
+
+MAX_SAMPLES = 1_000_000
+"""Times that `Trajectory.resampled` gives at most."""
 
 
 class TrajectoryError(ValueError):
@@ -36,7 +37,10 @@ class Trajectory:
         for name in ("t", "x", "u", "xdot"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, np.asarray(value, np.float64))
+                try:
+                    object.__setattr__(self, name, np.asarray(value, np.float64))
+                except (TypeError, ValueError) as error:
+                    raise TrajectoryError(f"{name} must be an array of numbers: {error}") from None
         n = self.t.size - 1
         if n < 0 or self.t.shape != (n + 1,) or self.x.shape != (n + 1, 8):
             raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, 8)")
@@ -46,7 +50,7 @@ class Trajectory:
             raise TrajectoryError(f"xdot {self.xdot.shape} must have the shape of x, {self.x.shape}")
         arrays = (self.t, self.x, self.u) if self.xdot is None else (self.t, self.x, self.u, self.xdot)
         if not all(np.isfinite(array).all() for array in arrays):
-            raise TrajectoryError("a trajectory must be finite")
+            raise TrajectoryError("a trajectory must be finite, and it holds NaN or infinity")
         if not (np.diff(self.t) > 0).all():
             raise TrajectoryError("times must increase")
 
@@ -95,7 +99,13 @@ class Trajectory:
         return i, max(0.0, (t - self.t[i]) / (self.t[i + 1] - self.t[i]))
 
     def resampled(self, dt: float) -> "Trajectory":
-        """The interpolated states and forces every dt s, with linear forces. For figures and comparisons."""
+        """The interpolated states and forces every dt s, with linear forces. For figures and comparisons.
+
+        Raises:
+            TrajectoryError: these are more than `MAX_SAMPLES` times.
+        """
+        if not (dt > 0 and self.duration / dt <= MAX_SAMPLES):
+            raise TrajectoryError(f"{self.duration:g} s every {dt:g} s are more than {MAX_SAMPLES:,} times")
         times = np.append(np.arange(self.t[0], self.t[-1], dt), self.t[-1])
         times = times[np.concatenate([[True], np.diff(times) > 1e-9])]
         return Trajectory(times, np.array([self.state(t) for t in times]), np.array([self.force(t) for t in times]))
@@ -115,7 +125,10 @@ class Trajectory:
             TrajectoryError: the file is no trajectory.
         """
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                return cls(**{name: arrays[name] for name in ("t", "x", "u", "xdot") if name in arrays})
-        except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            arrays = files.read_npz(path)
+            missing = [name for name in ("t", "x", "u") if name not in arrays]
+            if missing:
+                raise TrajectoryError(f"it has no array {', '.join(missing)}")
+            return cls(**{name: arrays[name] for name in ("t", "x", "u", "xdot") if name in arrays})
+        except ValueError as error:
             raise TrajectoryError(f"{path}: not a trajectory file: {error}") from error

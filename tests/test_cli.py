@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -277,6 +278,31 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     np.testing.assert_allclose(made.costs, known.costs[:3], rtol=1e-9)
     assert len(made.trajectories) == 3
     assert certified.path_of(make_task("turn")).read_bytes() == packaged
+
+
+def test_certify_goes_on_when_a_worker_dies(tmp_path):
+    options = ["--tasks", "turn", "--episodes", "6", "--workers", "1", "--out", "out"]
+    environment = {key: value for key, value in os.environ.items() if key != "BALLBOT_IN_PROCESS"}
+    run = subprocess.Popen(
+        [sys.executable, "-m", "ballbot_train.cli", "certify", *options],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    unfinished = tmp_path / "out" / "unfinished"
+    while run.poll() is None and not any(path.stat().st_size for path in unfinished.glob("*.jsonl")):
+        time.sleep(0.02)
+    search = ["pgrep", "-P", str(run.pid), "-f", "spawn_main"]
+    workers = subprocess.run(search, capture_output=True, text=True).stdout.split()
+    assert workers, "the optima are found in a process of their own"
+    os.kill(int(workers[0]), signal.SIGKILL)
+    printed, _ = run.communicate(timeout=120)
+    assert run.returncode == 0, printed
+    made, known = certified.load("turn", tmp_path / "out" / "BallbotTurn-v0.npz"), certified.load("turn")
+    np.testing.assert_array_equal(made.states, known.states[:6])
+    np.testing.assert_allclose(made.costs, known.costs[:6], rtol=1e-9)
 
 
 def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):

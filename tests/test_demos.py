@@ -106,7 +106,7 @@ def test_a_finished_dataset_is_kept_and_another_never_overwrites_it(tmp_path):
     folder = make(tmp_path / "kept-v0")
     before = content(folder)
     assert content(make(tmp_path / "kept-v0")) == before
-    with pytest.raises(ValueError, match="another dataset"):
+    with pytest.raises(ValueError, match=r"holds a dataset of .*; give another --out"):
         make(tmp_path / "kept-v0", seed=1)
     with pytest.raises(ValueError, match="NAME-vNUMBER"):
         make(tmp_path / "unversioned")

@@ -138,5 +138,5 @@ def test_unequal_force_limits_are_refused(tmp_path):
 
 
 def test_absent_urdf_is_named(tmp_path):
-    with pytest.raises(UrdfError, match=r"nowhere\.urdf: no such URDF file"):
+    with pytest.raises(UrdfError, match=r"nowhere\.urdf: no such file; give the path of a URDF"):
         BallbotParams.from_urdf(tmp_path / "nowhere.urdf")

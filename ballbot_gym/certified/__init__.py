@@ -4,12 +4,14 @@
 episode, and the optimal trajectories of the first 20 episodes. Costs hold for the env's discretization with physics="rk4".
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ballbot_gym import files
+from ballbot_gym.env import make_task
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -71,27 +73,62 @@ def path_of(task: Task) -> Path:
     return Path(__file__).parent / f"{task.id}.npz"
 
 
-def load(task: Task, path: Path | None = None) -> EvaluationSet:
+def load(task: str | Task, path: str | Path | None = None) -> EvaluationSet:
     """The evaluation set of a task.
 
     Args:
-        task: must be the very problem the set was computed for; its pay and its arena may differ.
+        task: a name in `TASKS`, or a Task that is the very problem of the set; its pay and its arena may differ.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
 
     Raises:
-        CertificateError: there is none, or it belongs to other fields of the task.
+        CertificateError: there is none, it belongs to other fields of the task, or it is damaged.
+        ValueError: no task of that name.
     """
+    task = make_task(task)
     path = path_of(task) if path is None else Path(path)
     if not path.exists():
         raise CertificateError(f'{path}: no evaluation set of {task.id}; compute it with "ballbot certify"')
-    with np.load(path, allow_pickle=False) as arrays:
+    try:
+        arrays = files.read_npz(path)
+        missing = [name for name in ("task", "lengths", "x", "u", *_PER_EPISODE) if name not in arrays]
+        if missing:
+            raise ValueError(f"it has no array {', '.join(missing)}")
         if str(arrays["task"]) != task.problem():
             raise CertificateError(
                 f'{path} was computed for {arrays["task"]}, not for {task.problem()}; compute another with "ballbot certify"'
             )
+        _check(task, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])
         states = np.split(x, np.cumsum(lengths + 1)[:-1])
         times = (task.control_dt * np.arange(n + 1) for n in lengths)
         trajectories = tuple(Trajectory(*parts) for parts in zip(times, states, forces, strict=True))
-        return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
+    except CertificateError:
+        raise
+    except ValueError as error:
+        raise CertificateError(f'{path} is no evaluation set: {error}; compute it with "ballbot certify"') from error
+    return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
+
+
+def _check(task: Task, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises a ValueError that names the array whose shape or values make no sense."""
+    n = arrays["costs"].size
+    shapes = dict.fromkeys(_PER_EPISODE, (n,)) | {"states": (n, 8), "constants": (n, len(task.constant_names))}
+    for name, shape in shapes.items():
+        if n == 0 or arrays[name].shape != shape:
+            raise ValueError(f"{name} has the shape {arrays[name].shape}, and not {shape} of at least one episode")
+        if name == "statuses":
+            continue
+        if arrays[name].dtype.kind != "f" or not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{name} must be finite numbers")
+    if not (arrays["costs"] > 0).all():
+        raise ValueError("costs must be positive")
+    lengths = arrays["lengths"]
+    if lengths.ndim != 1 or lengths.dtype.kind not in "iu" or not 0 < lengths.size <= n:
+        raise ValueError(f"lengths must be whole numbers, one for each of at most {n} trajectories")
+    if (lengths < 0).any() or (lengths > task.steps).any():
+        raise ValueError(f"lengths must be 0 to {task.steps} control steps")
+    steps = int(lengths.sum())
+    for name, shape in (("x", (steps + lengths.size, 8)), ("u", (steps, 2))):
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} has the shape {arrays[name].shape}, and not {shape}, as lengths say")

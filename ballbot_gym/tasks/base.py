@@ -1,6 +1,7 @@
 """Task: the one definition of an optimal-control problem that env, experts, optimizer and leaderboard use."""
 
 import math
+import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -8,10 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ballbot_gym import dynamics, ops
-from ballbot_gym.ops import Vector, squared
+from ballbot_gym.ops import Vector, is_number, squared
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.symmetry import Mirror
+
+MAX_STEPS = 1_000_000
+"""Control steps in the longest episode that a task may have."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +84,18 @@ class Task(ABC):
 
     def __post_init__(self) -> None:
         for field in fields(self):
+            if not isinstance(field.default, float):
+                continue
             value = getattr(self, field.name)
-            if isinstance(value, int | float) and not 0 < value < math.inf:
+            if not is_number(value):
+                raise ValueError(f"{type(self).__name__}: {field.name} must be a number, not {value!r}")
+            if not 0 < value <= sys.float_info.max:
                 raise ValueError(f"{type(self).__name__}: {field.name} must be positive and finite, not {value}")
+            object.__setattr__(self, field.name, float(value))  # so that 8 and 8.0 are the same task
+        if not 0.5 <= self.duration / self.control_dt <= MAX_STEPS:
+            raise ValueError(
+                f"duration {self.duration} s must be 1 to {MAX_STEPS:,} control steps of {self.control_dt} s"
+            )
         if not math.isclose(self.steps * self.control_dt, self.duration, rel_tol=1e-9):
             raise ValueError(
                 f"duration {self.duration} s is not a whole number of control steps of {self.control_dt} s"

@@ -103,6 +103,13 @@ class Orbit(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.min_radius > self.max_radius:
+            raise ValueError(f"Orbit: min_radius {self.min_radius:g} exceeds max_radius {self.max_radius:g} m")
+        if not self.min_steady_tilt <= self.max_steady_tilt < math.pi / 2:
+            raise ValueError(
+                f"Orbit: min_steady_tilt {self.min_steady_tilt:g} and max_steady_tilt {self.max_steady_tilt:g} rad must be "
+                "in order, and below 90°"
+            )
         if self.arena_factor <= 1:
             raise ValueError(
                 f"Orbit: arena_factor must exceed 1, so that the circle lies inside, not {self.arena_factor}"

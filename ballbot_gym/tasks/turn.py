@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -81,6 +81,9 @@ class Turn(Task):
     arena_radius: float = 20.0
     """How far from the gate the ball may go, m."""
 
+    MAX_SPEED: ClassVar[float] = 12.0
+    """Largest speed that an episode may have, m/s."""
+
     id = "BallbotTurn-v0"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 5.0)
     constant_names = ("speed",)
@@ -88,12 +91,20 @@ class Turn(Task):
     first_exit = True
     reward_threshold = 780.1
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.min_speed <= self.max_speed <= self.MAX_SPEED:
+            raise ValueError(
+                f"Turn: min_speed {self.min_speed:g} and max_speed {self.max_speed:g} must be in order, "
+                f"and at most {self.MAX_SPEED:g} m/s"
+            )
+
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         return (between(z[0], self.min_speed, self.max_speed),)
 
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
-        if not 0 < c[0] <= 12:
-            raise ValueError(f"{self.id}: speed must be in (0, 12] m/s, not {c[0]:g}")
+        if not 0 < c[0] <= self.MAX_SPEED:
+            raise ValueError(f"{self.id}: speed must be in (0, {self.MAX_SPEED:g}] m/s, not {c[0]:g}")
 
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         (speed,) = c

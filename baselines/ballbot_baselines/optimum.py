@@ -19,6 +19,7 @@ import numpy as np
 from ballbot_baselines import guess
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
+from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
@@ -58,12 +59,23 @@ class Backoff:
 
     `margin` is in the unit of the task's margins (obstacles: m). `goal` is the fraction of the goal's tolerance that the plan
     leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback.
+
+    Raises:
+        ValueError: a field is negative or not finite, or a fraction is not below 1.
     """
 
     # The defaults make up for the solvers' tolerance, so that optimal forces and states obey the limits exactly.
     margin: float = 1e-7
     goal: float = 1e-6
     force: float = 1e-7
+
+    def __post_init__(self) -> None:
+        for name, below in (("margin", math.inf), ("goal", 1.0), ("force", 1.0)):
+            value = getattr(self, name)
+            if not is_number(value):
+                raise ValueError(f"Backoff: {name} must be a number, not {value!r}")
+            if not 0 <= value < below:
+                raise ValueError(f"Backoff: {name} must be at least 0 and below {below:g}, not {value}")
 
 
 def find_optimum(

@@ -1,8 +1,11 @@
 """What every command shares: the console, its progress bars and tables, and checks of what was typed."""
 
 import sys
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -13,8 +16,38 @@ from rich.table import Table
 console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
 
 
+LINE_SECONDS = 10.0
+"""How often progress is printed into a file or a pipe."""
+
+
+class LineProgress(Progress):
+    """Progress for a file or a pipe, which cannot show a bar: every now and then a line per bar that is not full."""
+
+    def __init__(self, *columns: Any, **keywords: Any):
+        super().__init__(*columns, **keywords)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._print_lines, daemon=True)
+
+    def start(self) -> None:
+        super().start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        super().stop()
+
+    def _print_lines(self) -> None:
+        while not self._ended.wait(LINE_SECONDS):
+            for task in self.tasks:
+                if not task.finished:
+                    elapsed = timedelta(seconds=int(task.elapsed or 0))
+                    self.console.print(f"{elapsed} {task.description}: {task.completed:.0f} of {task.total or 0:.0f}")
+
+
 def progress_bar() -> Progress:
-    """A bar per task: description, share, times."""
+    """A bar per task: description, share, times. Where output is no terminal, a line per task now and then."""
     columns = (
         TextColumn("{task.description:>10}", markup=False),
         BarColumn(),
@@ -22,7 +55,7 @@ def progress_bar() -> Progress:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, console=console)
+    return (Progress if console.is_terminal else LineProgress)(*columns, console=console)
 
 
 class Bars:

@@ -72,10 +72,7 @@ def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Map
     try:
         if path.exists():
             held = {key: value for key, value in _read_marker(path).items() if key not in facts}
-            changed = [key for key in {**held, **wanted} if held.get(key) != wanted.get(key)]
-            if changed:
-                what = "; ".join(f"{key} {held.get(key)!r}, not {wanted.get(key)!r}" for key in changed)
-                raise ValueError(f"{out} holds an unfinished run of {what}; give another --out or delete the folder")
+            check_same(held, wanted, out, "an unfinished run" if marker == MARKER else "a run")
         files.write(path, json.dumps({**wanted, **facts}, indent=1) + "\n")
     except BaseException:
         if not locked_before:
@@ -83,12 +80,28 @@ def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Map
         raise
 
 
+def check_same(held: Mapping[str, Any], wanted: Mapping[str, Any], out: Path, what: str) -> None:
+    """Raises a ValueError that names the settings of what a folder holds where they are not those wanted.
+
+    Args:
+        held: settings of what the folder holds, as JSON gives them.
+        wanted: settings of what is to be in it; anything that JSON holds.
+        out: the folder.
+        what: it holds, in words.
+    """
+    wanted = json.loads(json.dumps(dict(wanted)))
+    changed = [key for key in {**held, **wanted} if held.get(key) != wanted.get(key)]
+    if changed:
+        said = "; ".join(f"{key} {held.get(key)!r}, not {wanted.get(key)!r}" for key in changed)
+        raise ValueError(f"{out} holds {what} of {said}; give another --out or delete the folder")
+
+
 def _read_marker(path: Path) -> dict[str, Any]:
     try:
-        held = json.loads(path.read_text())
+        held = files.read_json(path)
         if not isinstance(held, dict):
-            raise ValueError("it holds no object")
-    except (OSError, ValueError, RecursionError) as error:
+            raise ValueError(f"{path} holds no object")
+    except ValueError as error:
         raise ValueError(f"{path} is damaged ({error}); delete it or give another --out") from error
     return held
 
@@ -150,7 +163,8 @@ def run(jobs: Sequence[Job], out: Path, workers: int, on_progress: Callable[[str
     Args:
         jobs: what there is to do.
         out: folder of the results; unfinished ones are in a folder within.
-        workers: processes; with 1, the calling one.
+        workers: processes. The calling process does no item itself, so that it outlives any of them; but with 1 worker and
+            $BALLBOT_IN_PROCESS set, it does them all, for debuggers and tests.
         on_progress: called with a job's group and a number of its items that are there.
 
     Returns:
@@ -168,7 +182,7 @@ def run(jobs: Sequence[Job], out: Path, workers: int, on_progress: Callable[[str
         for job, entries in zip(jobs, done, strict=True):
             on_progress(job.group, len(entries))
         missing = [i for i, job in enumerate(jobs) if len(done[i]) < len(job.items)]
-        if workers == 1 or len(missing) == 1:
+        if workers == 1 and os.environ.get("BALLBOT_IN_PROCESS"):
             for i in missing:
                 on_progress(jobs[i].group, _work(jobs[i], paths[i]))
         elif missing:

@@ -139,8 +139,9 @@ def load_network(path: str | Path, task: Task) -> PolicyNetwork:
     described = read_description(path)["spec"]
     try:
         spec = PolicySpec.read(described)
-        weights = safetensors.torch.load(weights_path.read_bytes())
-    except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
+    except KeyError as error:
+        raise PolicyError(f"{description_path} is not a policy: its spec has no {error}") from error
+    except (ValueError, TypeError) as error:
         raise PolicyError(f"{description_path} is not a policy: {error}") from error
     if spec.task != task.problem():
         raise PolicyError(f"{description_path} was trained on {spec.task}, not on {task.problem()}")
@@ -153,12 +154,37 @@ def load_network(path: str | Path, task: Task) -> PolicyNetwork:
         raise PolicyError(
             f"{description_path} takes {spec.observations} observations, {task.id} has {len(task.observation_scale)}"
         )
-    try:
-        network = PolicyNetwork(spec)
-        network.load_state_dict(weights)
-    except (RuntimeError, KeyError, TypeError) as error:
-        raise PolicyError(f"{weights_path}: the weights do not fit their description: {error}") from error
+    weights = _read_weights(weights_path)
+    with torch.device("meta"):  # shapes without memory, which a wrong description would ask for
+        shapes = {name: tuple(part.shape) for name, part in PolicyNetwork(spec).state_dict().items()}
+    found = {name: tuple(part.shape) for name, part in weights.items()}
+    differing = [name for name in {**shapes, **found} if shapes.get(name) != found.get(name)]
+    if differing:
+        name = differing[0]
+        raise PolicyError(
+            f"{weights_path}: the weights do not fit their description: {name} has the shape {found.get(name)}, "
+            f"and should have {shapes.get(name)}"
+        )
+    network = PolicyNetwork(spec)
+    network.load_state_dict(weights)
     return network
+
+
+def _read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """The weights of a file; raises a PolicyError that names what is no number."""
+    try:
+        weights = safetensors.torch.load(files.read(path))
+    # safetensors answers some files with a KeyError, or with an error that torch raises
+    except (ValueError, KeyError, TypeError, RuntimeError, safetensors.SafetensorError) as error:
+        raise PolicyError(f"{path} is not a policy: {error}") from error
+    for name, tensor in weights.items():
+        if not tensor.is_floating_point():
+            raise PolicyError(f"{path}: {name} holds {tensor.dtype}, and not floating-point numbers")
+        if not tensor.isfinite().all():
+            raise PolicyError(
+                f"{path}: {name} holds NaN or infinity; take an earlier policy of the training, or train anew"
+            )
+    return weights
 
 
 def load_policy(

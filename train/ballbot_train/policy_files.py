@@ -4,12 +4,12 @@ A policy is two files: weights in `NAME.safetensors` and their description in `N
 """
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_type_hints
 
+from ballbot_gym import files
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
 
@@ -20,8 +20,19 @@ SHIPPED = Path(__file__).parent / "policies"
 """Policies that come with the package, as TASK-LEARNER.json and .safetensors."""
 
 
+_MOST_LAYERS = 64
+_MOST_MIRRORS = 16
+_MOST_UNITS = 1_000_000  # of a layer
+_DESCRIPTION_LIMIT = 2**24  # bytes
+
+
 class PolicyError(ValueError):
     """A policy file that is missing, damaged, or belongs to another task or observation."""
+
+
+def _check_count(name: str, number: Any) -> None:
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= _MOST_UNITS:
+        raise ValueError(f"{name} must be whole numbers from 0 to {_MOST_UNITS}, not {number!r:.200}")
 
 
 @dataclass(frozen=True)
@@ -48,6 +59,30 @@ class PolicySpec:
     """How the sum is brought into [−1, 1]."""
     observation_version: int = OBSERVATION_VERSION
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.task, str):
+            raise ValueError(f"task must be text, not {self.task!r}")
+        for name in ("observations", "observation_version"):
+            _check_count(name, getattr(self, name))
+        if not isinstance(self.hidden, tuple) or len(self.hidden) > _MOST_LAYERS:
+            raise ValueError(f"hidden must be the units of at most {_MOST_LAYERS} layers, not {self.hidden!r:.200}")
+        for units in self.hidden:
+            _check_count("hidden", units)
+        for name in ("activation", "squash"):
+            known = get_args(get_type_hints(PolicySpec)[name])
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
+        for name in ("linear", "odd"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be true or false, not {getattr(self, name)!r}")
+        if len(self.mirrors) > _MOST_MIRRORS:
+            raise ValueError(f"mirrors must be at most {_MOST_MIRRORS}, not {len(self.mirrors)}")
+        for signs, action in self.mirrors:
+            if len(signs) != self.observations or len(action) != 2 or not {*signs, *action} <= {-1, 1}:
+                raise ValueError(f"mirrors must hold signs of {self.observations} observations and 2 actions")
+        if self.odd and self.activation != "tanh":
+            raise ValueError(f"odd needs the activation tanh, not {self.activation}")
+
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":
         """The spec that a policy's JSON file describes, where JSON has lists in place of tuples.
@@ -55,10 +90,13 @@ class PolicySpec:
         Raises:
             KeyError, TypeError, ValueError: it describes none.
         """
+        hidden = described["hidden"]
+        if not isinstance(hidden, list | tuple):
+            raise ValueError(f"hidden must be a list of whole numbers, not {hidden!r:.200}")
         mirrors = tuple((tuple(signs), tuple(action)) for signs, action in described.get("mirrors", ()))
         if described.get("frame") not in (None, *FRAMES):
             raise ValueError(f"no frame {described['frame']!r}; known: {', '.join(FRAMES)}")
-        return cls(**(dict(described) | {"hidden": tuple(described["hidden"]), "mirrors": mirrors}))
+        return cls(**(dict(described) | {"hidden": tuple(hidden), "mirrors": mirrors}))
 
     @classmethod
     def of(cls, task: Task, **fields: Any) -> "PolicySpec":
@@ -77,14 +115,14 @@ def read_description(path: str | Path) -> dict[str, Any]:
     """
     _, description = paths_of(path)
     try:
-        read = json.loads(description.read_text())
+        read = files.read_json(description, _DESCRIPTION_LIMIT)
         if not isinstance(read["spec"], dict):
             raise TypeError("its spec is no object")
         if not isinstance(read["spec"]["task"], str):
             raise TypeError("its spec names no task")
     except KeyError as error:
         raise PolicyError(f"{description} is not a policy: it has no {error}") from error
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError) as error:
         raise PolicyError(f"{description} is not a policy: {error}") from error
     return read
 
@@ -105,8 +143,8 @@ def weights_digest(path: str | Path) -> str:
     """
     weights, _ = paths_of(path)
     try:
-        return hashlib.sha256(weights.read_bytes()).hexdigest()
-    except OSError as error:
+        return hashlib.sha256(files.read(weights)).hexdigest()
+    except files.FileError as error:
         raise PolicyError(f"{weights} is not a policy: {error}") from error
 
 

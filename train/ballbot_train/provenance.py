@@ -1,6 +1,7 @@
 """What a result depends on besides its settings: versions of the code and its libraries, and the machine."""
 
 import importlib.metadata
+import math
 import os
 import platform
 import subprocess
@@ -18,6 +19,36 @@ def provenance() -> dict[str, object]:
         **{name: _version(name) for name in _PACKAGES},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
     }
+
+
+BUSY = 1.25
+"""Load per core from which times are no longer those of the code alone."""
+
+
+def load() -> float:
+    """Processes that ran or waited for a core in the last minute; NaN where the system does not say."""
+    try:
+        return os.getloadavg()[0]
+    except (AttributeError, OSError):
+        return math.nan
+
+
+def load_facts(start: float, workers: int) -> dict[str, object]:
+    """Whether a run that ends now was timed on a busy machine, and the loads that say so.
+
+    Args:
+        start: `load()` before the run, which its own workers had not raised.
+        workers: of the run.
+
+    Returns:
+        "busy", "load_start" and "load_end"; null loads where the system does not say, and then it is not busy.
+    """
+    end, cores = load(), os.cpu_count() or 1
+    busy = start + workers > BUSY * cores or end > BUSY * cores
+    shown = {
+        name: round(value, 2) if math.isfinite(value) else None for name, value in (("start", start), ("end", end))
+    }
+    return {"busy": busy, "load_start": shown["start"], "load_end": shown["end"]}
 
 
 def _version(package: str) -> str:

@@ -30,8 +30,8 @@ def basins(
         workers: processes.
     """
     points = min(points, 9) if quick else points
-    if points < 3 or points % 2 == 0:
-        raise ValueError(f"points must be odd and at least 3, not {points}")
+    if not 3 <= points <= 501 or points % 2 == 0:
+        raise ValueError(f"points must be odd, and 3 to 501, not {points}")
     chosen = controllers_of([maps.TASK], controllers)
     names = chosen[maps.TASK]
     facts = open_run(out, chosen, workers, physics, points=points)

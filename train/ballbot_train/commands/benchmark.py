@@ -14,7 +14,8 @@ from ballbot_train.console import console, markdown, print_table, progress_bars
 from ballbot_train.evaluation import basins
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
-from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
 from ballbot_train.report.replay import certified_replay
@@ -49,9 +50,12 @@ def benchmark(
     """
     chosen = controllers_of(tasks, controllers)
     episodes = checked_episodes(episodes, quick, few=8)
+    load_before = load()
     facts = open_run(out, chosen, workers, physics, seed, episodes=episodes)
     with progress_bars({task: episodes * len(group) for task, group in chosen.items()}) as bars:
         done = run_benchmark(chosen, episodes, physics, out, workers, bars.advance, seed)
+    facts |= load_facts(load_before, workers)
+    busy = bool(facts["busy"])
     recovered, damaged = basins.recovered_fractions(runs / "basins")
     if damaged:
         console.print(f"skipped: {damaged}")
@@ -62,12 +66,14 @@ def benchmark(
     write_leaderboard(rows, done, facts, out)
     figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     pictures = [_episode_figure(task, group, physics, out) for task, group in chosen.items()]
-    table = [cells(row) for row in rows]
-    files.write(out / "leaderboard.md", markdown(HEADER, table))
-    sections = leaderboard_sections(HEADER, table, done, chosen, pictures, physics, runs)
+    table = [cells(row, busy) for row in rows]
+    files.write(out / "leaderboard.md", markdown(HEADER, table) + (f"\n{BUSY_NOTE}\n" if busy else ""))
+    sections = leaderboard_sections(HEADER, table, done, chosen, pictures, physics, runs, BUSY_NOTE if busy else "")
     page = write_report("ballbot-gym: leaderboard", sections, facts, out / "report.html")
     jobs.release(out)
     print_table(f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
+    if busy:
+        console.print(f"{BUSY_NOTE} Load {facts['load_start']} to {facts['load_end']} on {os.cpu_count()} cores.")
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")

@@ -33,7 +33,7 @@ def compare(
     compared = comparison.compare(runs[0], runs[1], match, margin, training_margin)
     for key in sorted(runs[0][0].keys() | runs[1][0].keys()):
         first, second = (run[0].get(key) for run in runs)
-        if runs[0][0] and runs[1][0] and first != second and key != "policies":
+        if runs[0][0] and runs[1][0] and first != second and key not in ("policies", "load_start", "load_end"):
             console.print(f"{key}: {first} in A, {second} in B")
     header = ["task", "controller", "B is", "episodes", "success B − A", "regret B − A", "because"]
     print_table(f"A: {a}\nB: {b}", header, [_cells(entry) for entry in compared])

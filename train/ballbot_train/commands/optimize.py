@@ -10,8 +10,10 @@ from ballbot_baselines.optimum import find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_names, console, print_table
+from ballbot_train.console import check_least, check_names, console, print_table
 from ballbot_train.report import figures
+
+_MOST_STEPS = 5000  # control steps of an episode; longer ones take hours and gigabytes
 
 
 def optimize(
@@ -40,15 +42,15 @@ def optimize(
     check_names("task", [task], TASKS)
     fields = {"duration": duration, "max_tilt": None if max_tilt is None else math.radians(max_tilt)}
     params = default_params()
+    check_least(0, seed=seed)
     if force_limit is not None:
-        if force_limit <= 0:
-            raise ValueError(f"force_limit must be positive, not {force_limit} N")
         params = replace(params, force_limit=force_limit)
-    env = BallbotEnv(
-        make_task(task, **{key: value for key, value in fields.items() if value is not None}),
-        physics="rk4",
-        params=params,
-    )
+    problem = make_task(task, **{key: value for key, value in fields.items() if value is not None})
+    if problem.steps > _MOST_STEPS:
+        raise ValueError(
+            f"duration {duration:g} s is too long to optimize; give at most {_MOST_STEPS * problem.control_dt:g} s"
+        )
+    env = BallbotEnv(problem, physics="rk4", params=params)
     options = {"constants": constants} | ({} if state is None else {"state": state})
     _, info = env.reset(seed=seed, options=options)
     optimum = find_optimum(env.task, params, info["state"], info["constants"])

@@ -10,6 +10,7 @@ from ballbot_train.console import check_names, console, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
 from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_ghosts
 
+_MOST_FRAMES = 100_000
 _WIDTHS = {"mp4": 1280, "gif": 640, "webp": 640}  # px
 
 
@@ -46,8 +47,8 @@ def replay(
         ghost_by: name of that expert.
         out: folder of the file. The file is named after task, controllers and episode.
     """
-    _check(fps >= 1, f"fps must be at least 1, not {fps}")
-    _check(frames >= 1, f"frames must be at least 1, not {frames}")
+    _check(1 <= fps <= 1000, f"fps must be 1 to 1000, not {fps}")
+    _check(1 <= frames <= 100, f"frames must be 1 to 100, not {frames}")
     _check(0 < speed < math.inf, f"speed must be positive, not {speed}")
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
@@ -57,6 +58,8 @@ def replay(
     if format == "png":
         console.print(f"picture: {write_strip(shown, path, frames, end)}")
         return
+    count = end / speed * fps
+    _check(count <= _MOST_FRAMES, f"the film would have {count:.3g} frames; give another speed or fps")
     with progress_bar() as progress:
         bar = progress.add_task("frames", total=len(film_times(end, fps, speed)))
         write_film(shown, path, end, fps, speed, width or _WIDTHS[format], on_frame=lambda: progress.advance(bar))

@@ -11,7 +11,9 @@ import tyro
 
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import check_names, console
-from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.learners import LEARNERS, check_settings
+
+_MOST_THREADS = 1024
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,10 @@ def train(
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
     algorithm = LEARNERS[learner]
-    if threads is not None and threads < 1:
-        raise ValueError(f"threads must be at least 1, not {threads}")
+    if threads is not None and not 1 <= threads <= _MOST_THREADS:
+        raise ValueError(f"threads must be 1 to {_MOST_THREADS}, not {threads}")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
 
@@ -81,6 +85,7 @@ def train(
         torch.set_num_threads(threads)
     problem = make_task(task)
     settings = algorithm.settings(task) if settings is None else settings
+    check_settings(settings)
     out = Path("runs") / "train" / f"{task}-{learner}" if out is None else out
     if command is None:
         command = command_with(learner, Run(task, demos, start, seed, threads, out), settings)
@@ -88,7 +93,10 @@ def train(
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
     if start is not None:
-        command = f"{read_description(start)['training']['command']} && {command}"
+        trained = read_description(start).get("training")
+        if not isinstance(trained, dict) or not isinstance(trained.get("command"), str):
+            raise ValueError(f"{start} does not say by which command it was trained; give a policy of ballbot train")
+        command = f"{trained['command']} && {command}"
     config = {
         "learner": learner,
         "task": task,

@@ -235,7 +235,7 @@ def _as_json(basin: BasinMap) -> dict[str, Any]:
 
 def read(folder: Path) -> list[BasinMap]:
     """The maps of a folder that `write` wrote."""
-    document = json.loads((folder / "basins.json").read_text())
+    document = files.read_json(folder / "basins.json")
     return [
         BasinMap(
             axis=entry["axis"],
@@ -257,9 +257,9 @@ def recovered_fractions(folder: Path) -> tuple[dict[tuple[str, str], float], str
     if not path.exists():
         return {}, ""
     try:
-        rows = json.loads(path.read_text())["rows"]
+        rows = files.read_json(path)["rows"]
         return {(str(row["task"]), str(row["controller"])): float(row["recovered"]) for row in rows}, ""
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         return {}, f"{path} is damaged: {error!r}"
 
 

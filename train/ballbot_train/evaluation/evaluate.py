@@ -3,6 +3,7 @@
 Importing this module is light: torch is imported for policy files, CasADi for experts that plan, SciPy for intervals.
 """
 
+import itertools
 import math
 import numbers
 from collections.abc import Callable, Iterable, Iterator
@@ -110,6 +111,8 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
         ValueError: none, more than there are, or one of them twice.
         TypeError: they are no whole numbers.
     """
+    if isinstance(episodes, bool | str):
+        raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
     if isinstance(episodes, numbers.Integral):
         count = int(episodes)
         if not 1 <= count <= available:
@@ -117,11 +120,13 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
         return list(range(count))
     if not isinstance(episodes, Iterable):
         raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
-    indices = list(episodes)
+    indices = list(itertools.islice(episodes, available + 1))  # it may be endless
+    if len(indices) > available:
+        raise ValueError(f"episodes names more than the {available} episodes that there are; give each once")
     if not indices:
         raise ValueError("episodes is empty; give at least one index")
     for index in indices:
-        if not isinstance(index, numbers.Integral):
+        if isinstance(index, bool) or not isinstance(index, numbers.Integral):
             raise TypeError(f"indices of episodes must be whole numbers, not {index!r}")
         if not 0 <= index < available:
             raise ValueError(f"indices of episodes must be 0 to {available - 1}, not {index}")

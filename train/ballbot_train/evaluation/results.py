@@ -126,14 +126,26 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
     path = path / "leaderboard.json" if path.is_dir() else path
     try:
         if path.suffix == ".csv":
-            text = path.read_text()
+            text = files.read(path).decode()
             if not text.endswith("\n"):
                 raise ValueError("its last line is cut off")
-            return {}, [_from_csv(entry) for entry in csv.DictReader(text.splitlines())]
-        document = json.loads(path.read_text())
-        return dict(document["about"]), [_from_json(entry) for entry in document["episodes"]]
-    except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error) as error:
+            return {}, [_checked(_from_csv(entry)) for entry in csv.DictReader(text.splitlines())]
+        document = files.read_json(path)
+        return dict(document["about"]), [_checked(_from_json(entry)) for entry in document["episodes"]]
+    except files.FileError as error:
+        raise ValueError(f"{path} holds no episodes of a benchmark: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error!r}") from error
+
+
+def _checked(result: Result) -> Result:
+    """The result, unless its costs make no sense."""
+    if not (math.isfinite(result.cost) and 0 < result.optimum < math.inf):
+        raise ValueError(
+            f"episode {result.episode} of {result.controller} on {result.task} has the cost {result.cost} and the optimum "
+            f"{result.optimum}"
+        )
+    return result
 
 
 def _from_json(entry: Mapping[str, Any]) -> Result:
@@ -141,7 +153,8 @@ def _from_json(entry: Mapping[str, Any]) -> Result:
     result = Result(**values)
     for field in fields(Result):
         value, kind = getattr(result, field.name), cast(Any, field.type)
-        if not isinstance(value, (int, float) if kind is float else kind):
+        fits = isinstance(value, (int, float) if kind is float else kind)
+        if not fits or (isinstance(value, bool) and kind is not bool):
             raise TypeError(f"{field.name} of an episode is {value!r}")
     return result
 
@@ -192,8 +205,15 @@ HEADER = [
 ]
 
 
-def cells(row: Row) -> list[str]:
-    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash."""
+BUSY_NOTE = "~ The machine was busy, so plan and per step are longer than they need be."
+"""What stands below a table of `cells` of a busy machine."""
+
+
+def cells(row: Row, busy: bool = False) -> list[str]:
+    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash.
+
+    Times of a busy machine have a ~ in front.
+    """
 
     def shown(value: float, form: str, unit: str = "") -> str:
         return format(value, form) + unit if math.isfinite(value) else "–"
@@ -210,6 +230,8 @@ def cells(row: Row) -> list[str]:
         shown(row.settle_time_median, ".2f", " s"),
         shown(row.effort_mean, ".0f", " N"),
         shown(row.recovered, ".0%"),
-        shown(row.plan_ms_median, ".0f", " ms"),
-        shown(row.step_us_median, ".0f", " µs"),
+        *(
+            "~" * (busy and math.isfinite(value)) + shown(value, ".0f", unit)
+            for value, unit in ((row.plan_ms_median, " ms"), (row.step_us_median, " µs"))
+        ),
     ]

@@ -19,7 +19,6 @@ dataset shows recoveries too.
 
 import importlib.metadata
 import inspect
-import json
 import math
 import os
 import shlex
@@ -78,6 +77,8 @@ class DemoConfig:
         check_names("expert", [self.expert], CONTROLLERS)
         if not 1 <= self.episodes <= _SEEDS:
             raise ValueError(f"episodes must be 1 to {_SEEDS}, not {self.episodes}")
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
         for name in ("noise", "pushes"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and at least 0, not {getattr(self, name)}")
@@ -266,14 +267,17 @@ def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callab
         PlanError: no episode could be started.
     """
     out = dataset_folder(out)
-    described = json.loads(json.dumps(asdict(config)))
+    described = asdict(config)
     unfinished = out.with_name(f".{out.name}.unfinished")
     if out.exists():
-        if _metadata(out).get("demos") != described:
-            raise ValueError(f"{out} already holds another dataset; give another --out or delete it")
+        jobs.check_same(_metadata(out)["demos"], described, out, "a dataset")
+        shutil.rmtree(unfinished, ignore_errors=True)  # a kill may have left it
         on_progress(config.episodes)
-    else:
-        jobs.claim(unfinished, described)
+        return out
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, not {workers}")
+    jobs.claim(unfinished, described)
+    try:
         chunks = [
             tuple(range(start, min(start + _CHUNK, config.episodes))) for start in range(0, config.episodes, _CHUNK)
         ]
@@ -282,7 +286,10 @@ def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callab
         ]
         done = jobs.run(work, unfinished, workers, lambda group, count: on_progress(count))
         _assemble(config, [entry for entries in done for entry in entries], unfinished, out)
-    shutil.rmtree(unfinished, ignore_errors=True)
+        jobs.release(unfinished)
+        shutil.rmtree(unfinished, ignore_errors=True)
+    finally:
+        jobs.unlock(unfinished)
     return out
 
 
@@ -312,14 +319,24 @@ def load_demos(path: Path, task: Task) -> Demos:
     """
     path = Path(path)
     metadata = _metadata(path)
-    if metadata["task"] != repr(task):
-        raise ValueError(f"{path} holds demonstrations of {metadata['task']}, not of {task!r}")
-    if metadata["observation_version"] != OBSERVATION_VERSION:
+    if metadata.get("task") != repr(task):
+        raise ValueError(f"{path} holds demonstrations of {metadata.get('task')}, not of {task!r}")
+    if metadata.get("observation_version") != OBSERVATION_VERSION:
         raise ValueError(
-            f"{path} holds observations of version {metadata['observation_version']}, this is {OBSERVATION_VERSION}; "
+            f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "
             'make it anew with "ballbot demos"'
         )
-    episodes = list(minari.MinariDataset(path / "data"))
+    try:
+        demos = _read(path / "data")
+        _check(demos, len(task.observation_scale))
+    except Exception as error:  # Minari and h5py have dozens of ways to refuse a damaged file
+        raise ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r})') from error
+    return demos
+
+
+def _read(data: Path) -> Demos:
+    """The episodes of Minari's folder."""
+    episodes = list(minari.MinariDataset(data))
 
     def joined(kind: type, part: Callable[[Any], np.ndarray]) -> np.ndarray:
         return np.concatenate([np.asarray(part(episode), kind) for episode in episodes])
@@ -333,6 +350,18 @@ def load_demos(path: Path, task: Task) -> Demos:
         truncations=joined(np.bool_, lambda e: e.truncations),
         executed=joined(np.float32, lambda e: e.actions),
     )
+
+
+def _check(demos: Demos, observations: int) -> None:
+    """Raises a ValueError that names the array whose shape or values make no sense."""
+    n = len(demos.actions)
+    wide, pair = (n, observations), (n, 2)
+    shapes = {"observations": wide, "actions": pair, "next_observations": wide, "executed": pair}
+    for name, array in vars(demos).items():
+        if array.shape != shapes.get(name, (n,)):
+            raise ValueError(f"{name} has the shape {array.shape}, and not {shapes.get(name, (n,))}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds NaN or infinity")
 
 
 def command_of(path: Path) -> str:
@@ -354,10 +383,10 @@ def command_of(path: Path) -> str:
 def _metadata(path: Path) -> dict[str, Any]:
     """Metadata of a dataset of `ballbot demos`; raises a ValueError for anything else."""
     try:
-        metadata = json.loads((path / "data" / "metadata.json").read_text())
-        if "demos" not in metadata:
+        metadata = files.read_json(path / "data" / "metadata.json")
+        if not isinstance(metadata, dict) or not isinstance(metadata.get("demos"), dict):
             raise ValueError("not made by ballbot demos")
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f'{path} is no dataset of "ballbot demos": {error}') from error
     return metadata
 
@@ -437,13 +466,13 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
 
 
 def _buffer(path: Path, seed: int) -> EpisodeBuffer:
-    with np.load(path, allow_pickle=False) as arrays:
-        return EpisodeBuffer(
-            seed=seed,
-            observations=arrays["observations"],
-            actions=arrays["actions"],
-            rewards=arrays["rewards"],
-            terminations=arrays["terminations"],
-            truncations=arrays["truncations"],
-            infos={"expert_action": arrays["labels"], "state": arrays["states"]},
-        )
+    arrays: dict[str, Any] = dict(files.read_npz(path))  # Minari's annotations say lists
+    return EpisodeBuffer(
+        seed=seed,
+        observations=arrays["observations"],
+        actions=arrays["actions"],
+        rewards=arrays["rewards"],
+        terminations=arrays["terminations"],
+        truncations=arrays["truncations"],
+        infos={"expert_action": arrays["labels"], "state": arrays["states"]},
+    )

@@ -12,10 +12,8 @@ A run is a folder:
 """
 
 import io
-import json
 import math
 import os
-import pickle
 import signal
 import time
 from collections.abc import Iterator, Mapping
@@ -33,11 +31,14 @@ from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import Task
+from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
 from ballbot_train.provenance import provenance
 
+_CONFIG = "config.json"
+_CHECKPOINT_LIMIT = 2**34  # bytes
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
 
 
@@ -135,7 +136,14 @@ def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, re
         if getattr(learner, name) < 1:
             raise ValueError(f"{name} must be at least 1, not {getattr(learner, name)}")
     run = _Run(learner, task, config, out, resume)
-    writer = SummaryWriter(str(out / "tensorboard"), purge_step=learner.iteration)
+    try:
+        return _learn(run, learner, config)
+    finally:
+        jobs.unlock(out)
+
+
+def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any]) -> evaluate.Row:
+    writer = SummaryWriter(str(run.out / "tensorboard"), purge_step=learner.iteration)
     every = max(1, learner.iterations // learner.evaluations)
     saved = time.monotonic()
     with _interruptible() as interrupted, progress_bar() as progress:
@@ -169,30 +177,29 @@ class _Run:
     def __init__(self, learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool):
         self.learner, self.task, self.config, self.out = learner, task, dict(config), out
         self.seconds, self.best, self.rows = 0.0, math.inf, []
-        written = out / "config.json"
-        if written.exists() and not resume:
+        if (out / _CONFIG).exists() and not resume:
             raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
-        if written.exists():
-            old = json.loads(written.read_text())
-            differing = [key for key in self.config if old.get(key) != json.loads(json.dumps(self.config[key]))]
-            if differing:
-                raise ValueError(f"{out} holds a run with another {', '.join(differing)}; give another --out")
-        files.write(written, json.dumps(self.config | {"about": provenance()}, indent=1) + "\n")
-        if (out / "checkpoint.pt").exists():
-            state = self._load_checkpoint()
-            self.seconds, self.best, self.rows = state["seconds"], state["best"], state["rows"]
-            save_policy(out / "policy", self._restored(state["policy"]), self._about())
-            self._write_rows()
+        jobs.claim(out, self.config, _CONFIG, {"about": provenance()})
+        try:
+            if (out / "checkpoint.pt").exists():
+                self._restore()
+        except BaseException:
+            jobs.unlock(out)
+            raise
 
-    def _load_checkpoint(self) -> dict[str, Any]:
-        """Reads the checkpoint and gives the learner its state; a damaged one is a ValueError."""
+    def _restore(self) -> None:
+        """Goes back to the checkpoint; a damaged one is a ValueError."""
         path = self.out / "checkpoint.pt"
         try:
-            state = torch.load(path, weights_only=True)  # tensors and plain values: nothing in it is executed
+            # tensors and plain values: nothing in it is executed
+            state = torch.load(io.BytesIO(files.read(path, _CHECKPOINT_LIMIT)), weights_only=True)
             self.learner.load_state_dict(state["learner"])
-        except (OSError, EOFError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error})") from error
-        return state
+            best = self._restored(state["policy"])
+            self.seconds, self.best, self.rows = float(state["seconds"]), float(state["best"]), list(state["rows"])
+        except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
+            raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error!r})") from error
+        save_policy(self.out / "policy", best, self._about())
+        self._write_rows()
 
     def score(self) -> Score:
         """Scores the present policy, and keeps it if it is the best."""

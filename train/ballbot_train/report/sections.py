@@ -1,12 +1,12 @@
 """What the leaderboard's page holds besides its table, each part where its data exist."""
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ballbot_gym import files
 from ballbot_train.console import console
 from ballbot_train.evaluation.results import Result
 from ballbot_train.report import figures, labels
@@ -31,6 +31,7 @@ def leaderboard_sections(
     pictures: Sequence[Path],
     physics: str,
     runs: Path,
+    note: str = "",
 ) -> list[Section | None]:
     """The page of `ballbot benchmark`.
 
@@ -42,6 +43,7 @@ def leaderboard_sections(
         pictures: of certified episodes.
         physics: "bullet" or "rk4".
         runs: folder in which other commands have left theirs: basins, robustness, paper, and any training.
+        note: about the leaderboard.
     """
     replays = [replay_of(task, names, results, physics) for task, names in controllers.items()]
     return [
@@ -49,7 +51,7 @@ def leaderboard_sections(
             "Leaderboard",
             header,
             table,
-            "Regret is cost / optimum − 1 over the episodes that did not fail. Press a column's head to sort by it.",
+            f"Regret is cost / optimum − 1 over the episodes that did not fail. Press a column's head to sort by it. {note}",
         ),
         replay_section(
             "Watch an episode",
@@ -100,11 +102,11 @@ def learning_section(runs: Path) -> Section | None:
         if not config.exists():
             continue
         try:
-            described = json.loads(config.read_text())
+            described = files.read_json(config)
             task, learner = str(described.get("task")), str(described.get("learner"))
-            rows = list(csv.DictReader(path.read_text().splitlines()))
+            rows = list(csv.DictReader(files.read(path).decode().splitlines()))
             points = [(float(row["seconds"]), 100 * float(row["regret_mean"])) for row in rows]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, csv.Error) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
             console.print(f"skipped: {config} or {path.name} beside it is damaged: {error!r}")
             continue
         lines = tasks.setdefault(task, [])

@@ -7,7 +7,8 @@ A new learner is one file and one line in `LEARNERS`. Its file holds
 - `make(task, params, settings, seed, demos)`, which returns the learner before its first iteration (see `training.Learner`).
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,6 +63,38 @@ class Algorithm:
         if demos is not None and not self.demonstrations:
             raise ValueError(f"{self.module.rpartition('.')[2]} uses no demonstrations")
         return load(f"{self.module}:make")(task, params, settings, seed, demos)
+
+
+_MAY_BE_ZERO = {
+    "candidate_episodes",
+    "clone_iterations",
+    "critic_gradient_steps",
+    "critic_warmup_iterations",
+    "gathering_iterations",
+    "rollouts_per_plan",
+    "tracked_rollouts_per_plan",
+    "tube_samples",
+}
+_MAY_BE_NEGATIVE = {"target_entropy"}
+_MOST = 10**9  # of whole numbers
+
+
+def check_settings(settings: Any) -> None:
+    """Raises a ValueError that names the first of a learner's settings that makes no sense.
+
+    Whole numbers are positive, except those that switch something off with 0. Other numbers are finite and at least 0.
+    """
+    for field in fields(settings):
+        name, value = field.name, getattr(settings, field.name)
+        for number in value if isinstance(value, tuple) else [value]:
+            if isinstance(number, bool) or not isinstance(number, int | float):
+                continue
+            if isinstance(number, int):
+                least = 0 if name in _MAY_BE_ZERO else 1
+                if not least <= number <= _MOST:
+                    raise ValueError(f"{name} must be {least} to {_MOST}, not {number}")
+            elif not math.isfinite(number) or (number < 0 and name not in _MAY_BE_NEGATIVE):
+                raise ValueError(f"{name} must be finite and at least 0, not {number}")
 
 
 _HERE = __name__

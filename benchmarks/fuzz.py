@@ -1,0 +1,261 @@
+"""Fuzzing: every reader is given mutations of valid files. A reader may only answer or raise the errors that it documents.
+
+    python benchmarks/fuzz.py --minutes 10 --seed 0
+
+Every reader runs in a process of its own whose memory is bounded, so that a file that makes it allocate too much is found.
+The file of a failure is kept. Exit status 1 says that there is one.
+"""
+
+import argparse
+import json
+import random
+import resource
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_MEMORY = 3 * 2**30  # bytes that a reader may take on top of what its imports map
+_PIECES = [
+    b"",
+    b"\x00",
+    b"\xff" * 8,
+    b"nan",
+    b"inf",
+    b"-1",
+    b"1e999",
+    b"null",
+    b"[" * 5000,
+    b"{}",
+    b"<a>",
+    b'"',
+    b"\n",
+    b",",
+]
+_NUMBERS = [b"0", b"-1", b"1", b"255", b"65536", b"2147483648", b"9223372036854775808", b"1" * 400, b"1e308", b"NaN"]
+
+
+def mutated(rng: random.Random, content: bytes) -> bytes:
+    """A file's content after one to eight random changes."""
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
+        at = rng.randrange(len(data) + 1)
+        kind = rng.randrange(7)
+        if kind == 0 and data:
+            data[min(at, len(data) - 1)] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            del data[at:]
+        elif kind == 2:
+            del data[at : at + rng.randrange(1, 64)]
+        elif kind == 3:
+            data[at:at] = rng.choice(_PIECES)
+        elif kind == 4:
+            data[at : at + 8] = rng.randbytes(8)
+        elif kind == 5:  # another number in the place of one
+            digits = [i for i in range(len(data)) if 48 <= data[i] < 58][:5000]
+            if digits:
+                i = rng.choice(digits)
+                data[i : i + 1] = rng.choice(_NUMBERS)
+        else:
+            start = rng.randrange(len(data) + 1)
+            data[at:at] = data[start : start + rng.randrange(1, 256)]
+    return bytes(data)
+
+
+def _trajectory(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_gym.trajectory import Trajectory, TrajectoryError
+
+    made = Trajectory(np.arange(5.0), np.ones((5, 8)), np.ones((4, 2)))
+    path = made.save(folder / "t.npz")
+    return [path], lambda: Trajectory.load(path), (TrajectoryError,)
+
+
+def _stored_trajectory(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    """Without compression, so that mutations reach the arrays' headers."""
+    from ballbot_gym.trajectory import Trajectory, TrajectoryError
+
+    path = folder / "t.npz"
+    np.savez(path, t=np.arange(5.0), x=np.ones((5, 8)), u=np.ones((4, 2)))
+    return [path], lambda: Trajectory.load(path), (TrajectoryError,)
+
+
+def _certified(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_gym import certified, files
+    from ballbot_gym.env import make_task
+
+    path = folder / "set.npz"
+    arrays: dict[str, Any] = files.read_npz(certified.path_of(make_task("turn")))
+    np.savez(path, **arrays)
+    return [path], lambda: certified.load("turn", path), (certified.CertificateError,)
+
+
+def _urdf(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_gym.params import URDF_PATH, BallbotParams
+
+    path = Path(shutil.copy(URDF_PATH, folder / "mine.urdf"))
+    return [path], lambda: BallbotParams.from_urdf(path), (ValueError,)
+
+
+def _policy(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_gym.env import make_task
+    from ballbot_train.policy import PolicyError, PolicyNetwork, PolicySpec, load_policy, save_policy
+
+    network = PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,)))
+    path = save_policy(folder / "mine", network, {"measured": {"regret_mean": 0.1}})
+    return [path, path.with_suffix(".safetensors")], lambda: load_policy(path, "turn"), (PolicyError,)
+
+
+def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_leaderboard
+
+    made = [Result("turn", "lqr", i, "rk4", 12.0, 10.0, True, False, 30.0, 2.0, 8.0, 0.1, 1e-5) for i in range(10)]
+    write_leaderboard(leaderboard(made), made, {"commit": "a"}, folder)
+
+    def read() -> None:
+        for path in (folder / "leaderboard.json", folder / "episodes.csv"):
+            leaderboard(read_results(path)[1] or made)
+
+    return [folder / "leaderboard.json", folder / "episodes.csv"], read, (ValueError,)
+
+
+def _basins(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_train.evaluation.basins import recovered_fractions
+
+    path = folder / "basins.json"
+    path.write_text(json.dumps({"rows": [{"task": "stabilize", "controller": "lqr", "recovered": 0.5}] * 3}))
+    return [path], lambda: recovered_fractions(folder), ()
+
+
+def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_train import jobs
+
+    jobs.claim(folder, {"episodes": 3, "policies": {"a": "b"}})
+    return [folder / jobs.MARKER], lambda: jobs.claim(folder, {"episodes": 3, "policies": {"a": "b"}}), (ValueError,)
+
+
+def _entries(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_train import jobs
+
+    path = folder / "job.jsonl"
+    path.write_text("".join(json.dumps({"item": i, "entry": {"cost": 1.5}}) + "\n" for i in range(9)))
+    return [path], lambda: jobs._read(path, 9), ()
+
+
+def _demos(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_gym.env import make_task
+    from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+
+    out = write_demos(DemoConfig("turn", "lqr", 2, "rk4"), folder / "tiny-v0", 1, lambda count: None)
+    paths = [out / "data" / "metadata.json", out / "data" / "main_data.hdf5"]
+    return paths, lambda: load_demos(out, make_task("turn")), (ValueError,)
+
+
+def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
+    from ballbot_gym.env import make_task
+    from ballbot_gym.params import default_params
+    from ballbot_train import jobs
+    from ballbot_train.learning import training
+    from ballbot_train.learning.learners import shac
+
+    task, config = make_task("turn"), {"learner": "shac", "task": "turn"}
+    settings = shac.ShacConfig(total_iterations=2, evaluations=1, num_envs=2, horizon=2, hidden=(4,), compile=False)
+    made = shac.Shac(task, default_params(), settings)
+    run = training._Run(made, task, config | {"settings": asdict(settings)}, folder / "run", False)
+    run.score()
+    run.save()
+
+    def resume() -> None:
+        jobs.unlock(folder / "run")
+        training._Run(
+            shac.Shac(task, default_params(), settings),
+            task,
+            config | {"settings": asdict(settings)},
+            folder / "run",
+            True,
+        )
+
+    return [folder / "run" / "checkpoint.pt", folder / "run" / "config.json"], resume, (ValueError,)
+
+
+READERS = {
+    "trajectory": _trajectory,
+    "trajectory, stored": _stored_trajectory,
+    "certified set": _certified,
+    "urdf": _urdf,
+    "policy": _policy,
+    "results": _results,
+    "basins": _basins,
+    "marker": _marker,
+    "job entries": _entries,
+    "demonstrations": _demos,
+    "checkpoint": _checkpoint,
+}
+
+
+def fuzz(name: str, minutes: float, seed: int, kept: Path) -> None:
+    """Gives a reader mutations until the time is over; ends the process with status 1 at the first failure."""
+    rng = random.Random(f"{seed} {name}")
+    with tempfile.TemporaryDirectory() as folder:
+        paths, read, allowed = READERS[name](Path(folder))
+        original = {path: path.read_bytes() for path in paths}
+        read()
+        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + _MEMORY, mapped + _MEMORY))
+        runs = refused = 0
+        longest, end = 0.0, time.monotonic() + 60 * minutes
+        while time.monotonic() < end:
+            path = rng.choice(paths)
+            path.write_bytes(mutated(rng, original[path]))
+            shutil.copy(path, kept)  # so that a file that kills the process is kept
+            start = time.monotonic()
+            try:
+                read()
+            except allowed:
+                refused += 1
+            except BaseException:
+                print(f"{name}: {path.name} is kept as {kept}\n{traceback.format_exc()}", flush=True)
+                sys.exit(1)
+            longest, runs = max(longest, time.monotonic() - start), runs + 1
+            for changed, content in original.items():
+                changed.write_bytes(content)
+        kept.unlink(missing_ok=True)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(
+            f"{name}: {runs} files, {refused} refused, longest {longest:.2f} s, peak memory {peak:.0f} MiB", flush=True
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Gives every reader mutations of valid files.")
+    parser.add_argument("--minutes", type=float, default=10.0, help="for each reader")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--readers", nargs="*", choices=list(READERS), default=list(READERS))
+    parser.add_argument("--out", type=Path, default=Path("runs/fuzz"), help="folder of the files of failures")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    failed = []
+    for name in options.readers:
+        kept = options.out / f"{name.replace(', ', '-').replace(' ', '-')}.bin"
+        process = get_context("spawn").Process(target=fuzz, args=(name, options.minutes, options.seed, kept))
+        process.start()
+        process.join(60 * options.minutes + 300)
+        if process.is_alive():
+            process.kill()
+            process.join()
+            print(f"{name}: hangs; its file is kept as {kept}", flush=True)
+        if process.exitcode != 0:
+            failed.append(f"{name} (exit status {process.exitcode})")
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}")
+
+
+if __name__ == "__main__":
+    main()

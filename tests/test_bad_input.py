@@ -1,0 +1,712 @@
+"""One table of wrong input: every call is refused with a message that names what is wrong, and what to give instead.
+
+Every case is a call, and what its message must contain. A call gets an empty folder. Cases of the command line are what is
+typed after `ballbot`.
+"""
+
+import csv
+import io
+import itertools
+import json
+import math
+import os
+import shlex
+import struct
+import zipfile
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from builders import result
+
+from ballbot_baselines.optimum import Backoff
+from ballbot_gym import BallbotEnv, certified, files
+from ballbot_gym.env import make_task
+from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
+from ballbot_gym.randomization import Disturbance, Randomization
+from ballbot_gym.tasks import TASKS as TASK_NAMES
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train import evaluate, jobs, load_policy
+from ballbot_train.cli import _run
+from ballbot_train.evaluation.benchmark import controllers_of
+from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
+from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+from ballbot_train.learning.learners import LEARNERS, check_settings
+from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy
+
+REFUSALS = (ValueError, TypeError, gymnasium.error.Error)
+"""What a wrong call may raise."""
+
+MESSAGES = 200  # characters of a value that a message may repeat, and more
+
+
+def env(**keywords):
+    return BallbotEnv(**({"physics": "rk4"} | keywords))
+
+
+def started(task="stabilize", seed=0, **keywords):
+    return env(task=task).reset(seed=seed, **keywords)
+
+
+def stepped(action):
+    made = env()
+    made.reset(seed=0)
+    return made.step(action)
+
+
+def constants(task, **named):
+    return lambda folder: started(task, options={"constants": named})
+
+
+def task(name, **fields):
+    return lambda folder: make_task(name, **fields)
+
+
+def params(**fields):
+    return lambda folder: replace(default_params(), **fields)
+
+
+def randomization(**fields):
+    return lambda folder: Randomization(**fields)
+
+
+ENVS = [
+    (lambda f: env(task="dance"), "unknown task 'dance'; known: 'stabilize'"),
+    (lambda f: env(task=None), "unknown task None; known"),
+    (lambda f: env(task=["stabilize"]), "unknown task ['stabilize']; known"),
+    (lambda f: env(physics="mujoco"), "unknown physics 'mujoco'; known: 'bullet', 'rk4'"),
+    (lambda f: env(physics=["rk4"]), "unknown physics ['rk4']; known"),
+    (lambda f: env(render_mode="ascii"), "unknown render_mode 'ascii'; known"),
+    (lambda f: env(frameskip=4), "has no argument frameskip; it has"),
+    (lambda f: env(params={"body_mass": 12.0}), "params must be a BallbotParams, for instance dataclasses.replace("),
+    (lambda f: env(params="ballbot.urdf"), "params must be a BallbotParams"),
+    (lambda f: env(randomization={"lean_noise": 0.1}), "randomization must be a Randomization, for instance"),
+    (lambda f: env(physics_dt=0.0), "physics_dt = 0.0 s must be a whole fraction of control_dt = 0.02 s"),
+    (lambda f: env(physics_dt=-0.001), "physics_dt = -0.001 s must be a whole fraction"),
+    (lambda f: env(physics_dt=0.003), "physics_dt = 0.003 s must be a whole fraction"),
+    (lambda f: env(physics_dt=math.nan), "physics_dt = nan s must be a whole fraction"),
+    (lambda f: env(physics_dt=math.inf), "physics_dt = inf s must be a whole fraction"),
+    (lambda f: env(physics_dt=1e-30), "at least 1/10000 of it"),
+    (lambda f: env(physics_dt="0.001"), "physics_dt must be a number of seconds, not '0.001'"),
+    (lambda f: env(physics="bullet", physics_dt=1e-300), "at least 1/10000 of it"),
+    (lambda f: env(task=make_task("turn"), duration=4.0), "fields ['duration'] cannot be given together with a Task"),
+    (lambda f: started(seed=-1), "-1"),
+    (lambda f: started(seed="7"), "Seed must be a python integer"),
+    (lambda f: started(options=[1]), "options must be a dict with 'state' and 'constants', not [1]"),
+    (lambda f: started(options={"sate": np.zeros(8)}), "unknown reset options ['sate']; known: 'state', 'constants'"),
+    (lambda f: started(options={"state": np.zeros(7)}), "state must be 8 finite numbers"),
+    (lambda f: started(options={"state": "upright"}), "state must be 8 finite numbers, not 'upright'"),
+    (lambda f: started(options={"state": [math.nan] * 8}), "state must be 8 finite numbers"),
+    (lambda f: started(options={"state": [1e200] + [0.0] * 7}), "state must be numbers within ±1e+06"),
+    (lambda f: started(options={"state": [0, 0, 2.0, 0, 0, 0, 0, 0]}), "it violates the limit of tilt"),
+    (lambda f: started(options={"constants": [1.0]}), "constants must be 0 finite numbers"),
+    (lambda f: started("turn", options={"constants": [[3.0]]}), "constants must be 1 finite numbers"),
+    (constants("turn", sped=3.0), "has no constants ['sped']; it has ['speed']"),
+    (constants("turn", speed=30.0), "speed must be in (0, 12] m/s, not 30"),
+    (constants("turn", speed=math.nan), "constants must be 1 finite numbers"),
+    (constants("turn", speed="fast"), "constants must be 1 finite numbers"),
+    (constants("turn", speed=None), "constants must be 1 finite numbers"),
+    (constants("orbit", radius=0.1), "radius must exceed"),
+    (constants("orbit", speed=0.0), "speed must not be 0"),
+    (constants("orbit", radius=1e200), "constants must be numbers within ±1e+06"),
+    (constants("weave", obstacle0_radius=-1.0), "obstacle0_radius must be positive"),
+    (constants("weave", goal_x=1e300), "constants must be numbers within ±1e+06"),
+    (lambda f: env().step([0.0, 0.0]), "step() before reset()"),
+    (lambda f: stepped([0.0]), "action must have shape (2,), not (1,)"),
+    (lambda f: stepped([math.nan, 0.0]), "action must be finite"),
+    (lambda f: stepped(None), "action must have shape (2,), not ()"),
+]
+
+TASKS = [
+    (task("stabilize", duration="8"), "Stabilize: duration must be a number, not '8'"),
+    (task("stabilize", duration=None), "Stabilize: duration must be a number, not None"),
+    (task("stabilize", duration=True), "Stabilize: duration must be a number, not True"),
+    (task("stabilize", duration=[8.0]), "Stabilize: duration must be a number, not [8.0]"),
+    (task("stabilize", duration=np.float32(math.nan)), "duration must be positive and finite, not nan"),
+    (task("stabilize", duration=1e9), "must be 1 to 1,000,000 control steps"),
+    (task("stabilize", duration=1e300), "must be 1 to 1,000,000 control steps"),
+    (task("stabilize", duration=1e-9), "must be 1 to 1,000,000 control steps"),
+    (task("stabilize", duration=1.01), "is not a whole number of control steps"),
+    (task("stabilize", control_dt=1e-12), "must be 1 to 1,000,000 control steps"),
+    (task("stabilize", control_dt=1e-320), "must be 1 to 1,000,000 control steps"),
+    (task("stabilize", control_dt=0), "control_dt must be positive and finite, not 0"),
+    (task("stabilize", max_tilt=math.pi / 2), "max_tilt must be below 90°"),
+    (task("stabilize", max_tilt=-0.1), "max_tilt must be positive and finite"),
+    (task("stabilize", rest_weight=math.inf), "rest_weight must be positive and finite, not inf"),
+    (task("stabilize", effort_weight=-1.0), "effort_weight must be positive and finite"),
+    (task("stabilize", effort_weight=10**400), "effort_weight must be positive and finite"),
+    (task("turn", max_speed=200.0), "max_speed 200 must be in order, and at most 12 m/s"),
+    (task("turn", min_speed=9.0, max_speed=3.0), "min_speed 9 and max_speed 3 must be in order"),
+    (task("orbit", min_radius=5.0), "min_radius 5 exceeds max_radius 3 m"),
+    (task("orbit", min_steady_tilt=1.0), "min_steady_tilt 1 and max_steady_tilt"),
+    (task("orbit", max_steady_tilt=1.6), "must be in order, and below 90°"),
+]
+
+ROBOTS = [
+    (params(body_mass=math.nan), "body_mass must be positive and finite, not nan"),
+    (params(ball_mass=-1.0), "ball_mass must be positive and finite, not -1.0"),
+    (params(gravity=math.nan), "gravity must be positive and finite, not nan"),
+    (params(gravity=0), "gravity must be positive and finite, not 0"),
+    (params(force_limit=math.inf), "force_limit must be positive and finite, not inf"),
+    (params(inertia="1"), "inertia must be a number, not '1'"),
+    (params(com_height=None), "com_height must be a number, not None"),
+    (params(body_mass=[1.0]), "body_mass must be a number, not [1.0]"),
+    (params(body_mass=True), "body_mass must be a number, not True"),
+    (lambda f: BallbotParams.from_urdf(gravity=-9.81), "gravity must be positive and finite"),
+    (lambda f: BallbotParams.from_urdf(f / "none.urdf"), "none.urdf: no such file"),
+    (lambda f: BallbotParams.from_urdf(f), "is no regular file; give the path of a URDF"),
+    (lambda f: BallbotParams.from_urdf("/dev/zero"), "/dev/zero is no regular file"),
+    (lambda f: BallbotParams.from_urdf("a\0b"), "give the path of a URDF"),
+    (lambda f: replace(default_params(), axial_inertia=0.0), "axial_inertia must be positive"),
+]
+
+
+def urdf(old, new, count=1):
+    """The paper's URDF with something replaced."""
+
+    def read(folder):
+        text = URDF_PATH.read_text()
+        assert old in text
+        path = folder / "mine.urdf"
+        path.write_text(text.replace(old, new, count))
+        return BallbotParams.from_urdf(path)
+
+    return read
+
+
+def written(content, reader, name="file"):
+    """A reader of a file with some content."""
+
+    def read(folder):
+        path = folder / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return reader(path)
+
+    return read
+
+
+def body(old, new):
+    """The URDF with a number of the body's inertial replaced."""
+
+    def read(folder):
+        text = URDF_PATH.read_text()
+        head, tail = text.split('<link name="body">')
+        assert old in tail
+        path = folder / "mine.urdf"
+        path.write_text(head + '<link name="body">' + tail.replace(old, new, 1))
+        return BallbotParams.from_urdf(path)
+
+    return read
+
+
+URDFS = [
+    (written("", BallbotParams.from_urdf), "not well-formed XML"),
+    (written("<robot", BallbotParams.from_urdf), "not well-formed XML"),
+    (written(b"\xff\xfe\x00", BallbotParams.from_urdf), "not well-formed XML"),
+    (written('<?xml version="1.0" encoding="klingon"?><robot/>', BallbotParams.from_urdf), "not well-formed XML"),
+    (written('<?xml version="1.0" encoding="utf-7"?><robot/>', BallbotParams.from_urdf), "file: "),
+    (written('<?xml version="1.0" encoding="shift_jis"?><robot/>', BallbotParams.from_urdf), "file: "),
+    (written("<robot>" + "<link>" * 100_000 + "</link>" * 100_000 + "</robot>", BallbotParams.from_urdf), "missing"),
+    (written("<robot/>", BallbotParams.from_urdf), "joint 'x' is missing"),
+    (urdf('<link name="body">', '<link name="ball">'), "link 'ball' is there 2 times"),
+    (body("mass value=", 'mass value="nan" was='), "mass of link 'body': value = 'nan' is not a number"),
+    (body("mass value=", 'mass value="inf" was='), "value = 'inf' is not a number"),
+    (body("mass value=", 'mass value="-1" was='), "link 'body' has negative mass"),
+    (body("mass value=", 'mass value="ten" was='), "value = 'ten' is not a number"),
+    (body("mass value=", 'mass value="0" was='), "link 'body' has mass 0"),
+    (body("ixx=", 'ixx="1e999" was='), "ixx = '1e999' is not a number"),
+    (body("xyz=", 'xyz="0 0 nan" was='), "xyz = '0 0 nan' is not three numbers"),
+    (body("xyz=", 'xyz="0 0 inf" was='), "xyz = '0 0 inf' is not three numbers"),
+    (urdf("effort=", 'effort="nan" was='), "effort = 'nan' is not a number"),
+    (urdf("radius=", 'radius="-1" was='), "must have a positive radius"),
+]
+
+RANDOMIZATIONS = [
+    (randomization(body_mass=(1.2, 0.8)), "body_mass must be a finite range (low, high)"),
+    (randomization(body_mass=(math.nan, 1.0)), "body_mass must be a finite range"),
+    (randomization(body_mass=(1.0, math.inf)), "body_mass must be a finite range"),
+    (randomization(body_mass=(0.0, 1.0)), "body_mass must be positive factors"),
+    (randomization(body_mass=(1.0, 1e300)), "body_mass must be at most 1000"),
+    (randomization(body_mass=1.0), "body_mass must be a finite range (low, high), not 1.0"),
+    (randomization(body_mass="12"), "body_mass must be a finite range (low, high), not '12'"),
+    (randomization(body_mass=None), "body_mass must be a finite range (low, high), not None"),
+    (randomization(body_mass=(True, True)), "body_mass must be a finite range"),
+    (randomization(lean_noise=-0.1), "lean_noise must be finite and at least 0"),
+    (randomization(lean_noise=math.nan), "lean_noise must be finite and at least 0"),
+    (randomization(lean_noise="0.1"), "lean_noise must be a number, not '0.1'"),
+    (randomization(lean_noise=True), "lean_noise must be a number, not True"),
+    (randomization(lean_noise=1e300), "lean_noise must be finite and at least 0, and at most 1e+06"),
+    (randomization(lean_noise=(0.0, 0.1)), "lean_noise must be a number, not (0.0, 0.1)"),
+    (randomization(push_interval=0.0), "push_interval must be positive"),
+    (randomization(actuator_lag=(-0.1, 0.1)), "actuator_lag must be at least 0"),
+    (lambda f: env(randomization=Randomization(actuator_delay=(0.0, 0.03))), "must be whole control steps of 0.02 s"),
+    (lambda f: env(randomization=Randomization(actuator_delay=(0.0, 1e5))), "must be at most 1000 control steps"),
+    (
+        lambda f: Disturbance(Randomization(actuator_delay=(0, 1e6)), default_params(), 1e-9),
+        "at most 1000 control steps",
+    ),
+]
+
+
+def npz(**arrays):
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def npy(header, data=b""):
+    """An .npy file with any header."""
+    text = header.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
+
+
+def archive(members, method=zipfile.ZIP_DEFLATED):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+    return buffer.getvalue()
+
+
+def bomb():
+    """2.5 GB of zeros in 2.5 MB, and its neighbour: a small file that only says so."""
+    content = archive({"t.npy": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4,), }", bytes(10))})
+    sized = bytearray(content)
+    at = sized.rindex(b"PK\x01\x02")
+    sized[at + 24 : at + 28] = struct.pack("<I", 2_500_000_000)
+    return bytes(sized)
+
+
+def encrypted():
+    content = bytearray(npz(t=np.arange(3.0)))
+    for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        content[content.rindex(mark) + offset] |= 1
+    return bytes(content)
+
+
+def odd_method(method):
+    content = bytearray(npz(t=np.arange(3.0)))
+    for mark, offset in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
+        content[content.rindex(mark) + offset] = method
+    return bytes(content)
+
+
+HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 1000000), }"
+DEEP = "(" * 200 + ")" * 200
+STILL = {"t": np.arange(3.0), "x": np.zeros((3, 8)), "u": np.zeros((2, 2))}
+
+
+def trajectory(**changes):
+    return written(npz(**(STILL | changes)), Trajectory.load)
+
+
+TRAJECTORIES = [
+    (lambda f: Trajectory.load(f / "none.npz"), "none.npz: no such file"),
+    (lambda f: Trajectory.load(f), "is no regular file"),
+    (lambda f: Trajectory.load("/dev/zero"), "is no regular file"),
+    (written(b"", Trajectory.load), "is no .npz file, or a damaged one"),
+    (written(b"garbage" * 99, Trajectory.load), "is no .npz file, or a damaged one"),
+    (written(npz(**STILL)[:-30], Trajectory.load), "is no .npz file, or a damaged one"),
+    (written(npz(t=np.arange(3.0)), Trajectory.load), "it has no array x, u"),
+    (written(archive({"t.npy": b"short"}), Trajectory.load), "is no .npz file, or a damaged one"),
+    (written(archive({"t.npy": npy(HUGE)}), Trajectory.load), "does not fit 0 bytes"),
+    (written(archive({"t.npy": npy(DEEP)}), Trajectory.load), "a damaged one"),
+    (written(archive({"t.npy": npy("{")}), Trajectory.load), "a damaged one"),
+    (written(archive({"t.npy": npy(HUGE.replace("<f8", "|O"))}), Trajectory.load), "is no array of numbers"),
+    (written(archive({"t.npy": npy(HUGE.replace("1000000000", "-1"))}), Trajectory.load), "does not fit"),
+    (written(archive({"t.npy": npz(**STILL)[:100], "t": b""}), Trajectory.load), "two arrays of one name"),
+    (written(bomb(), Trajectory.load), "unpacks to 2384 MiB; at most 256 MiB are read"),
+    (written(encrypted(), Trajectory.load), "t.npy is encrypted; write it without a password"),
+    (written(odd_method(12), Trajectory.load), "t.npy is compressed by method 12; use numpy.savez"),
+    (written(odd_method(99), Trajectory.load), "compressed by method 99"),
+    (trajectory(t=np.array([0.0, math.nan, 2.0])), "it holds NaN or infinity"),
+    (trajectory(t=np.array([0.0, 2.0, 1.0])), "times must increase"),
+    (trajectory(x=np.zeros((3, 7))), "must be (N+1,) and (N+1, 8)"),
+    (trajectory(u=np.zeros((5, 2))), "must be (2, 2), held, or (3, 2), linear"),
+    (trajectory(t=np.array(["a", "b", "c"])), "t must be an array of numbers"),
+    (lambda f: Trajectory([0, 1], "rest", np.zeros((1, 2))), "x must be an array of numbers"),
+    (lambda f: Trajectory([0, 1e9], np.zeros((2, 8)), np.zeros((1, 2))).resampled(0.02), "more than 1,000,000 times"),
+    (lambda f: Trajectory([0, 1], np.zeros((2, 8)), np.zeros((1, 2))).resampled(0), "more than 1,000,000 times"),
+    (lambda f: files.read(URDF_PATH, 10), "is larger than 0 MiB, the most that is read"),
+]
+
+
+def evaluation_set(**changes):
+    """Reads Turn's set with some arrays replaced."""
+
+    def read(folder):
+        arrays = files.read_npz(certified.path_of(make_task("turn"))) | changes
+        path = files.write_npz(folder / "set.npz", {name: part for name, part in arrays.items() if part is not None})
+        return certified.load("turn", path)
+
+    return read
+
+
+SETS = [
+    (lambda f: certified.load("dance"), "unknown task 'dance'; known"),
+    (lambda f: certified.load(None), "unknown task None"),
+    (lambda f: certified.load("turn", f / "none.npz"), 'compute it with "ballbot certify"'),
+    (lambda f: certified.load(make_task("turn", duration=4.0)), "was computed for Turn("),
+    (lambda f: certified.load("stabilize", certified.path_of(make_task("turn"))), "was computed for Turn("),
+    (lambda f: certified.load("turn", f), "is no evaluation set"),
+    (written(b"garbage", lambda path: certified.load("turn", path)), "is no evaluation set"),
+    (written(bomb(), lambda path: certified.load("turn", path)), "unpacks to 2384 MiB"),
+    (evaluation_set(costs=None), "it has no array costs"),
+    (evaluation_set(states=np.zeros((200, 7))), "states has the shape (200, 7)"),
+    (evaluation_set(costs=np.full(200, math.nan)), "costs must be finite numbers"),
+    (evaluation_set(costs=np.zeros(200)), "costs must be positive"),
+    (evaluation_set(costs=np.array(["a"] * 200)), "costs must be finite numbers"),
+    (evaluation_set(lengths=np.array([10**9])), "lengths must be 0 to 400 control steps"),
+    (evaluation_set(lengths=np.array([-1])), "lengths must be 0 to 400 control steps"),
+    (evaluation_set(lengths=np.array([1.5])), "lengths must be whole numbers"),
+    (evaluation_set(u=np.zeros((3, 2))), "u has the shape (3, 2)"),
+]
+
+
+def policy(weights=None, raw=None, text=None, **changes):
+    """Loads a small policy for Stabilize whose files were changed."""
+
+    def read(folder):
+        torch.manual_seed(0)
+        network = PolicyNetwork(PolicySpec.of(make_task("stabilize"), hidden=(4,)))
+        path = save_policy(folder / "mine", network, {})
+        content = json.loads(path.read_text())
+        content["spec"] |= changes
+        content["spec"] = {key: value for key, value in content["spec"].items() if value is not MISSING}
+        path.write_text(json.dumps(content) if text is None else text)
+        if weights is not None:
+            values = network.state_dict()
+            (folder / "mine.safetensors").write_bytes(safetensors.torch.save(values | weights(values)))
+        if raw is not None:
+            (folder / "mine.safetensors").write_bytes(raw)
+        return load_policy(path, "stabilize")
+
+    return read
+
+
+MISSING = object()
+
+
+def header(document, data=b""):
+    """A safetensors file with any header."""
+    text = document if isinstance(document, bytes) else json.dumps(document).encode()
+    return struct.pack("<Q", len(text)) + text + data
+
+
+POLICIES = [
+    (lambda f: load_policy(f / "none.json"), "none.json is not a policy"),
+    (lambda f: load_policy(f / "none"), "none.json is not a policy"),
+    (policy(text="{"), "holds no JSON"),
+    (policy(text="[" * 100_000), "it is nested too deeply"),
+    (policy(text='{"a":' * 100_000), "it is nested too deeply"),
+    (policy(text="[]"), "is not a policy"),
+    (policy(text="\x00\xff"), "holds no JSON"),
+    (policy(text="{}"), "it has no 'spec'"),
+    (policy(task=MISSING), "it has no 'task'"),
+    (policy(task=3), "its spec names no task"),
+    (policy(hidden=MISSING), "has no 'hidden'"),
+    (policy(observations=MISSING), "is not a policy"),
+    (policy(squash="sigmoid"), "squash must be one of tanh, clip, not 'sigmoid'"),
+    (policy(activation="exec"), "activation must be one of tanh, relu, silu, not 'exec'"),
+    (policy(activation=["tanh"]), "activation must be one of tanh, relu, silu"),
+    (policy(linear="false"), "linear must be true or false, not 'false'"),
+    (policy(odd=1), "odd must be true or false, not 1"),
+    (policy(odd=True, activation="relu"), "odd needs the activation tanh"),
+    (policy(hidden="128"), "hidden must be a list of whole numbers, not '128'"),
+    (policy(hidden=[1.5]), "hidden must be whole numbers"),
+    (policy(hidden=[-1]), "hidden must be whole numbers"),
+    (policy(hidden=[10**12]), "hidden must be whole numbers from 0 to 1000000"),
+    (policy(hidden=[10**6] * 9), "the weights do not fit their description"),
+    (policy(hidden=[4] * 10_000), "at most 64 layers"),
+    (policy(observations="8"), "observations must be whole numbers"),
+    (policy(observations=9), "takes 9 observations"),
+    (policy(observation_version=0), "reads observation version 0"),
+    (policy(surprise=1), "surprise"),
+    (policy(raw=b""), "mine.safetensors is not a policy"),
+    (policy(raw=b"\x80\x04pickled"), "mine.safetensors is not a policy"),
+    (policy(raw=struct.pack("<Q", 2**63)), "mine.safetensors is not a policy"),
+    (policy(raw=header(b"[" * 100_000)), "mine.safetensors is not a policy"),
+    (policy(raw=header({"w": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 4]}}, bytes(4))), "not a policy"),
+    (policy(raw=header({"w": {"dtype": "F32", "shape": [1], "data_offsets": [0, 2**42]}}, bytes(4))), "not a policy"),
+    (policy(weights=lambda w: {"mlp.0.weight": w["mlp.0.weight"] * math.nan}), "mlp.0.weight holds NaN or infinity"),
+    (policy(weights=lambda w: {"mlp.0.bias": w["mlp.0.bias"] + math.inf}), "mlp.0.bias holds NaN or infinity"),
+    (policy(weights=lambda w: {"mlp.0.bias": torch.zeros(4, dtype=torch.int32)}), "mlp.0.bias holds torch.int32"),
+    (policy(weights=lambda w: {"more": torch.zeros(1)}), "more has the shape (1,), and should have None"),
+    (lambda f: save_policy(f / "mine", PolicyNetwork(PolicySpec("t", 8, hidden=(-4,))), {}), "hidden must be whole"),
+]
+
+
+def results(edit=lambda text: text, name="episodes.csv"):
+    """Reads a benchmark's file after an edit of its text."""
+
+    def read(folder):
+        made = [result(episode=i) for i in range(10)]
+        write_leaderboard(leaderboard(made), made, {"commit": "a"}, folder)
+        (folder / name).write_text(edit((folder / name).read_text()))
+        return read_results(folder / name)
+
+    return read
+
+
+def entry(**changes):
+    """Reads a leaderboard.json whose first episode has other values."""
+
+    def edit(text):
+        document = json.loads(text)
+        document["episodes"][0] |= changes
+        return json.dumps(document)
+
+    return results(edit, "leaderboard.json")
+
+
+RESULTS = [
+    (lambda f: read_results(f), "leaderboard.json: no such file"),
+    (lambda f: read_results(f / "none.csv"), "holds no episodes of a benchmark"),
+    (results(lambda text: text[:-5]), "its last line is cut off"),
+    (results(lambda text: ""), "its last line is cut off"),
+    (results(lambda text: text.replace("12.0", "12.x", 1)), "holds no episodes of a benchmark"),
+    (results(lambda text: text.replace("True", "yes", 1)), "holds no episodes of a benchmark"),
+    (results(lambda text: text.replace("optimum", "best")), "holds no episodes of a benchmark"),
+    (results(lambda text: text.replace("12.0", "nan", 1)), "has the cost nan"),
+    (results(lambda text: "a" * (csv.field_size_limit() + 1) + "\n1\n"), "holds no episodes of a benchmark"),
+    (results(lambda text: text[:-9], "leaderboard.json"), "holds no JSON"),
+    (results(lambda text: "[" * 100_000, "leaderboard.json"), "nested too deeply"),
+    (results(lambda text: "[]", "leaderboard.json"), "holds no episodes of a benchmark"),
+    (results(lambda text: '{"about": {}}', "leaderboard.json"), "holds no episodes of a benchmark"),
+    (entry(optimum=0), "the optimum 0"),
+    (entry(optimum=None), "the optimum nan"),
+    (entry(cost="12"), "cost of an episode is '12'"),
+    (entry(episode=True), "episode of an episode is True"),
+    (entry(surprise=1), "surprise"),
+]
+
+
+def dataset(metadata=None):
+    """Reads a folder with some metadata as a dataset for Stabilize."""
+
+    def read(folder):
+        if metadata is not None:
+            (folder / "data").mkdir()
+            (folder / "data" / "metadata.json").write_text(metadata)
+            (folder / "data" / "main_data.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n" + b"garbage" * 99)
+        return load_demos(folder, make_task("stabilize"))
+
+    return read
+
+
+DESCRIBED = {"demos": {}, "task": repr(make_task("stabilize")), "observation_version": 1}
+
+DEMOS = [
+    (dataset(), 'is no dataset of "ballbot demos"'),
+    (dataset("{"), 'is no dataset of "ballbot demos"'),
+    (dataset("[" * 100_000), "nested too deeply"),
+    (dataset("[]"), "not made by ballbot demos"),
+    (dataset('{"demos": 3}'), "not made by ballbot demos"),
+    (dataset('{"demos": {}}'), "holds demonstrations of None"),
+    (dataset(json.dumps(DESCRIBED | {"observation_version": 0})), "holds observations of version 0"),
+    (dataset(json.dumps(DESCRIBED)), 'is damaged; make it anew with "ballbot demos"'),
+    (lambda f: DemoConfig(episodes=0), "episodes must be 1 to 1000000, not 0"),
+    (lambda f: DemoConfig(seed=-1), "seed must be 0 to"),
+    (lambda f: DemoConfig(noise=math.nan), "noise must be finite and at least 0"),
+    (lambda f: DemoConfig(task="dance"), "unknown task 'dance'"),
+    (lambda f: DemoConfig(expert="me"), "unknown expert me; known: lqr"),
+    (lambda f: write_demos(DemoConfig(), f / "name", 1, lambda n: None), "is named NAME-vNUMBER"),
+    (lambda f: write_demos(DemoConfig(), f / "mine-v0", 0, lambda n: None), "workers must be at least 1"),
+    (lambda f: Backoff(margin=-0.1), "Backoff: margin must be at least 0"),
+    (lambda f: Backoff(goal=1.0), "Backoff: goal must be at least 0 and below 1"),
+    (lambda f: Backoff(force=math.nan), "Backoff: force must be at least 0 and below 1"),
+    (lambda f: Backoff(force="0.1"), "Backoff: force must be a number"),
+]
+
+
+def settings(learner, **changes):
+    return lambda folder: check_settings(replace(LEARNERS[learner].settings("stabilize"), **changes))
+
+
+LEARNING = [
+    (settings("shac", total_iterations=-5), "total_iterations must be 1 to 1000000000, not -5"),
+    (settings("shac", evaluations=0), "evaluations must be 1 to"),
+    (settings("shac", num_envs=0), "num_envs must be 1 to"),
+    (settings("shac", num_envs=10**12), "num_envs must be 1 to 1000000000"),
+    (settings("shac", learning_rate=math.nan), "learning_rate must be finite and at least 0, not nan"),
+    (settings("shac", learning_rate=-1e-3), "learning_rate must be finite and at least 0"),
+    (settings("bc", hidden=(0,)), "hidden must be 1 to"),
+    (settings("bc", batch_size=0), "batch_size must be 1 to"),
+    (settings("ppo", gamma=math.inf), "gamma must be finite"),
+    (settings("sac", rl_iterations=0), "rl_iterations must be 1 to"),
+    (settings("dagger", gathering_iterations=-1), "gathering_iterations must be 0 to"),
+]
+
+
+def nothing(observation):
+    return np.zeros(2)
+
+
+EVALUATION = [
+    (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, or a list of indices, not 0"),
+    (lambda f: evaluate(nothing, episodes=201), "episodes must be 1 to 200"),
+    (lambda f: evaluate(nothing, episodes=-1), "episodes must be 1 to 200"),
+    (lambda f: evaluate(nothing, episodes=[]), "episodes is empty; give at least one index"),
+    (lambda f: evaluate(nothing, episodes=[0, 0]), "names an episode twice; give each once"),
+    (lambda f: evaluate(nothing, episodes=[200]), "indices of episodes must be 0 to 199, not 200"),
+    (lambda f: evaluate(nothing, episodes=[0.5]), "indices of episodes must be whole numbers, not 0.5"),
+    (lambda f: evaluate(nothing, episodes="5"), "episodes must be a number of episodes or a list of indices, not '5'"),
+    (
+        lambda f: evaluate(nothing, episodes=True),
+        "episodes must be a number of episodes or a list of indices, not True",
+    ),
+    (
+        lambda f: evaluate(nothing, episodes=None),
+        "episodes must be a number of episodes or a list of indices, not None",
+    ),
+    (lambda f: evaluate(nothing, episodes=2.5), "episodes must be a number of episodes or a list of indices, not 2.5"),
+    (lambda f: evaluate(nothing, episodes=itertools.count()), "names more than the 200 episodes"),
+    (lambda f: evaluate(nothing, "dance"), "unknown task 'dance'"),
+    (lambda f: evaluate(nothing, make_task("turn", duration=4.0)), "was computed for Turn("),
+    (lambda f: evaluate(nothing, physics="real"), "unknown physics 'real'"),
+    (lambda f: evaluate(nothing, randomization=3), "randomization must be a Randomization"),
+    (lambda f: evaluate(None), "None is no policy: give a Controller"),
+    (lambda f: evaluate("pid"), "unknown controller 'pid'"),
+    (lambda f: evaluate("mine.zip"), 'PPO.load("mine.zip")'),
+    (lambda f: evaluate(f / "mine.zip"), "is a saved Stable-Baselines3 model"),
+    (lambda f: evaluate("mine.json"), "mine.json is not a policy"),
+    (lambda f: evaluate(lambda o: np.zeros(3), episodes=1, physics="rk4"), "action must have shape (2,)"),
+    (lambda f: evaluate(lambda o: None, episodes=1, physics="rk4"), "action must"),
+    (lambda f: evaluate(lambda o: [math.nan, 0], episodes=1, physics="rk4"), "action must be finite"),
+    (lambda f: controllers_of([]), "give at least one task"),
+    (lambda f: controllers_of(["turn", "turn"]), "task turn is given more than once"),
+    (lambda f: controllers_of(["turn"], ["lqr", "lqr"]), "controller lqr is given more than once"),
+    (lambda f: controllers_of(["turn"], ["[red]x"]), "unknown controller [red]x"),
+    (lambda f: jobs.run([], f, 0, print), "workers must be at least 1"),
+    (written("{", lambda path: jobs.claim(path.parent, {}), jobs.MARKER), "is damaged"),
+    (written("[" * 100_000, lambda path: jobs.claim(path.parent, {}), jobs.MARKER), "is damaged"),
+]
+
+GROUPS = {
+    "env": ENVS,
+    "task": TASKS,
+    "robot": ROBOTS,
+    "urdf": URDFS,
+    "randomization": RANDOMIZATIONS,
+    "trajectory": TRAJECTORIES,
+    "set": SETS,
+    "policy": POLICIES,
+    "results": RESULTS,
+    "demos": DEMOS,
+    "learning": LEARNING,
+    "evaluation": EVALUATION,
+}
+
+CASES = [
+    pytest.param(call, message, id=f"{group}-{i}")
+    for group, cases in GROUPS.items()
+    for i, (call, message) in enumerate(cases)
+]
+
+
+@pytest.mark.parametrize(("call", "message"), CASES)
+def test_wrong_input_is_refused_with_a_message_that_names_it(call, message, tmp_path):
+    with pytest.raises(REFUSALS) as refused:
+        call(tmp_path)
+    assert message in str(refused.value)
+    assert len(str(refused.value)) < 1500
+
+
+TYPED = [
+    ("benchmark --tasks dance", "unknown task dance; known: stabilize"),
+    ("benchmark --tasks turn turn", "task turn is given more than once"),
+    ("benchmark --controllers pid", "unknown controller pid; known: lqr"),
+    ("benchmark --controllers lqr lqr", "controller lqr is given more than once"),
+    ("benchmark --controllers mine.zip", "is a saved Stable-Baselines3 model"),
+    ("benchmark --episodes 0", "episodes must be 1 to 200, not 0"),
+    ("benchmark --episodes 1e9", "invalid"),
+    ("benchmark --seed -1", "seed must be at least 0, not -1"),
+    ("benchmark --workers 0", "workers must be at least 1, not 0"),
+    ("benchmark --physics mujoco", "invalid choice"),
+    ("robustness --stresses wind", "unknown stress wind; known: push"),
+    ("robustness --episodes 500", "episodes must be 1 to 200"),
+    ("basins --points 4", "points must be odd, and 3 to 501, not 4"),
+    ("basins --points 100001", "points must be odd"),
+    ("certify --tasks dance", "unknown task dance"),
+    ("certify --episodes 0", "episodes must be at least 1"),
+    ("certify --episodes 3 --install", "the package needs sets of 200 episodes"),
+    ("paper --only fig9", "unknown problem fig9"),
+    ("optimize dance", "unknown task dance"),
+    ("optimize stabilize --duration 1e9", "must be 1 to 1,000,000 control steps"),
+    ("optimize stabilize --duration 1000", "is too long to optimize; give at most 100 s"),
+    ("optimize stabilize --duration nan", "duration must be positive and finite, not nan"),
+    ("optimize stabilize --max-tilt 95", "max_tilt must be below 90°"),
+    ("optimize stabilize --force-limit nan", "force_limit must be positive and finite, not nan"),
+    ("optimize stabilize --force-limit -3", "force_limit must be positive and finite"),
+    ("optimize stabilize --seed -1", "seed must be at least 0"),
+    ("optimize stabilize --state 0 0 nan 0 0 0 0 0", "state must be 8 finite numbers"),
+    ("optimize stabilize --state 0 0", "state"),
+    ("optimize turn --constants sped 3", "has no constants ['sped']; it has ['speed']"),
+    ("optimize turn --constants speed 30", "speed must be in (0, 12] m/s"),
+    ("compare a b", "no such file"),
+    ("compare a b --margin nan", "no such file"),
+    ("replay dance", "unknown task dance"),
+    ("replay stabilize --episode 500", "episode must be 0 to 199, not 500"),
+    ("replay stabilize --episode -1", "episode must be 0 to 199, not -1"),
+    ("replay stabilize --frames 0", "frames must be 1 to 100"),
+    ("replay stabilize --frames 1000000000", "frames must be 1 to 100"),
+    ("replay stabilize --fps 0", "fps must be 1 to 1000"),
+    ("replay stabilize --seconds nan", "seconds must be positive, not nan"),
+    ("replay stabilize --speed 0", "speed must be positive"),
+    ("replay stabilize --width 3", "width must be 64 to 7680 px"),
+    ("replay stabilize --controllers lqr --physics rk4 --format gif --speed 1e-9", "frames; give another speed or fps"),
+    ("replay none.npz", "none.npz: no such file"),
+    ("demos --task dance", "unknown task dance"),
+    ("demos --expert me", "unknown expert me"),
+    ("demos --episodes 0", "episodes must be 1 to"),
+    ("demos --seed -1", "seed must be 0 to"),
+    ("demos --noise nan", "noise must be finite"),
+    ("demos --backoff.goal -1", "Backoff: goal must be at least 0"),
+    ("demos --workers 0", "workers must be at least 1"),
+    ("demos --out mine", "is named NAME-vNUMBER"),
+    ("train dance", "unknown learner dance; known: bc"),
+    ("train shac --task dance", "unknown task dance"),
+    ("train shac --threads 0", "threads must be 1 to"),
+    ("train shac --seed -1", "seed must be 0 to"),
+    ("train shac --evaluations 0", "evaluations must be 1 to"),
+    ("train shac --total-iterations -5", "total_iterations must be 1 to"),
+    ("train shac --learning-rate nan", "learning_rate must be finite"),
+    ("train shac --demos x", "shac uses no demonstrations"),
+    ("train shac --start none.json", "none.json is not a policy"),
+    ("train bc", "bc learns from demonstrations: give --demos"),
+    ("train bc --demos none", 'is no dataset of "ballbot demos"'),
+    ("train dagger --backoff.force 2", "Backoff: force must be at least 0 and below 1"),
+    ("trian", "did you mean train?"),
+]
+
+
+@pytest.mark.parametrize(("typed", "message"), TYPED, ids=[typed for typed, _ in TYPED])
+def test_what_is_typed_wrong_ends_with_a_message_and_a_status_and_writes_nothing(
+    typed, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    try:
+        status = _run(shlex.split(typed))
+    except SystemExit as end:  # tyro ends so
+        status = end.code
+    printed = capsys.readouterr()
+    said = " ".join((printed.err + printed.out).replace("│", " ").split())
+    assert message in said
+    assert "Traceback" not in said
+    assert status in (1, 2)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", TASK_NAMES)
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_the_settings_tuned_for_every_task_make_sense(learner, name):
+    check_settings(LEARNERS[learner].settings(name))
+
+
+def test_a_pipe_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.npz")
+    with pytest.raises(ValueError, match="is no regular file"):
+        Trajectory.load(tmp_path / "pipe.npz")
