@@ -82,7 +82,7 @@ class RslPpoConfig:
 
 
 TUNED: dict[str, RslPpoConfig] = {
-    "stabilize": RslPpoConfig(symmetry="odd"),
+    "stabilize": RslPpoConfig(symmetry="odd", total_iterations=600),
     "orbit": RslPpoConfig(symmetry="frame", total_iterations=600),
     "weave": RslPpoConfig(
         symmetry="mirrors", episode_seconds=8.0, hidden=(128, 128), critic_hidden=(128, 128), total_iterations=800
