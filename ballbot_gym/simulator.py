@@ -128,7 +128,7 @@ PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": Bull
 
 
 def default_physics() -> str:
-    """ "bullet" where PyBullet is installed; else "rk4", with one warning per process."""
+    """What `physics` is by default: "bullet" where PyBullet is installed; else "rk4", with one warning per process."""
     if importlib.util.find_spec("pybullet") is not None:
         return "bullet"
     if not _noticed:
