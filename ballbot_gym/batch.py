@@ -15,7 +15,11 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import torch
+
+try:
+    import torch
+except ImportError as error:
+    raise ImportError('batches of environments need torch: pip install "ballbot-gym[train]"') from error
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.env import make_task

@@ -4,9 +4,10 @@ An env's random numbers therefore do not depend on the batch or on its position 
 drawn without a loop. `key` and `floats` give the same numbers for one env, in plain Python.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 _WORD = 0xFFFFFFFF  # hashes are 32-bit words kept in int64, whose products then never overflow
 
@@ -16,7 +17,7 @@ def key(seed: Any, episode: Any, step: Any) -> Any:
     return _mix(_mix(_mix(_mix(seed & _WORD) ^ (seed >> 32)) ^ (episode & _WORD)) ^ (step & _WORD))
 
 
-def uniforms(key: torch.Tensor, count: int, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+def uniforms(key: "torch.Tensor", count: int, dtype: "torch.dtype") -> "tuple[torch.Tensor, ...]":
     """`count` tensors (B,) of uniform numbers in [0, 1), multiples of 2⁻²⁴ and so the same in both dtypes."""
     words = (_mix((key + 0x9E3779B9 * i) & _WORD) for i in range(1, count + 1))
     return tuple((word >> 8).to(dtype) * 2.0**-24 for word in words)

@@ -204,7 +204,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             np.zeros(size),
             np.zeros((3, size)),
             self._array(tilt).astype(self._dtype, copy=False),
-            np.zeros((size, 2)),
+            np.zeros((size, 2), self._dtype),
             np.zeros(size, bool),
             np.full(size, -1),
             np.zeros(size, bool),

@@ -24,12 +24,13 @@ from ballbot_gym.vector import BallbotVectorEnv
 INFO = ("state", "cost", *REWARD_PARTS, "tilt", "success", "failure", "violated", "force", "clipped", "constants")
 
 
-@pytest.fixture
-def make_vec():
+@pytest.fixture(params=["torch", "loop"])
+def make_vec(request):
     """Makes vector envs that are closed after the test; float64 and eager unless said otherwise."""
     envs = []
 
     def make(num_envs, task="stabilize", dtype=torch.float64, compile=False, **kwargs):
+        kwargs.setdefault("engine", request.param)
         envs.append(BallbotVectorEnv(num_envs, task, dtype=dtype, compile=compile, **kwargs))
         return envs[-1]
 
@@ -310,7 +311,7 @@ def test_bad_reset_mask_is_refused(mask, error, message, make_vec):
         ("stabilize", {"stat": 1}, "unknown reset options"),
         ("stabilize", {"state": np.zeros(7)}, "state must be finite"),
         ("stabilize", {"state": np.full((2, 8), np.nan)}, "state must be finite"),
-        ("stabilize", {"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a margin"),
+        ("stabilize", {"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a limit"),
         ("orbit", {"constants": {"tempo": 1.0}}, "no constants"),
         ("orbit", {"constants": [[0.5, 1.0], [2.0, 1.0]]}, "radius must exceed"),
     ],
@@ -321,7 +322,8 @@ def test_bad_start_is_refused_and_changes_nothing(task, options, message, make_v
     before = vec.batch.state
     with pytest.raises(ValueError, match=message):
         vec.reset(seed=5, options=options)
-    assert vec.batch.state is before
+    for now, then in zip(vec.batch.state, before, strict=True):
+        np.testing.assert_array_equal(now, then)
 
 
 def test_bad_arguments_are_refused():
@@ -331,7 +333,13 @@ def test_bad_arguments_are_refused():
         ({"num_envs": 2, "compile": "yes"}, ValueError, "compile"),
         ({"num_envs": 2, "render_mode": "human"}, ValueError, "render_mode"),
         ({"num_envs": 2, "task": "juggle"}, ValueError, "unknown task"),
-        ({"num_envs": 2, "physics": "bullet"}, TypeError, "physics"),
+        ({"num_envs": 2, "physics": "bullet"}, ValueError, 'num_envs=2, vectorization_mode="sync", physics="bullet"'),
+        ({"num_envs": 2, "physics": "mujoco"}, ValueError, "unknown physics 'mujoco'"),
+        ({"num_envs": 2, "autoreset_mode": "never"}, ValueError, "unknown autoreset_mode 'never'; known: 'NextStep'"),
+        ({"num_envs": 2, "engine": "numpy"}, ValueError, "unknown engine 'numpy'; known: 'auto', 'torch', 'loop'"),
+        ({"num_envs": 2, "max_episode_steps": 0}, ValueError, "max_episode_steps must be a positive whole number"),
+        ({"num_envs": 2, "max_episode_steps": 9, "duration": 1.0}, ValueError, "not both"),
+        ({"num_envs": 2, "frameskip": 4}, TypeError, "got an unexpected keyword argument 'frameskip'"),
     ):
         with pytest.raises(error, match=message):
             BallbotVectorEnv(**kwargs)
@@ -576,7 +584,7 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
         batch.reset(seed=0)
         batch.step(torch.zeros(4, 2))
         batch.step(torch.zeros(4, 2))
-    assert [record.name for record in caplog.records] == ["ballbot_gym.vector"]
+    assert [record.name for record in caplog.records] == ["ballbot_gym.batch"]
     assert "no such compiler" in caplog.text
     assert not batch.compiled
     must = BallbotBatch("stabilize", 4, compile=True)
