@@ -224,7 +224,7 @@ class BallbotEnv(gymnasium.Env):
         if not self._state:
             raise gymnasium.error.ResetNeeded("get_state() before reset()")
         disturbance = None if self._disturbance is None else self._disturbance.get_state()
-        rng = self.np_random.bit_generator.state
+        rng = dict(self.np_random.bit_generator.state)
         return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance)
 
     def set_state(self, state: EnvState) -> None:

@@ -95,8 +95,9 @@ class BallbotLoop:
             if not (old is None or mask is None or mask[i]):
                 rows.append(single.memory())
                 continue
-            fresh = given[i] is not None
-            number, episode = given[i] if fresh else seeds[i], 0 if fresh or old is None else single.episode + 1
+            own = given[i]
+            number = int(seeds[i]) if own is None else own
+            episode = 0 if own is not None or old is None else single.episode + 1
             x_row, c_row = (None if part is None else tuple(part[:, i].tolist()) for part in (x, c))
             rows.append(single.start(number, episode, x_row, c_row))
         return self._stacked(rows)

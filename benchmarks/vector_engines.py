@@ -1,6 +1,7 @@
 """Control steps per second of vector environments by batch size: Gymnasium's sync, the loop and torch.
 
 `ballbot_gym.vector.LOOP_BELOW` follows from this table. Every figure is the median of several runs, whose order alternates.
+Time is that of the processor, so that a busy machine does not spoil it; run it with OMP_NUM_THREADS=1.
 """
 
 import argparse
@@ -41,12 +42,12 @@ def speed(env: gymnasium.vector.VectorEnv, seconds: float) -> float:
     """Control steps per second of all envs together, with random actions, ends of episodes included."""
     env.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (64, env.num_envs, 2)).astype(np.float32)
-    count, begin = 0, time.perf_counter()
-    while time.perf_counter() - begin < seconds:
+    count, begin = 0, time.process_time()
+    while time.process_time() - begin < seconds:
         for action in actions[count % 64 : count % 64 + 8]:
             env.step(action)
         count += 8
-    return count * env.num_envs / (time.perf_counter() - begin)
+    return count * env.num_envs / (time.process_time() - begin)
 
 
 if __name__ == "__main__":

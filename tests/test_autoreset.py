@@ -7,8 +7,8 @@ from gymnasium.vector import AutoresetMode
 
 torch = pytest.importorskip("torch")
 
-from ballbot_gym import Randomization, counter_rng
-from ballbot_gym.vector import LOOP_BELOW, BallbotLoop, BallbotVectorEnv
+from ballbot_gym import Randomization, counter_rng  # noqa: E402
+from ballbot_gym.vector import LOOP_BELOW, BallbotLoop, BallbotVectorEnv  # noqa: E402
 
 ROBOTS = Randomization(body_mass=(0.8, 1.2), actuator_delay=(0.0, 0.06), position_noise=0.01, push_impulse=(0.0, 3.0))
 

@@ -11,9 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "clients.md").read_text()
-SECTIONS = {
-    title: code for title, code in re.findall(r"^## (.+?)\n.*?```python\n(.*?)```", PAGE, re.MULTILINE | re.DOTALL)
-}
+SECTIONS = dict(re.findall(r"^## (.+?)\n.*?```python\n(.*?)```", PAGE, re.MULTILINE | re.DOTALL))
 OURS = {"ballbot_gym", "ballbot_train"}
 NEEDS = {"RL Baselines3 Zoo": {"rl_zoo3"}, "Minari": {"jax"}}  # besides what the code imports
 

@@ -333,7 +333,7 @@ def test_bad_action_is_refused_and_changes_nothing(make_env, physics, action, pr
         (
             {"durration": 4.0},
             TypeError,
-            "BallbotStabilize-v0 got an unexpected keyword argument 'durration'; it has .*duration",
+            "Stabilize-v0 got an unexpected keyword argument 'durration'; it has .*duration",
         ),
         ({"duration": -1.0}, ValueError, "Stabilize: duration must be positive"),
         ({"task": Stabilize(), "duration": 4.0}, ValueError, r"fields \['duration'\] cannot be given together"),
@@ -360,7 +360,7 @@ BAD_OPTIONS = {
     "long constants": ({"constants": [0.0] * 99}, "constants must be"),
     "unknown constant": (
         {"constants": {"colour": 1.0}},
-        r"has no constants \['colour'\]; (it has \[|its episodes have none)",
+        r"no constants \['colour'\]; (it has \[|its episodes have none)",
     ),
 }
 
