@@ -104,11 +104,11 @@ class BatchEpisodes(NamedTuple):
     """One episode of each of B environments."""
 
     cost: torch.Tensor
-    """(B,) float64, minus the return."""
+    """(B,) float64, a failure's price included."""
     success: torch.Tensor
     """(B,) bool: the episode ended in the goal."""
     failure: torch.Tensor
-    """(B,) bool: the episode ended at a violated margin."""
+    """(B,) bool: the episode ended at a violated limit."""
     terminated: torch.Tensor
     """(B,) bool: the episode ended by success or failure, not because its time was over."""
     steps: torch.Tensor

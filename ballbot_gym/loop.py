@@ -96,7 +96,7 @@ class BallbotLoop:
                 rows.append(single.memory())
                 continue
             own = given[i]
-            number = int(seeds[i]) if own is None else own
+            number: Any = seeds[i] if own is None else own
             episode = 0 if own is not None or old is None else single.episode + 1
             x_row, c_row = (None if part is None else tuple(part[:, i].tolist()) for part in (x, c))
             rows.append(single.start(number, episode, x_row, c_row))

@@ -19,8 +19,10 @@ def cubic(p0: np.ndarray, v0: np.ndarray, p1: np.ndarray, v1: np.ndarray, steps:
     """The cubic ground path from position p0 and velocity v0 to position p1 and velocity v1.
 
     Args:
-        p0, p1: (2,) m.
-        v0, v1: (2,) m/s.
+        p0: (2,) position at the start, m.
+        v0: (2,) velocity at the start, m/s.
+        p1: (2,) position at the end, m.
+        v1: (2,) velocity at the end, m/s.
         steps: intervals of the path.
         dt: length of an interval, s.
 

@@ -28,8 +28,8 @@ def test_rollout_is_one_episode_of_the_env(make_env, task, physics):
     _, info = env.reset(seed=5)
     total, states, done = 0.0, [info["state"]], False
     while not done:
-        _, reward, terminated, truncated, info = env.step([0.0, 0.0])
-        total, done = total - reward, terminated or truncated
+        _, _, terminated, truncated, info = env.step([0.0, 0.0])
+        total, done = total + info["cost"], terminated or truncated
         states.append(info["state"])
     assert episode.cost == total
     np.testing.assert_array_equal(episode.trajectory.x, states)

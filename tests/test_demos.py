@@ -158,7 +158,9 @@ def test_its_command_makes_it_anew(dataset, tmp_path, monkeypatch):
     assert made == dataset
     words[words.index("--out") + 1] = str(tmp_path / "again-v0")
     monkeypatch.setattr(sys, "argv", words)
-    main()
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
     assert content(tmp_path / "again-v0") == content(dataset)
 
 

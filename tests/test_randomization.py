@@ -280,14 +280,14 @@ def test_batched_sensors_and_pushes_have_the_statistics_asked_for():
     speed = torch.hypot(*result.final_x[4:6])
     assert (speed > 0).double().mean() == pytest.approx(0.25, abs=5 * math.sqrt(0.19 / n))
     assert speed[speed > 0].mean() == pytest.approx(0.295172 * 0.5, rel=0.01)
-    assert (result.reward == 0).all()
+    assert (result.cost == 0).all()
 
 
 def test_gradients_flow_through_randomized_robots_and_actuators():
     vec = batch(3, EVERYTHING)
     vec.reset(seed=0)
     actions = torch.zeros(6, 3, 2, dtype=torch.float64, requires_grad=True)
-    cost = -sum(vec.step(a).reward.sum() for a in actions)
+    cost = sum(vec.step(a).cost.sum() for a in actions)
     (gradient,) = torch.autograd.grad(cost, actions)
     assert torch.isfinite(gradient).all()
     assert (gradient[0] != 0).all()

@@ -28,6 +28,7 @@ BOUNDARY = "boundary"
 """What the search for the boundaries counts its progress for."""
 LEAN_LIMIT = 75.0  # degrees, either side
 _BOUNDARY_POINTS = 31  # its search goes from value to value, in steps that it can follow
+_ARENA_RADIUS = 1000.0  # m: a map asks whether the robot comes back, not how far it goes meanwhile
 _DOUBT = (
     2.0  # degrees beyond the boundary that are run too, because the boundary is only as exact as its regularization
 )
@@ -156,7 +157,7 @@ def run(
 def _cells(
     axis: str, controller: str, physics: str, points: int, items: Sequence[tuple[int, int]]
 ) -> Iterator[jobs.Entry]:
-    env = BallbotEnv(TASK, physics=physics)
+    env = BallbotEnv(TASK, physics=physics, arena_radius=_ARENA_RADIUS)
     made = make_controller(controller, env.task, env.params)
     leans, values = grid(axis, points)
     for i, j in items:

@@ -35,7 +35,8 @@ def leaderboard_sections(
     """The page of `ballbot benchmark`.
 
     Args:
-        header, table: the leaderboard's cells.
+        header: the names of the leaderboard's columns.
+        table: its cells.
         results: its episodes.
         controllers: by task.
         pictures: of certified episodes.
