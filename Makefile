@@ -1,11 +1,12 @@
 # make demo   install into .venv and run the benchmark on an eighth of the episodes: LQR, trajectory optimization, NMPC
 # make test   install into .venv, then lint, check types and test
+# make clients  install other people's libraries into .venv-clients and run docs/clients.md with them
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 TRIALS := benchmarks/soak.py benchmarks/faults.py benchmarks/fuzz.py
 
-.PHONY: demo test test-slow bench soak faults fuzz docs certify clean
+.PHONY: demo test test-slow bench soak faults fuzz docs certify clients clean
 
 demo: $(VENV)/installed
 	$(BIN)/ballbot benchmark --episodes 25 --out runs/demo
@@ -39,6 +40,16 @@ fuzz: $(VENV)/installed
 docs: $(VENV)/installed
 	$(BIN)/mkdocs build --strict
 
+# RLlib is tested where it is installed; it pins another Gymnasium, so that it cannot be here. RL Zoo wants an older dateutil.
+CLIENTS := torchrl skrl rl-zoo3 rsl-rl-lib minari[create]
+
+clients: $(VENV)/installed
+	$(BIN)/python -m venv .venv-clients
+	grep -v "^python-dateutil" constraints.txt > .venv-clients/constraints.txt
+	.venv-clients/bin/pip install -c .venv-clients/constraints.txt "torch==2.13.0"
+	.venv-clients/bin/pip install -c .venv-clients/constraints.txt -e ".[all]" pytest $(patsubst %,"%",$(CLIENTS))
+	.venv-clients/bin/python -m pytest -rs tests/test_clients.py
+
 # the optima that the package ships, computed anew
 certify: $(VENV)/installed
 	$(BIN)/ballbot certify
@@ -59,4 +70,4 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) runs build dist *.egg-info
+	rm -rf $(VENV) .venv-clients runs build dist *.egg-info

@@ -15,7 +15,11 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import torch
+
+try:
+    import torch
+except ImportError as error:
+    raise ImportError('batches of environments need torch: pip install "ballbot-gym[train]"') from error
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.env import make_task
@@ -137,7 +141,8 @@ class BallbotBatch:
 
     `transition` is a pure function of state and actions; `reset` and `step` apply it to `self.state`. Gradients flow
     through `step` into earlier actions until an episode ends; `detach` cuts them. The physics is the closed form of
-    `BallbotEnv(physics="rk4")`.
+    `BallbotEnv(physics="rk4")`. `state` is never written into: keep it and assign it again to go on from there. Copies and
+    pickles are independent batches in the same state.
     """
 
     def __init__(
@@ -168,8 +173,7 @@ class BallbotBatch:
             ValueError: num_envs, dtype or compile out of range, or as `make_task`.
             TypeError: a keyword that is no field of the task.
         """
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
+        check_num_envs(num_envs)
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, not {dtype}")
         if compile not in (True, False, "auto"):
@@ -188,6 +192,13 @@ class BallbotBatch:
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
         self._run = _compiled(self._compilable) if wanted else self.transition
         self._proven = not wanted
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_run": self.compiled}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._run = _compiled(self._compilable) if state["_run"] else self.transition
 
     @property
     def compiled(self) -> bool:
@@ -227,13 +238,13 @@ class BallbotBatch:
         old = self.state
         if old is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-            seeds = torch.tensor(_seeds_of(self._entropy, self.num_envs), device=self.device)
+            seeds = torch.tensor(seeds_of(self._entropy, self.num_envs), device=self.device)
             episode = torch.zeros_like(seeds)
         else:
             mask = torch.ones_like(old.seed, dtype=torch.bool) if mask is None else mask
             seeds, episode = old.seed, old.episode + 1
         if seed is not None:
-            given = torch.tensor([-1 if s is None else s for s in _seeds_of(seed, self.num_envs)], device=self.device)
+            given = torch.tensor([-1 if s is None else s for s in seeds_of(seed, self.num_envs)], device=self.device)
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c)
         return self._stacked(new if old is None else _select(mask, new, _rows(old)))
@@ -493,7 +504,14 @@ def tilt_of(x: tuple) -> torch.Tensor:
     return dynamics.tilt(tuple(part.detach() for part in x))
 
 
-def _seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
+def check_num_envs(num_envs: Any) -> int:
+    """num_envs, or a ValueError."""
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
+    return int(num_envs)
+
+
+def seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
     """One seed per env."""
     seeds: list[int | None] = []
     seeds += [int(seed) + i for i in range(num_envs)] if isinstance(seed, int | np.integer) else seed

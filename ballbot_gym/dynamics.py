@@ -106,11 +106,11 @@ def _rk4(params: BallbotParams, x: tuple, u: tuple, dt: Any) -> tuple:
     k2 = derivative(params, _advance(x, half, k1), u)
     k3 = derivative(params, _advance(x, half, k2), u)
     k4 = derivative(params, _advance(x, dt, k3), u)
-    return tuple(a + sixth * (b + 2 * (c + d) + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True))
+    return tuple([a + sixth * (b + 2 * (c + d) + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True)])
 
 
 def _advance(x: tuple, dt: Any, slope: tuple) -> tuple:
-    return tuple(a + dt * b for a, b in zip(x, slope, strict=True))
+    return tuple([a + dt * b for a, b in zip(x, slope, strict=True)])
 
 
 def energy(params: BallbotParams, x: Vector) -> Any:

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -12,12 +12,42 @@ from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams, checked_params
-from ballbot_gym.randomization import Disturbance, Randomization, checked_randomization
+from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.scene import Scene
-from ballbot_gym.simulator import PHYSICS, State
+from ballbot_gym.simulator import PHYSICS, State, default_physics
 from ballbot_gym.tasks import TASKS, Task
 
 _LARGEST = 1e6  # of any number that reset takes
+
+
+class EnvState(NamedTuple):
+    """What `BallbotEnv.get_state` returns: everything that decides how an episode goes on. It may be pickled."""
+
+    task: Task
+    x: State
+    """(8,) state; order and units in `dynamics.STATE`."""
+    constants: State
+    """(nc,) constants of the episode."""
+    steps_left: int
+    """Control steps to the end of the episode; 0 where it has ended."""
+    rng: dict[str, Any]
+    """State of the random number generator."""
+    disturbance: DisturbanceState | None
+    """Of the randomized robot and actuator; None where nothing varies."""
+
+
+class Outcome(NamedTuple):
+    """What one control step did, as plain numbers."""
+
+    terminated: bool
+    truncated: bool
+    reward: tuple[float, float, float]
+    """Its parts, named in `REWARD_PARTS`."""
+    cost: float
+    force: tuple[float, float]
+    success: bool
+    violated: str
+    clipped: bool
 
 
 class BallbotEnv(gymnasium.Env):
@@ -43,6 +73,9 @@ class BallbotEnv(gymnasium.Env):
     | force | (2,) N, applied in this step (0 after `reset`) |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
+
+    `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
+    copy of a Bullet env has a physics client of its own. The window is not copied.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
@@ -50,7 +83,7 @@ class BallbotEnv(gymnasium.Env):
     def __init__(
         self,
         task: str | Task = "stabilize",
-        physics: str = "bullet",
+        physics: str | None = None,
         render_mode: str | None = None,
         params: BallbotParams | None = None,
         physics_dt: float | None = None,
@@ -61,7 +94,8 @@ class BallbotEnv(gymnasium.Env):
 
         Args:
             task: a name in `TASKS`, or a Task.
-            physics: "bullet", the URDF in PyBullet, or "rk4", the closed-form model.
+            physics: "bullet", the URDF in PyBullet, or "rk4", the closed-form model; default, "bullet" where PyBullet is
+                installed, else "rk4" with a warning.
             render_mode: None, "rgb_array" or "human".
             params: the robot; default, the paper's.
             physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
@@ -77,6 +111,7 @@ class BallbotEnv(gymnasium.Env):
         self._spec: EnvSpec | None = None
         self._scene: Scene | None = None
         self._state: State = ()  # until the first reset
+        physics = default_physics() if physics is None else physics
         if not isinstance(physics, str) or physics not in PHYSICS:
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -92,6 +127,7 @@ class BallbotEnv(gymnasium.Env):
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )
         self.observation_space = observation_space(self.task, self.params)
+        self._physics_dt = physics_dt
         self._simulator = PHYSICS[physics](self.params, self.task.control_dt, physics_dt)
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
@@ -114,7 +150,7 @@ class BallbotEnv(gymnasium.Env):
         self._check_open()
         super().reset(seed=seed)
         x, c = self._draw({} if options is None else options)
-        self._constants, self._constants_array = tuple(c.tolist()), c
+        self._set_constants(tuple(c.tolist()))
         self._state = tuple(x.tolist())
         if self._disturbance is not None:
             self._disturbance.reset(self.np_random)
@@ -122,11 +158,9 @@ class BallbotEnv(gymnasium.Env):
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
         self._steps_left = self.task.steps
-        if self._scene is not None:
-            self._scene.set_markers(self.task.markers(self._constants_array))
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._info(0.0, _NO_REWARD, (0.0, 0.0), False, "", False)
+        return self._observation(), self._info(_START)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -144,33 +178,11 @@ class BallbotEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended; call reset()" if self._state else "step() before reset()"
             )
-        force, clipped = self._force(action)
-        task, c, total = self.task, self._constants, force
-        if self._disturbance is not None:
-            force = self._disturbance.actuate(force)
-            total = self._disturbance.pushed(force, self.np_random)
-        running = task.cost(self._state, force, c) * task.control_dt
-        self._state = x = self._simulator.step(total)
-        self._steps_left -= 1
-        violated = task.violated(x, c)
-        failure = violated != ""
-        last = self._steps_left == 0
-        success = not failure and (last or task.first_exit) and task.is_goal(x, c)
-        terminated = failure or (success and task.first_exit)
-        survive = task.survival_reward * task.control_dt
-        ahead = survive * self._steps_left  # for the time that remains
-        reward = (survive, -running, ahead if terminated and success else 0.0)
-        if terminated:
-            self._steps_left = 0
+        outcome = self._advance(*self._force(action))
         if self.render_mode == "human":
             self.render()
-        return (
-            self._observation(),
-            sum(reward),
-            terminated,
-            last and not terminated,
-            self._info(running + ahead * failure, reward, force, success, violated, clipped),
-        )
+        reward = sum(outcome.reward)
+        return self._observation(), reward, outcome.terminated, outcome.truncated, self._info(outcome)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -203,6 +215,56 @@ class BallbotEnv(gymnasium.Env):
             self._scene.set_markers(self.task.markers(self._constants_array))
         return self._scene.draw(tuple(map(float, x)))
 
+    def get_state(self) -> EnvState:
+        """The state of the env in its episode, from which `set_state` goes on bit-identically, for instance in tree search.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before `reset`.
+            gymnasium.error.ClosedEnvironmentError: after `close`.
+        """
+        self._check_open()
+        if not self._state:
+            raise gymnasium.error.ResetNeeded("get_state() before reset()")
+        disturbance = None if self._disturbance is None else self._disturbance.get_state()
+        rng = dict(self.np_random.bit_generator.state)
+        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance)
+
+    def set_state(self, state: EnvState) -> None:
+        """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
+
+        An env that `gymnasium.make` returned wants a `reset` before its first `step` all the same.
+
+        Raises:
+            ValueError: the state is of another task, or of an env with other randomization.
+            gymnasium.error.ClosedEnvironmentError: after `close`.
+        """
+        self._check_open()
+        if not isinstance(state, EnvState):
+            raise TypeError(f"set_state() takes what get_state() returned, not {type(state).__name__}")
+        if state.task != self.task:
+            raise ValueError(f"the state is of {state.task}, and this env's task is {self.task}")
+        if (state.disturbance is None) != (self._disturbance is None):
+            raise ValueError("the state is of an env with other randomization")
+        self._set_constants(state.constants)
+        self._state, self._steps_left = state.x, state.steps_left
+        self.np_random.bit_generator.state = state.rng
+        if self._disturbance is not None and state.disturbance is not None:
+            self._disturbance.set_state(state.disturbance)
+        self._restore_simulator()
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.np_random  # noqa: B018  an env that was never seeded is seeded here, so that its copy draws the same episodes
+        return {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_scene")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._scene = None
+        self._simulator = PHYSICS[self.physics](self.params, self.task.control_dt, self._physics_dt)
+        if self._closed:
+            self._simulator.close()
+        elif self._state:
+            self._restore_simulator()
+
     def close(self) -> None:
         """Releases the physics client and the window; may be called again."""
         self._closed = True
@@ -215,6 +277,40 @@ class BallbotEnv(gymnasium.Env):
     def _check_open(self) -> None:
         if self._closed:
             raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
+
+    def _set_constants(self, c: State) -> None:
+        """Makes c the constants of the episode."""
+        self._constants, self._constants_array = c, np.array(c, np.float64)
+        if self._scene is not None:
+            self._scene.set_markers(self.task.markers(self._constants_array))
+
+    def _restore_simulator(self) -> None:
+        """Puts the simulator into the env's state. Joint positions and velocities are all that Bullet remembers of a step."""
+        if self._disturbance is not None and self.randomization.varies_robot:
+            self._simulator.set_params(self._disturbance.params)
+        self._simulator.reset(self._state)
+
+    def _advance(self, force: tuple[float, float], clipped: bool) -> Outcome:
+        """Holds a force, N, for one control step."""
+        task, c, total = self.task, self._constants, force
+        if self._disturbance is not None:
+            force = self._disturbance.actuate(force)
+            total = self._disturbance.pushed(force, self.np_random)
+        running = task.cost(self._state, force, c) * task.control_dt
+        self._state = x = self._simulator.step(total)
+        self._steps_left -= 1
+        violated = task.violated(x, c)
+        failure = violated != ""
+        last = self._steps_left == 0
+        success = not failure and (last or task.first_exit) and task.is_goal(x, c)
+        terminated = failure or (success and task.first_exit)
+        survive = task.survival_reward * task.control_dt
+        ahead = survive * self._steps_left  # for the time that remains
+        reward = (survive, -running, ahead if terminated and success else 0.0)
+        if terminated:
+            self._steps_left = 0
+        cost = running + ahead * failure
+        return Outcome(terminated, last and not terminated, reward, cost, force, success, violated, clipped)
 
     def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Initial state and constants. Those that the options do not give are drawn."""
@@ -248,9 +344,7 @@ class BallbotEnv(gymnasium.Env):
     def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[Any]:
         """The drawn constants c, of which some are replaced by name."""
         names = self.task.constant_names
-        unknown = sorted(set(named) - set(names))
-        if unknown:
-            raise ValueError(f"{self.task.id} has no constants {unknown}; it has {list(names)}")
+        check_constant_names(self.task, named)
         return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
@@ -265,32 +359,27 @@ class BallbotEnv(gymnasium.Env):
         limit = self.params.force_limit
         return (limit * ax, limit * ay), clipped
 
-    def _observation(self) -> np.ndarray:
+    def _observed(self) -> tuple[float, ...]:
+        """(no) observation of the present state, with the sensors' noise."""
         x = self._state
         if self._disturbance is not None:
             x = self._disturbance.sensed(x, self.np_random)
-        return np.array(self.task.observe(x, self._constants), np.float32)
+        return self.task.observe(x, self._constants)
 
-    def _info(
-        self,
-        cost: float,
-        reward: tuple[float, float, float],
-        force: tuple[float, float],
-        success: bool,
-        violated: str,
-        clipped: bool,
-    ) -> dict[str, Any]:
-        """`reward` holds its parts."""
+    def _observation(self) -> np.ndarray:
+        return np.array(self._observed(), np.float32)
+
+    def _info(self, outcome: Outcome) -> dict[str, Any]:
         return {
             "state": np.array(self._state),
-            "cost": cost,
-            **dict(zip(REWARD_PARTS, reward, strict=True)),
+            "cost": outcome.cost,
+            **dict(zip(REWARD_PARTS, outcome.reward, strict=True)),
             "tilt": dynamics.tilt(self._state),
-            "success": success,
-            "failure": violated != "",
-            "violated": violated,
-            "force": np.array(force),
-            "clipped": clipped,
+            "success": outcome.success,
+            "failure": outcome.violated != "",
+            "violated": outcome.violated,
+            "force": np.array(outcome.force),
+            "clipped": outcome.clipped,
             "constants": self._constants_array.copy(),
         }
 
@@ -298,7 +387,8 @@ class BallbotEnv(gymnasium.Env):
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 """Keys of `info` whose values add up to the reward."""
 
-_NO_REWARD = (0.0, 0.0, 0.0)
+_START = Outcome(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, "", False)
+"""What `reset` reports."""
 
 _REPLACED = {
     "failure_cost": "a failure now costs survival_reward for every second not lived: give survival_reward (1/s) instead"
@@ -339,13 +429,25 @@ def make_task(task: str | Task, **task_fields: Any) -> Task:
         return task
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"unknown task {task!r}; known: {', '.join(map(repr, TASKS))}")
-    known = {field.name for field in dataclasses.fields(TASKS[task])}
-    for name in task_fields.keys() & _REPLACED.keys():
-        raise TypeError(f"{TASKS[task].id} has no argument {name}; {_REPLACED[name]}")
-    unknown = sorted(set(task_fields) - known)
-    if unknown:
-        raise TypeError(f"{TASKS[task].id} has no argument {', '.join(unknown)}; it has {', '.join(sorted(known))}")
+    known = sorted(field.name for field in dataclasses.fields(TASKS[task]))
+    for name in sorted(task_fields.keys() - set(known)):
+        # Python's own words, because clients such as torchrl look for them.
+        hint = _REPLACED.get(name) or f"it has {', '.join(known)}"
+        raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; {hint}")
     return TASKS[task](**task_fields)
+
+
+def check_constant_names(task: Task, named: dict[str, Any]) -> None:
+    """Raises a ValueError that says which constants a task has, where others are given by name."""
+    unknown = sorted(set(named) - set(task.constant_names))
+    if not unknown:
+        return
+    if not task.constant_names:
+        raise ValueError(
+            f'{task.id} has no constants {unknown}; its episodes have none: leave options["constants"] out, or set '
+            'the start with options={"state": x}'
+        )
+    raise ValueError(f"{task.id} has no constants {unknown}; it has {list(task.constant_names)}")
 
 
 def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:

@@ -1,14 +1,33 @@
-"""Entry points that are imported when they are first used, so that a registry costs no import."""
+"""Entry points that are imported when they are first used, so that a registry costs no import.
+
+Where a library is missing, the error names the extra that brings it.
+"""
 
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
+_EXTRAS = {"ballbot_gym": "train", "ballbot_baselines": "baselines", "ballbot_train": "train"}
+"""The extra that brings what a package of ours imports."""
+
 
 def load(entry: str) -> Any:
-    """What "package.module:name" names."""
+    """What "package.module:name" names.
+
+    Raises:
+        ModuleNotFoundError: a library is missing; the message names the extra to install.
+    """
     module, _, name = entry.partition(":")
-    return getattr(import_module(module), name)
+    try:
+        return getattr(import_module(module), name)
+    except ModuleNotFoundError as error:
+        package = module.partition(".")[0]
+        if (error.name or "").partition(".")[0] in _EXTRAS or package not in _EXTRAS:
+            raise
+        raise ModuleNotFoundError(
+            f'{name} needs {error.name}, which is not installed: pip install "ballbot-gym[{_EXTRAS[package]}]"',
+            name=error.name,
+        ) from error
 
 
 def called(entry: str) -> Callable[..., Any]:

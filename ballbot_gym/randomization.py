@@ -6,7 +6,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -197,6 +197,17 @@ def checked_randomization(randomization: Any) -> Randomization:
     return randomization
 
 
+class DisturbanceState(NamedTuple):
+    """What a `Disturbance` remembers."""
+
+    drawn: tuple[float, ...]
+    """(6,) what `Randomization.draw` drew for the episode."""
+    force: tuple[float, float]
+    """N, applied last."""
+    past: tuple[tuple[float, float], ...]
+    """N, earlier commands, the latest first."""
+
+
 class Disturbance:
     """The randomization of one environment: the robot and actuator of its episode, and the actuator's memory."""
 
@@ -208,13 +219,23 @@ class Disturbance:
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draws the episode's robot and actuator."""
-        *factors, self._gain, self._delay = self._randomization.draw(
-            tuple(rng.random(Randomization.EPISODE_DRAWS).tolist()), self._dt
-        )
+        z = tuple(rng.random(Randomization.EPISODE_DRAWS).tolist())
+        self.begin(self._randomization.draw(z, self._dt))
+
+    def begin(self, drawn: tuple[float, ...]) -> None:
+        """Starts an episode with what `Randomization.draw` drew."""
+        self.set_state(DisturbanceState(drawn, (0.0, 0.0), ((0.0, 0.0),) * self._past_steps))
+
+    def get_state(self) -> DisturbanceState:
+        """What it remembers, after `reset`."""
+        return DisturbanceState(self._drawn, self._force, self._past)
+
+    def set_state(self, state: DisturbanceState) -> None:
+        """Goes on from what another one remembered."""
+        self._drawn, self._force, self._past = state
+        *factors, self._gain, self._delay = self._drawn
         if self._randomization.varies_robot:
             self.params = self._randomization.robot(self._nominal, tuple(factors))
-        self._force: tuple[float, float] = (0.0, 0.0)
-        self._past: tuple[tuple[float, float], ...] = ((0.0, 0.0),) * self._past_steps
 
     def actuate(self, command: tuple[float, float]) -> tuple[float, float]:
         """The force, N, that the actuator applies in the control step that begins with this command, N."""

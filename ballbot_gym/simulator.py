@@ -4,10 +4,12 @@
 """
 
 import ctypes
+import importlib.util
 import math
 import os
 import sys
 import tempfile
+import warnings
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -132,6 +134,21 @@ PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": Bull
 """Simulators by the name that `gymnasium.make(..., physics=name)` takes."""
 
 
+def default_physics() -> str:
+    """What `physics` is by default: "bullet" where PyBullet is installed; else "rk4", with one warning per process."""
+    if importlib.util.find_spec("pybullet") is not None:
+        return "bullet"
+    if not _noticed:
+        _noticed.append(True)
+        warnings.warn(f'PyBullet is not installed: physics="rk4" is used. {_HOW_TO_GET_IT}', stacklevel=3)
+    return "rk4"
+
+
+_noticed: list[bool] = []
+
+_HOW_TO_GET_IT = 'Get it with "pip install pybullet" (wheels exist up to Python 3.11).'
+
+
 def import_pybullet() -> ModuleType:
     """PyBullet, or an ImportError that says what to do."""
     try:
@@ -139,8 +156,7 @@ def import_pybullet() -> ModuleType:
             import pybullet
     except ImportError as error:
         raise ImportError(
-            'PyBullet is not installed. Install it with "pip install pybullet" (wheels exist up to Python 3.11), or use '
-            'physics="rk4", which needs only NumPy.'
+            f'PyBullet is not installed. {_HOW_TO_GET_IT} Or use physics="rk4", which needs only NumPy.'
         ) from error
     if not pybullet.isNumpyEnabled():
         raise ImportError(

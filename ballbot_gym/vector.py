@@ -1,34 +1,92 @@
-"""BallbotVectorEnv: Gymnasium's vector interface to a `BallbotBatch`, with NumPy arrays."""
+"""BallbotVectorEnv: Gymnasium's vector interface to a `BallbotBatch`, or to a `BallbotLoop` where envs are few."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ballbot_gym.batch import BallbotBatch, BatchState, all_of, tilt_of
-from ballbot_gym.env import REWARD_PARTS, observation_space, spec_of
+from ballbot_gym import dynamics
+from ballbot_gym.env import REWARD_PARTS, check_constant_names, make_task, observation_space, spec_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.scene import Scene
+from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import Task
+
+try:
+    import torch
+except ImportError as error:
+    raise ImportError(
+        'vector environments need torch: pip install "ballbot-gym[train]", or use '
+        'gymnasium.make_vec(..., vectorization_mode="sync", physics="rk4"), which needs none'
+    ) from error
+
+from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, tilt_of
+from ballbot_gym.loop import BallbotLoop
+
+LOOP_BELOW = 64
+"""Batch size below which engine="auto" loops over the envs on a CPU. From there on a batch in torch is as fast or faster.
+
+Measured by `benchmarks/vector_engines.py` on one core.
+"""
+
+_DTYPES = {"reward": np.float64, "cost": np.float64, "observation": np.float32, "final_observation": np.float32}
+"""Of arrays that do not have the batch's dtype."""
+
+_INFO_KEYS = tuple(
+    (name, f"_{name}")
+    for name in (
+        "state",
+        "cost",
+        *REWARD_PARTS,
+        "tilt",
+        "success",
+        "failure",
+        "violated",
+        "force",
+        "clipped",
+        "constants",
+    )
+)
+"""Keys of an info, each with that of its mask."""
+
+_ENGINES = ("auto", "torch", "loop")
+
+
+class VectorState(NamedTuple):
+    """What `BallbotVectorEnv.get_state` returns. It may be pickled."""
+
+    task: Task
+    batch: BatchState
+    ended: np.ndarray
+    """(B,) bool: the episode has ended, and the next one has not begun."""
 
 
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.
 
-    Spaces, rewards, ends and `info` are those of `BallbotEnv(physics="rk4")`, in float32 by default. An env starts its next
-    episode in the step that ends the last one (`AutoresetMode.SAME_STEP`). `infos["final_obs"]` and `infos["final_info"]`
-    then hold the observation and info before the restart. The entries of `final_info` are valid only for the envs that the
-    masks `_…` mark. Returned arrays never change later; `state` and `constants` in `infos` share the batch's memory and are
-    read-only. Observations and states are in Fortran order, component by component, like those of Gymnasium's own batched
-    CartPole. Actions in that order are not copied.
+    Spaces, rewards, ends and `info` are those of `BallbotEnv(physics="rk4")`, in float32 by default. `autoreset_mode` is one
+    of Gymnasium's:
+
+    | mode | after the end of an episode |
+    |---|---|
+    | "SameStep" | the step that ends it starts the next; `infos["final_obs"]` and `infos["final_info"]` hold the end |
+    | "NextStep" | the next step ignores the env's action, starts the next episode and rewards 0 |
+    | "Disabled" | `reset(options={"reset_mask": mask})` must come before the next step |
+
+    The episodes are the same in all three. The entries of `final_info` are valid only for the envs that the
+    masks `_…` mark. Returned arrays never change later; `state` and `constants` in `infos` may share the batch's memory and
+    are read-only. From `LOOP_BELOW` envs on, observations and states are in Fortran order, component by component, like
+    those of Gymnasium's own batched CartPole, and actions in that order are not copied.
+
+    `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -43,24 +101,51 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
         randomization: Randomization | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        physics: str = "rk4",
+        max_episode_steps: int | None = None,
+        engine: str = "auto",
         **task_fields: Any,
     ):
-        """Makes the environments. All arguments except render_mode are those of `BallbotBatch`.
+        """Makes the environments. Arguments that are not listed are those of `BallbotBatch`.
 
         Args:
             render_mode: None or "rgb_array", which draws every env in turn.
+            autoreset_mode: an `AutoresetMode`, or its value or name; default, SAME_STEP.
+            physics: "rk4". Gymnasium's own vector envs run "bullet".
+            max_episode_steps: control steps; the same as the task's `duration` of so many.
+            engine: "torch" computes all envs at once; "loop" one after the other in float64, whatever dtype is returned;
+                "auto" loops over fewer than `LOOP_BELOW` envs on a CPU, unless compile is True. Both run the same
+                episodes, to rounding. `batch` is a `BallbotBatch` or a `BallbotLoop`.
 
         Raises:
-            ValueError: an unknown render mode, or as `BallbotBatch`.
+            ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
+                `BallbotBatch`.
             TypeError: a keyword that is no field of the task.
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'rgb_array'")
+        if engine not in _ENGINES:
+            raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
         self._spec: EnvSpec | None = None
-        self.batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, **task_fields)
+        task = _task(task, max_episode_steps, task_fields)
+        _check_physics(physics, task, num_envs)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        small = isinstance(num_envs, int) and num_envs < LOOP_BELOW
+        automatic = small and torch.device(device).type == "cpu" and compile is not True
+        if engine == "loop" and torch.device(device).type != "cpu":
+            raise ValueError(f'engine="loop" runs on the CPU, not on {device}')
+        self.batch: BallbotBatch | BallbotLoop
+        # Made in any case, because it checks the arguments; it allocates nothing.
+        self.batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization)
+        self._dtype = np.float32 if dtype == torch.float32 else np.float64
+        if engine == "loop" or (engine == "auto" and automatic):
+            self.batch = BallbotLoop(task, num_envs, self._dtype, self.batch.params, self.batch.randomization)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
+        fps = round(1 / self.task.control_dt)
+        self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
+        self._ended = np.zeros(self.num_envs, np.bool_)  # whose episodes have ended and not begun anew
         self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.single_observation_space = observation_space(self.task, self.params)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -102,81 +187,89 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"unknown reset options {sorted(options)}; known: 'reset_mask', 'state', 'constants'")
         if self.batch.state is None:
             mask = np.ones_like(mask)
-        tensor_mask = torch.from_numpy(mask).to(self.batch.device)
+        batch_mask: Any = self._to_batch(mask)
         with torch.no_grad():
-            state = self.batch.initial_state(seed, tensor_mask)
+            state = self.batch.initial_state(seed, batch_mask)
             if constants is not None:
-                c = self._constants(constants, state, mask)
-                state = self.batch.initial_state(seed, tensor_mask, c=c)
+                c: Any = self._constants(constants, state, mask)
+                state = self.batch.initial_state(seed, batch_mask, c=c)
             if x is not None:
                 state = self._with_x(state, x, mask)
             self.batch.state = state
             observation = self.batch.observe(state)
+            tilt: Any = (
+                dynamics.tilt(tuple(state.x)) if isinstance(self.batch, BallbotLoop) else tilt_of(state.x.unbind(0))
+            )
+        self._ended = self._ended & ~mask
         size = self.num_envs
         infos = self._info(
-            state,
+            *self._x_and_c(),
             np.zeros(size),
             np.zeros((3, size)),
-            self._array(tilt_of(state.x.unbind(0))),
-            np.zeros((size, 2)),
+            self._array(tilt).astype(self._dtype, copy=False),
+            np.zeros((size, 2), self._dtype),
             np.zeros(size, bool),
             np.full(size, -1),
             np.zeros(size, bool),
+            mask,
         )
-        return self._array(observation, np.float32), _masked(infos, mask)
+        return self._array(observation, np.float32), infos
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Holds forces for one control step, and restarts episodes that end.
+        """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
 
         Args:
             actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1].
 
         Raises:
             ValueError: actions that are not finite or not of shape (B, 2).
-            gymnasium.error.ResetNeeded: before `reset`.
+            gymnasium.error.ResetNeeded: before `reset`, or in mode "Disabled" while an episode has ended.
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
-        before = self.batch.state
-        if before is None:
-            raise gymnasium.error.ResetNeeded("step() before reset()")
         actions = np.asarray(actions, self._dtype, order="F")  # components contiguous, as everything in the batch
         if actions.shape != (self.num_envs, 2):
             raise ValueError(f"actions must have shape ({self.num_envs}, 2), not {actions.shape}")
         if not np.isfinite(actions).all():
             bad = np.flatnonzero(~np.isfinite(actions).all(1))
             raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
-        with torch.no_grad():
-            result = self.batch.step(torch.from_numpy(actions).to(self.batch.device))
-        reward = self._array(result.reward, np.float64)
-        terminated, truncated = self._array(result.terminated), self._array(result.truncated)
+        waiting = self._ended if self._ended.any() else None
+        if waiting is not None and self.autoreset_mode is AutoresetMode.DISABLED:
+            raise gymnasium.error.ResetNeeded(
+                f"the episodes of envs {np.flatnonzero(waiting)[:8].tolist()} have ended; reset them with "
+                'options={"reset_mask": mask}'
+            )
+        restart = self.autoreset_mode is AutoresetMode.SAME_STEP
+        constants = self._x_and_c()[1] if restart else None
+        result = self._advance(actions, waiting, restart)
+        reward, cost, terminated, truncated = result.reward, result.cost, result.terminated, result.truncated
+        success, violated, force, clipped = result.success, result.violated, result.force.T, result.clipped
         done = terminated | truncated
-        ended = np.flatnonzero(done)
-        cost, tilt = self._array(result.cost, np.float64), self._array(result.tilt)
-        parts = np.stack([np.full(self.num_envs, self._survive), -cost, np.zeros(self.num_envs)])
-        force, clipped = self._array(result.force), self._array(result.clipped)
+        ended = done.nonzero()[0]
+        parts = np.zeros((3, self.num_envs))
+        parts[0], parts[1] = self._survive, -cost
         infos: dict[str, Any] = {}
+        if waiting is not None:
+            parts[:, waiting] = 0.0
         if ended.size:
-            success, violated = self._array(result.success), self._array(result.violated)
             failed = np.flatnonzero(violated >= 0)
             parts[1, failed] = reward[failed] - self._survive  # the cost has a failure's price too
             if self.task.first_exit:
                 parts[2, ended] = (reward - parts[0] - parts[1])[ended] * success[ended]
-            final = before._replace(x=result.final_x)
-            final_tilt = self._array(result.final_tilt)
-            final_info = self._info(final, cost, parts, final_tilt, force.T, success, violated, clipped)
-            infos["final_info"] = _masked(final_info, done)
-            infos["final_obs"] = _some_rows(self._array(result.final_observation, np.float32), ended)
+        if constants is None:
+            self._ended = done
+        elif ended.size:
+            end = (cost, parts, result.final_tilt, force, success, violated, clipped)
+            infos["final_info"] = self._info(result.final_x, constants, *end, done)
+            infos["final_obs"] = _some_rows(result.final_observation, ended)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
             cost, parts, force, clipped = cost.copy(), parts.copy(), force.copy(), clipped.copy()
-            cost[ended], parts[:, ended], force[:, ended], clipped[ended] = 0.0, 0.0, 0.0, False
-        running = np.full(self.num_envs, -1)
-        state = self.batch.state
-        assert state is not None
-        info = self._info(state, cost, parts, tilt, force.T, np.zeros_like(done), running, clipped)
-        infos |= _masked(info, np.ones_like(done))
-        return self._array(result.observation, np.float32), reward, terminated, truncated, infos
+            cost[ended], parts[:, ended], force[ended], clipped[ended] = 0.0, 0.0, 0.0, False
+            success, violated = success & ~done, np.where(done, -1, violated)
+        everywhere = np.ones(self.num_envs, np.bool_)
+        infos |= self._info(*self._x_and_c(), cost, parts, result.tilt, force, success, violated, clipped, everywhere)
+        return result.observation, reward, terminated, truncated, infos
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every env: of this object, or "episode_params", the robot of the running episode."""
@@ -219,10 +312,37 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if self._scene is None:
             self._scene = Scene(self.params)
         images = []
-        for x, c in zip(self.batch.state.x.T.tolist(), self.batch.state.c.T.cpu().double().numpy(), strict=True):
+        for x, c in zip(self.batch.state.x.T.tolist(), np.array(self.batch.state.c.T.tolist()), strict=True):
             self._scene.set_markers(self.task.markers(c))
             images.append(self._scene.draw(tuple(x)))
         return tuple(images)
+
+    def get_state(self) -> VectorState:
+        """The state of all envs in their episodes, from which `set_state` goes on bit-identically.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before `reset`.
+        """
+        self._check_open()
+        if self.batch.state is None:
+            raise gymnasium.error.ResetNeeded("get_state() before reset()")
+        return VectorState(self.task, self.batch.state, self._ended)
+
+    def set_state(self, state: VectorState) -> None:
+        """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
+
+        Raises:
+            ValueError: the state is of another task or of another number of envs.
+        """
+        self._check_open()
+        if state.task != self.task or len(state.ended) != self.num_envs:
+            raise ValueError(
+                f"the state is of {len(state.ended)} envs of {state.task}; this one has {self.num_envs} of {self.task}"
+            )
+        self.batch.state, self._ended = state.batch, state.ended
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_scene": None}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Releases the renderer."""
@@ -230,22 +350,41 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             self._scene.close()
             self._scene = None
 
-    @property
-    def _dtype(self) -> type[np.floating]:
-        return np.float32 if self.batch.dtype == torch.float32 else np.float64
-
     def _check_open(self) -> None:
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("this environment was closed; make a new one")
 
+    def _to_batch(self, array: np.ndarray) -> Any:
+        """The array as the batch takes it."""
+        return array if isinstance(self.batch, BallbotLoop) else torch.from_numpy(array).to(self.batch.device)
+
+    def _advance(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> Any:
+        """`_advance` of the batch, with NumPy arrays in and out."""
+        if isinstance(self.batch, BallbotLoop):
+            return self.batch.step(actions, waiting, restart)
+        with torch.no_grad():
+            result = _advance(self.batch, self._to_batch(actions), waiting, restart)
+        arrays = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
+        return result._replace(**arrays)
+
+    def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
+        """(8, B) states and (nc, B) constants."""
+        if isinstance(self.batch, BallbotLoop):
+            return self.batch.x_and_c()
+        state = self.batch.state
+        if state is None:
+            raise gymnasium.error.ResetNeeded("step() before reset()")
+        return self._array(state.x), self._array(state.c)
+
     @staticmethod
-    def _array(tensor: torch.Tensor, dtype: Any = None) -> np.ndarray:
-        array = tensor.cpu().numpy()
+    def _array(part: Any, dtype: Any = None) -> np.ndarray:
+        array = part if isinstance(part, np.ndarray) else part.cpu().numpy()
         return array if dtype is None else array.astype(dtype, copy=False)
 
     def _info(
         self,
-        state: BatchState,
+        x: np.ndarray,
+        c: np.ndarray,
         cost: np.ndarray,
         reward_parts: np.ndarray,
         tilt: np.ndarray,
@@ -253,48 +392,125 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         success: np.ndarray,
         violated: np.ndarray,
         clipped: np.ndarray,
+        mask: np.ndarray,
     ) -> dict[str, Any]:
-        """An info with the keys of `BallbotEnv`'s, in the same order. Arrays that share the batch's memory are read-only."""
-        x, c = self._array(state.x.T), self._array(state.c.T)
-        x.flags.writeable = c.flags.writeable = False
-        return {
-            "state": x,
-            "cost": cost,
-            **dict(zip(REWARD_PARTS, reward_parts, strict=True)),
-            "tilt": tilt,
-            "success": success,
-            "failure": violated >= 0,
-            "violated": self._limit_names[violated + 1],
-            "force": force,
-            "clipped": clipped,
-            "constants": c,
-        }
+        """An info with the keys of `BallbotEnv`'s, in the same order, each with Gymnasium's mask (B,) of valid entries.
 
-    def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> torch.Tensor:
+        Arrays that share the batch's memory are read-only.
+        """
+        x, c = x.T, c.T
+        x.flags.writeable = c.flags.writeable = False
+        failure, names = violated >= 0, self._limit_names[violated + 1]
+        survive, running, goal = reward_parts
+        values = (x, cost, survive, running, goal, tilt, success, failure, names, force, clipped, c)
+        infos = {}
+        for (name, mask_name), value in zip(_INFO_KEYS, values, strict=True):
+            infos[name], infos[mask_name] = value, mask
+        return infos
+
+    def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
         """(nc, B) constants: those given, and drawn ones for the rest."""
         names, task = self.task.constant_names, self.task
         c = self._array(drawn.c).astype(np.float64)
         if isinstance(constants, dict):
-            unknown = sorted(set(constants) - set(names))
-            if unknown:
-                raise ValueError(f"{task.id} has no constants {unknown}; it has {list(names)}")
+            check_constant_names(task, constants)
             for name, value in constants.items():
                 c[names.index(name)] = _finite(value, (self.num_envs,), f"constant {name!r}")
         else:
             c[:] = _finite(constants, (self.num_envs, len(names)), "constants").T
         for distinct in np.unique(c[:, mask], axis=1).T:
             task.check_constants(distinct, self.params)
-        return torch.as_tensor(c.astype(self._dtype), device=self.batch.device)
+        return self._to_batch(c.astype(self._array(drawn.c).dtype))
 
     def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
         """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
-        x = torch.as_tensor(_finite(given, (self.num_envs, 8), "state").T.astype(self._dtype, order="C"))
-        x = torch.where(torch.from_numpy(mask), x, state.x.cpu()).to(self.batch.device)
-        safe = self._array(all_of(m >= 0 for m in self.task.limits(x.unbind(0), state.c.unbind(0))))
+        drawn, c = self._array(state.x), self._array(state.c)
+        x = np.where(mask, _finite(given, (self.num_envs, 8), "state").T, drawn).astype(drawn.dtype, order="C")
+        safe = np.all([limit >= 0 for limit in self.task.limits(tuple(x), tuple(c))], axis=0)
         if not safe[mask].all():
             bad = np.flatnonzero(mask & ~safe)
             raise ValueError(f"start states of envs {bad[:8].tolist()} violate a limit of {self.task.id}")
-        return state._replace(x=x)
+        return state._replace(x=self._to_batch(x))
+
+
+def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None, restart: bool) -> BatchStep:
+    """One control step of a batch.
+
+    Args:
+        batch: which goes on.
+        actions: (B, 2).
+        waiting: (B,) bool, the envs that ignore their action and begin their next episode; None where there are none.
+        restart: whether episodes that end are followed by the next ones at once. Else the batch stays at their ends, and
+            `observation` and `tilt` are those of the end.
+    """
+    if batch.state is None:
+        raise gymnasium.error.ResetNeeded("step() before reset()")
+    wait = None if waiting is None else torch.from_numpy(waiting).to(batch.device)
+    if wait is not None:
+        batch.state = batch.initial_state(None, wait)
+    before = batch.state
+    result = batch.step(actions)
+    after = batch.state
+    if restart or after is None:
+        return result
+    ended = result.terminated | result.truncated
+    if wait is not None:
+        ended = ended & ~wait
+        no = ~wait
+        result = result._replace(
+            reward=result.reward * no,
+            cost=result.cost * no,
+            terminated=result.terminated & no,
+            truncated=result.truncated & no,
+            success=result.success & no,
+            failure=result.failure & no,
+            violated=torch.where(wait, -1, result.violated),
+            force=result.force * no,
+            clipped=result.clipped & no,
+        )
+    held = ended if wait is None else ended | wait
+    if not held.any():
+        return result
+    x = torch.where(ended, result.final_x, before.x)
+    old = before._replace(x=x, steps=before.steps + ended)
+    batch.state = BatchState(*(torch.where(held, a, b) for a, b in zip(old, after, strict=True)))
+    observation = torch.where(ended[:, None], result.final_observation, result.observation)
+    if wait is not None:
+        observation = torch.where(wait[:, None], batch.observe(batch.state), observation)
+    return result._replace(observation=observation, tilt=tilt_of(batch.state.x.unbind(0)))
+
+
+def _task(task: str | Task, max_episode_steps: int | None, fields: dict[str, Any]) -> Task:
+    """The task, with episodes of at most so many control steps."""
+    made = make_task(task, **fields)
+    if max_episode_steps is None:
+        return made
+    if isinstance(max_episode_steps, bool) or not isinstance(max_episode_steps, int) or max_episode_steps < 1:
+        raise ValueError(f"max_episode_steps must be a positive whole number, not {max_episode_steps!r}")
+    if "duration" in fields:
+        raise ValueError("give duration or max_episode_steps, not both")
+    return dataclasses.replace(made, duration=max_episode_steps * made.control_dt)
+
+
+def _check_physics(physics: str, task: Task, num_envs: int) -> None:
+    """Raises a ValueError that says how to get other physics than the closed form."""
+    if physics == "bullet":
+        raise ValueError(
+            'these vector environments run physics="rk4"; for PyBullet: '
+            f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics="bullet"), or "async"'
+        )
+    if physics != "rk4":
+        raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
+
+
+def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    """The mode of that value or name."""
+    for known in AutoresetMode:
+        if mode in (known, known.value, known.name):
+            return known
+    raise ValueError(
+        f"unknown autoreset_mode {mode!r}; known: {', '.join(repr(known.value) for known in AutoresetMode)}"
+    )
 
 
 def _reset_mask(mask: Any, num_envs: int) -> np.ndarray:
@@ -319,11 +535,6 @@ def _finite(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError(f"{what} must be finite numbers that broadcast to {shape}, not {value!r}")
     return array
-
-
-def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """An info with Gymnasium's masks, which mark the envs whose entries are valid."""
-    return {key: part for name, value in info.items() for key, part in ((name, value), (f"_{name}", mask))}
 
 
 def _some_rows(array: np.ndarray, rows: np.ndarray) -> np.ndarray:

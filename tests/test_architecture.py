@@ -3,10 +3,10 @@ import importlib.metadata
 import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
+import tomllib
 
 import ballbot_gym
 from ballbot_gym.params import URDF_PATH

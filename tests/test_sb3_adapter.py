@@ -30,7 +30,7 @@ def test_only_a_ballbot_vector_env_is_taken():
 
 
 def test_terminal_observation_is_the_last_of_the_old_episode_and_the_returned_one_the_first_of_the_next():
-    env, same = make(duration=0.1), BallbotVectorEnv(4, duration=0.1)
+    env, same = make(duration=0.1, engine="torch"), BallbotVectorEnv(4, duration=0.1, engine="torch")
     env.seed(3)
     first = env.reset()
     np.testing.assert_array_equal(first, same.reset(seed=3)[0])
@@ -88,8 +88,42 @@ def test_attributes_are_given_per_env():
         env.set_attr("task", None)
 
 
+def test_ends_of_episodes_report_what_a_vec_monitor_reports():
+    env = make(6, duration=0.2)
+    with pytest.warns(UserWarning, match="Monitor"):
+        both = VecMonitor(make(6, duration=0.2))
+    env.seed(1), both.seed(1)
+    env.reset(), both.reset()
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(25):
+        actions = rng.uniform(-1, 1, (6, 2))
+        ours, theirs = env.step(actions)[3], both.step(actions)[3]
+        for a, b in zip(ours, theirs, strict=True):
+            assert ("episode" in a) == ("episode" in b)
+            if "episode" in a:
+                ends += 1
+                assert a["episode"]["l"] == b["episode"]["l"] <= 10
+                assert a["episode"]["r"] == pytest.approx(b["episode"]["r"], rel=1e-5)
+                assert a["episode"]["t"] >= 0
+    assert ends >= 12
+
+
+def test_episodes_are_as_long_as_max_episode_steps_says():
+    env = BallbotVecEnv(gymnasium.make_vec("BallbotStabilize-v0", num_envs=2, max_episode_steps=7))
+    env.set_options({"state": np.zeros(8)})
+    env.reset()
+    ends = [env.step(np.zeros((2, 2))) for _ in range(7)]
+    assert [done.tolist() for _, _, done, _ in ends] == [[False] * 2] * 6 + [[True] * 2]
+    assert [info["TimeLimit.truncated"] for info in ends[-1][3]] == [True] * 2
+
+
+def test_only_same_step_autoreset_is_taken():
+    with pytest.raises(ValueError, match='autoreset_mode="SameStep"'):
+        make(2, autoreset_mode="NextStep")
+
+
 def test_ppo_learns_on_it_and_logs_episodes():
-    env = VecMonitor(make(16, duration=0.4))
+    env = make(16, duration=0.4)
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=256, n_epochs=2, seed=0, device="cpu")
     before = [p.detach().clone() for p in model.policy.parameters()]
     model.learn(3000)

@@ -140,7 +140,7 @@ def test_physics_step_must_be_a_whole_fraction_of_the_control_step(params, physi
 def test_missing_pybullet_names_the_remedy(monkeypatch, make_env):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(ImportError, match=r'pip install pybullet.*physics="rk4"'):
-        make_env()
+        make_env(physics="bullet")
 
 
 def test_rk4_needs_no_pybullet(monkeypatch, make_env):

@@ -7,8 +7,11 @@ import difflib
 import sys
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
+try:
+    from rich.console import Console
+    from rich.table import Table
+except ImportError as error:
+    sys.exit(f'ballbot: {error}; pip install "ballbot-gym[train]" installs what the commands need')
 
 from ballbot_train.commands import COMMANDS, help_of
 

@@ -1,10 +1,13 @@
 """Stable-Baselines3 on the batched environments: it takes its own `VecEnv` and not Gymnasium's vector envs."""
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ballbot_gym.vector import BallbotVectorEnv
@@ -20,9 +23,10 @@ class BallbotVecEnv(VecEnv):
     | terminal_observation | (no,) last observation of the episode |
     | TimeLimit.truncated | the episode ran out of time, so learners bootstrap from the value of that observation |
     | is_success | the task's goal held at the end; logged as `rollout/success_rate` |
-    | failure | a margin was violated |
+    | failure | a limit was violated |
+    | episode | the return r, the length l in control steps and the seconds t since this object was made, as of `Monitor` |
 
-    Wrap it in `VecMonitor` to log episodes' returns and lengths.
+    A `VecMonitor` is not needed. `gymnasium.make_vec(..., max_episode_steps=100)` limits episodes.
     """
 
     def __init__(self, env: BallbotVectorEnv):
@@ -30,10 +34,18 @@ class BallbotVecEnv(VecEnv):
 
         Raises:
             TypeError: env is something else; `.unwrapped` of what `gymnasium.make_vec` returns is right.
+            ValueError: its autoreset mode is not the one that Stable-Baselines3 knows, SAME_STEP.
         """
         if not isinstance(env, BallbotVectorEnv):
             raise TypeError(f"BallbotVecEnv needs a BallbotVectorEnv, not {type(env).__name__}")
+        if env.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(
+                'Stable-Baselines3 needs autoreset_mode="SameStep", the default of make_vec, not '
+                f'"{env.autoreset_mode.value}"'
+            )
         self.env = env
+        self._returns, self._lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, np.int64)
+        self._made = time.time()
         self._actions: np.ndarray | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -44,6 +56,7 @@ class BallbotVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._returns[:], self._lengths[:] = 0.0, 0
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -53,6 +66,9 @@ class BallbotVecEnv(VecEnv):
         assert self._actions is not None, "step_async comes before step_wait"
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
+        self._returns += reward
+        self._lengths += 1
+        elapsed = round(time.time() - self._made, 6)
         listed: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done).tolist():
             listed[i] = {
@@ -60,7 +76,9 @@ class BallbotVecEnv(VecEnv):
                 "TimeLimit.truncated": bool(truncated[i]),
                 "is_success": bool(infos["final_info"]["success"][i]),
                 "failure": bool(infos["final_info"]["failure"][i]),
+                "episode": {"r": round(float(self._returns[i]), 6), "l": int(self._lengths[i]), "t": elapsed},
             }
+        self._returns[done], self._lengths[done] = 0.0, 0
         return observation, reward.astype(np.float32), done, listed
 
     def close(self) -> None:
@@ -81,7 +99,8 @@ class BallbotVecEnv(VecEnv):
         return [values[i] for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
-        return [False for _ in self._get_indices(indices)]
+        # Tools ask for Monitor to know whether episodes' statistics are in the infos.
+        return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
 
 def _merged(options: list[dict[str, Any]]) -> dict[str, Any] | None:

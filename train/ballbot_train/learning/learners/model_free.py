@@ -171,7 +171,8 @@ class TrainingEnv(VecEnvWrapper):
 
     def __init__(self, task: Task, params: BallbotParams, num_envs: int, episode_seconds: float, reward_scale: float):
         """Args: episode_seconds: duration of an episode, s; reward_scale: factor of every reward."""
-        self._vector = BallbotVectorEnv(num_envs, replace(task, duration=episode_seconds), params=params, compile=False)
+        task = replace(task, duration=episode_seconds)
+        self._vector = BallbotVectorEnv(num_envs, task, params=params, compile=False, engine="torch")
         self._scale = np.float32(reward_scale)
         super().__init__(BallbotVecEnv(self._vector))
 

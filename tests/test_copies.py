@@ -1,0 +1,164 @@
+"""Copies, pickles and saved states of environments go on bit-identically and independently."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+
+from ballbot_gym import BallbotEnv, Randomization
+from ballbot_gym.env import EnvState
+
+cloudpickle = pytest.importorskip("cloudpickle")
+
+ALL = Randomization(
+    body_mass=(0.8, 1.2),
+    com_height=(0.9, 1.1),
+    inertia=(0.8, 1.2),
+    actuator_lag=(0.0, 0.05),
+    actuator_delay=(0.0, 0.06),
+    position_noise=0.01,
+    push_impulse=(0.0, 3.0),
+)
+ONE_HEIGHT = Randomization(body_mass=(0.8, 1.2), com_height=(1.1, 1.1))  # the URDF is loaded once, then masses change
+COPIES = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+    "cloudpickle": lambda env: cloudpickle.loads(cloudpickle.dumps(env)),
+}
+
+
+def trace(env, steps=200):
+    """Everything that many steps return, over the ends of episodes."""
+    rng, seen = np.random.default_rng(9), []
+    for _ in range(steps):
+        observation, reward, terminated, truncated, info = env.step(rng.uniform(-0.2, 0.2, 2))
+        seen.append(
+            (observation.tobytes(), reward, terminated, truncated, info["state"].tobytes(), info["force"].tobytes())
+        )
+        if terminated or truncated:
+            observation, info = env.reset()
+            seen.append((observation.tobytes(), info["state"].tobytes()))
+    return seen
+
+
+@pytest.mark.parametrize("randomization", [None, ALL, ONE_HEIGHT], ids=["nominal", "randomized", "one height"])
+def test_copies_go_on_bit_identically_from_the_middle_of_an_episode(task, physics, randomization):
+    env = gymnasium.make(task.id, physics=physics, randomization=randomization)
+    env.reset(seed=3)
+    env.reset()
+    for _ in range(10):
+        env.step([0.05, -0.02])
+    copies = [make(env) for make in COPIES.values()]
+    state = env.unwrapped.get_state()
+    expected = trace(env)
+    for other in copies:
+        assert trace(other) == expected
+        other.close()
+    env.unwrapped.set_state(state)
+    assert trace(env) == expected
+    env.close()
+
+
+@pytest.mark.parametrize("make", COPIES.values(), ids=COPIES)
+def test_env_and_copy_do_not_disturb_each_other(physics, make):
+    env, alone = BallbotEnv(physics=physics), BallbotEnv(physics=physics)
+    for each in (env, alone):
+        each.reset(options={"state": np.zeros(8)})
+    other = make(env)
+    for _ in range(20):
+        other.step([0.03, -0.03])
+        assert env.step([0.01, 0.0])[0].tobytes() == alone.step([0.01, 0.0])[0].tobytes()
+    other.close()
+    env.step([0.0, 0.0])
+    env.close()
+    alone.close()
+
+
+@pytest.mark.parametrize("make", COPIES.values(), ids=COPIES)
+def test_copy_of_a_closed_env_is_closed_and_of_one_never_reset_draws_the_same_episodes(physics, make):
+    env = BallbotEnv(physics=physics)
+    other = make(env)  # never seeded either
+    np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
+    env.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+        make(env).step([0.0, 0.0])
+    other.close()
+
+
+def test_copy_of_an_ended_env_wants_a_reset(physics):
+    env = BallbotEnv(physics=physics, duration=0.04)
+    env.reset(options={"state": np.zeros(8)})
+    env.step([0, 0]), env.step([0, 0])
+    with pytest.raises(gymnasium.error.ResetNeeded, match="has ended"):
+        copy.deepcopy(env).step([0, 0])
+
+
+def test_gymnasiums_own_pickling_test_passes(task, physics):
+    env = gymnasium.make(task.id, physics=physics)
+    other = pickle.loads(pickle.dumps(env))
+    assert data_equivalence(env.reset(), other.reset())
+    action = env.action_space.sample()
+    assert data_equivalence(env.step(action), other.step(action))
+    env.close()
+    other.close()
+
+
+def test_drawing_is_not_copied_and_starts_again_in_the_copy():
+    env = BallbotEnv("weave", physics="rk4", render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    other = copy.deepcopy(env)
+    env.close()
+    np.testing.assert_array_equal(other.render(), frame)
+    other.close()
+
+
+def test_state_goes_to_another_env_made_alike(task, physics):
+    first, second = (BallbotEnv(task, physics=physics, randomization=ALL) for _ in range(2))
+    first.reset(seed=1)
+    first.step([0.1, 0.1])
+    second.set_state(pickle.loads(pickle.dumps(first.get_state())))
+    assert trace(first, 60) == trace(second, 60)
+
+
+def test_bad_states_are_refused():
+    env = BallbotEnv(physics="rk4")
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"get_state\(\) before reset"):
+        env.get_state()
+    env.reset(seed=0)
+    state = env.get_state()
+    assert isinstance(state, EnvState)
+    with pytest.raises(ValueError, match="the state is of Stabilize"):
+        BallbotEnv("turn", physics="rk4").set_state(state)
+    with pytest.raises(ValueError, match="other randomization"):
+        BallbotEnv(physics="rk4", randomization=ALL).set_state(state)
+    with pytest.raises(TypeError, match="takes what get_state"):
+        env.set_state(np.zeros(8))
+
+
+@pytest.mark.parametrize("engine", ["loop", "torch"])
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_vector_envs_copy_pickle_and_go_back(task, engine, mode):
+    pytest.importorskip("torch")
+    settings = {"engine": engine, "compile": False, "randomization": ALL, "duration": 0.3, "autoreset_mode": mode}
+    envs = gymnasium.make_vec(task.id, num_envs=3, **settings)
+
+    def run(envs):
+        rng, seen = np.random.default_rng(2), []
+        for _ in range(40):
+            observation, reward, *_, info = envs.step(rng.uniform(-1, 1, (3, 2)))
+            seen.append((observation.tobytes(), reward.tobytes(), info["state"].tobytes()))
+        return seen
+
+    envs.reset(seed=0)
+    run(envs)
+    copies = [copy.deepcopy(envs), pickle.loads(pickle.dumps(envs))]
+    state = envs.get_state()
+    expected = run(envs)
+    for other in copies:
+        assert run(other) == expected
+    envs.set_state(state)
+    assert run(envs) == expected
