@@ -28,6 +28,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning import schedules
 from ballbot_train.learning.learners.model_free import ScopedRng
+from ballbot_train.learning.rsl import RslVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 _GROUPS = {"actor": ["policy"], "critic": ["policy"]}
@@ -175,13 +176,10 @@ class RslPpo:
         self._random = ScopedRng()
         with self._random:
             shorter = replace(task, duration=config.episode_seconds)
-            self._batch = BallbotBatch(shorter, config.num_envs, compile=False, params=params)
-            self._observation = self._batch.reset(seed=seed)
-            assert self._batch.state is not None
-            steps = torch.randint(shorter.steps, (config.num_envs,))
-            self._batch.state = self._batch.state._replace(steps=steps)
+            self._env = RslVecEnv(BallbotBatch(shorter, config.num_envs, compile=False, params=params), seed)
+            self._env.episode_length_buf = torch.randint(shorter.steps, (config.num_envs,))
+            self._seen = seen = self._env.get_observations()
             spec = spec_for(task, config)
-            seen = self._seen()
             # living for ever without cost: PPO clips how fast values change, and this is far from 0
             value = config.reward_scale * task.survival_reward * task.control_dt / (1 - config.gamma)
             self._actor = Actor(seen, PolicyNetwork(spec), config.std)
@@ -221,18 +219,15 @@ class RslPpo:
         for group in self._ppo.optimizer.param_groups:
             group["lr"] = rate
         self._actor.set_std(std)
-        ended = failed = paid = 0.0
+        ended = early = paid = 0.0
         with torch.no_grad():
             for _ in range(config.num_steps):
-                step = self._batch.step(self._ppo.act(self._seen()))
-                self._observation = step.observation
-                done = step.terminated | step.truncated
-                self._ppo.process_env_step(
-                    self._seen(), config.reward_scale * step.reward, done, {"time_outs": step.truncated.float()}
-                )
-                ended, failed = ended + float(done.sum()), failed + float(step.failure.sum())
-                paid += float(step.reward.mean())
-            self._ppo.compute_returns(self._seen())
+                self._seen, reward, ends, extras = self._env.step(self._ppo.act(self._seen))
+                self._ppo.process_env_step(self._seen, config.reward_scale * reward, ends, extras)
+                terminated = ends.bool() & ~extras["time_outs"]
+                ended, early = ended + float(ends.sum()), early + float(terminated.sum())
+                paid += float(reward.mean())
+            self._ppo.compute_returns(self._seen)
         losses = self._ppo.update()
         with torch.no_grad():
             share = max(1 - _RETAINED, 1 / (1 + self.iteration))  # the first iterations start the average
@@ -242,25 +237,21 @@ class RslPpo:
         return {
             **{f"loss/{name}": float(value) for name, value in losses.items()},
             "train/reward": paid / config.num_steps,
-            "train/failure_rate": failed / max(1.0, ended),
+            "train/early_end_rate": early / max(1.0, ended),
             "train/learning_rate": rate,
             "train/std": std,
             "train/env_steps": self.iteration * config.num_envs * config.num_steps,
         }
 
-    def _seen(self) -> TensorDict:
-        return TensorDict({"policy": self._observation}, batch_size=[len(self._observation)])
-
     def state_dict(self) -> dict[str, Any]:
-        assert self._batch.state is not None
+        assert self._env.batch.state is not None
         return {
             "iteration": self.iteration,
             "actor": self._actor.state_dict(),
             "critic": self._ppo.critic.state_dict(),
             "average": self._average.state_dict(),
             "optimizer": self._ppo.optimizer.state_dict(),
-            "batch": list(self._batch.state),
-            "observation": self._observation,
+            "batch": list(self._env.batch.state),
             "random": self._random.state_dict(),
         }
 
@@ -270,7 +261,8 @@ class RslPpo:
         self._ppo.critic.load_state_dict(state["critic"])
         self._average.load_state_dict(state["average"])
         self._ppo.optimizer.load_state_dict(state["optimizer"])
-        self._batch.state, self._observation = BatchState(*state["batch"]), state["observation"]
+        self._env.batch.state = BatchState(*state["batch"])
+        self._seen = self._env.get_observations()
         self._random.load_state_dict(state["random"])
 
 
