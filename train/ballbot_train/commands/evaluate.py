@@ -38,7 +38,7 @@ def evaluate(
     out: Path | None = None,
     workers: int = os.cpu_count() or 1,
 ) -> None:
-    """Runs a policy on 10,000 fresh episodes: failures, success and cost by ranges of what makes episodes hard, the worst ten.
+    """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
 
     Args:
         policy: a policy file, or the name of a policy that comes with the package; with --episodes also an expert.
@@ -61,6 +61,7 @@ def evaluate(
     if episodes > certified.EPISODES:
         raise ValueError(f"episodes must be at most {certified.EPISODES}, the certified ones, not {episodes}")
     fresh = (0 if episodes else _FRESH) if fresh is None else fresh
+    check_least(0, fresh=fresh)
     if optima > fresh:
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
     if not fresh and not episodes:

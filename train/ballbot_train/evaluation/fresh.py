@@ -205,7 +205,7 @@ class FreshResult:
 def _spread(values: np.ndarray) -> tuple[float, float, float, float]:
     """Mean, median, 99th percentile and largest; NaN where there is no value."""
     if not len(values):
-        return (math.nan,) * 4
+        return math.nan, math.nan, math.nan, math.nan
     return float(values.mean()), float(np.median(values)), float(np.percentile(values, 99)), float(values.max())
 
 
@@ -264,8 +264,8 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
         name, shipped = str(policy), shipped_policies(task)
         if name in CONTROLLERS:
             raise ValueError(
-                f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a policy, "
-                "or run the expert on certified episodes (--episodes)"
+                f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
+                "policy, or run the expert on certified episodes with evaluate"
             )
         if name not in shipped and not is_file(name):
             raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")

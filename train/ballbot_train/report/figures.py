@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ballbot_train.evaluation.fresh import Bin, FreshResult  # it imports torch
 
 _MAP_CELLS = 20  # along each axis of a map
+_CELL_EPISODES = 5  # in a cell, at least; the share of fewer is chance
 
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 
@@ -200,8 +201,8 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
 def fresh_figure(result: "FreshResult", bins: "Sequence[Bin]") -> Figure:
     """Fresh episodes by every quantity that makes them hard: episodes without success, mean cost, and maps of two quantities.
 
-    Bars have 95 % Wilson intervals. A map shows the share of episodes without success by one quantity and the next; white
-    cells hold no episode.
+    Bars have 95 % Wilson intervals. A map shows the share of episodes without success by one quantity and the next, where a
+    cell holds at least 5 episodes; others are white.
     """
     names = list(result.measures)
     lines = 3 if len(names) > 1 else 2
@@ -244,8 +245,8 @@ def _plot_map(figure: Figure, axis: Axes, result: "FreshResult", name: str, othe
     shape = [min(_MAP_CELLS, max(4, len(result) // 100))] * 2
     count, *edges = np.histogram2d(x, y, shape)
     missed, *_ = np.histogram2d(x, y, edges, weights=(~result.success).astype(float))
-    share = np.divide(100 * missed, count, out=np.full_like(count, np.nan), where=count > 0)
-    mesh = axis.pcolormesh(*edges, share.T, cmap="YlOrRd", vmin=0, vmax=max(1.0, float(np.nanmax(share))))
+    share = np.divide(100 * missed, count, out=np.full_like(count, np.nan), where=count >= _CELL_EPISODES)
+    mesh = axis.pcolormesh(*edges, share.T, cmap="YlOrRd", vmin=0, vmax=np.nanmax(share, initial=1.0))
     figure.colorbar(mesh, ax=axis, label="without success, %")
     axis.set_xlabel(name, fontsize=9)
     axis.set_ylabel(other, fontsize=9)
