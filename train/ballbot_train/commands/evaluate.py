@@ -1,6 +1,7 @@
 """`ballbot evaluate POLICY`: one policy on thousands of fresh episodes, or anything that acts on the certified ones."""
 
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -131,13 +132,15 @@ def _worst(result: Any, policy: str, task: str, folder: Path) -> list[dict[str, 
     """The worst episodes, each with its trajectory in a file that `ballbot replay` draws."""
     env = BallbotEnv(task, physics="rk4")
     controller = make_controller(policy, env.task, env.params)
+    for stale in folder.glob("episode-*.npz"):  # of an earlier evaluation
+        stale.unlink()
     worst = []
     for i in result.worst(_WORST):
         run = rollout(env, controller, options={"state": result.states[i], "constants": result.constants[i]})
         path = run.trajectory.save(folder / f"episode-{i}.npz")
         constants = dict(zip(env.task.constant_names, result.constants[i].tolist(), strict=True))
         start = {"start": result.states[i].tolist(), "constants": constants}
-        worst.append(result.episode(i) | start | {"replay": f"ballbot replay {path}"})
+        worst.append(result.episode(i) | start | {"replay": shlex.join(["ballbot", "replay", str(path)])})
     env.close()
     return worst
 
