@@ -109,6 +109,8 @@ class BatchEpisodes(NamedTuple):
     """(B,) bool: the episode ended in the goal."""
     failure: torch.Tensor
     """(B,) bool: the episode ended at a violated limit."""
+    violated: torch.Tensor
+    """(B,) int64 index in `task.limit_names` of the limit at which the episode ended, else −1."""
     terminated: torch.Tensor
     """(B,) bool: the episode ended by success or failure, not because its time was over."""
     steps: torch.Tensor
@@ -425,6 +427,7 @@ def run_episodes(
     success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
     cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)
     steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=batch.device)
+    violated = torch.full_like(steps, -1)
     states: list[torch.Tensor] = []
     for _ in range(batch.task.steps):
         result = batch.step(policy(observation))
@@ -433,11 +436,13 @@ def run_episodes(
         steps += running
         success |= running & result.success
         failure |= running & result.failure
+        violated = torch.where(running & result.failure, result.violated, violated)
         terminated |= running & result.terminated
         running &= ~(result.terminated | result.truncated)
         if record:
             states.append(result.final_x)
-    return BatchEpisodes(cost, success, failure, terminated, steps, torch.stack(states) if record else None)
+    recorded = torch.stack(states) if record else None
+    return BatchEpisodes(cost, success, failure, violated, terminated, steps, recorded)
 
 
 def _has_compiler(device: torch.device) -> bool:

@@ -1,6 +1,7 @@
 """Training runs: they learn, are written as promised, and go on after an interruption as if there had been none."""
 
 import ast
+import csv
 import importlib
 import inspect
 import itertools
@@ -189,6 +190,54 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
         (tmp_path / "checkpoint.pt").write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint\.pt is damaged"):
             training.train(shac.Shac(task, params, config), task, about, tmp_path, resume=True)
+
+
+@pytest.fixture
+def short_run(tmp_path, monkeypatch):
+    """Trains for two iterations, each followed by an evaluation, without the measurement in PyBullet."""
+    task, params = TASKS["stabilize"](), default_params()
+    config = shac.ShacConfig(total_iterations=2, evaluations=2, num_envs=2, horizon=2, hidden=(4,), compile=False)
+    monkeypatch.setattr(training._Run, "measure", lambda run: None)
+
+    def start(resume=False):
+        learner = shac.Shac(task, params, config)
+        training.train(learner, task, {"learner": "shac", "task": "stabilize"}, tmp_path, resume)
+        return learner
+
+    return start
+
+
+def evaluations(folder):
+    with (folder / "evaluations.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_test_it(
+    short_run, tmp_path, monkeypatch
+):
+    costs = iter((30.0, 20.0, 25.0))
+    monkeypatch.setattr(training, "validate", lambda *policy: training.Validation(next(costs), 1.0, 0))
+    ratios = iter((1.5, 1.4, 1.1))
+    monkeypatch.setattr(training, "score", lambda *policy: training.Score(next(ratios), 0.1, 0.1, 1.0, 0))
+    short_run()
+    rows = evaluations(tmp_path)
+    assert [float(row["validation_cost"]) for row in rows] == [30.0, 20.0, 25.0]
+    assert [float(row["cost_ratio"]) for row in rows] == [1.5, 1.4, 1.1]
+    described = json.loads((tmp_path / "policy.json").read_text())
+    assert described["iteration"] == 1
+    assert described["chosen_by"]["cost"] == 20.0
+
+
+def test_a_checkpoint_of_an_earlier_version_goes_on(short_run, tmp_path):
+    short_run()
+    path = tmp_path / "checkpoint.pt"
+    state = torch.load(path, weights_only=True)
+    validated = state.pop("best_validation")
+    state["rows"] = [{key: row[key] for key in row if not key.startswith("validation")} for row in state["rows"]]
+    torch.save(state | {"best": 1.3}, path)  # of the certified episodes, as it used to be
+    short_run(resume=True)
+    assert torch.load(path, weights_only=True)["best_validation"] == validated
+    assert {row["validation_cost"] for row in evaluations(tmp_path)} == {"nan"}
 
 
 def parsed(command):

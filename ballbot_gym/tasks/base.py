@@ -137,6 +137,14 @@ class Task(ABC):
         x = self.draw_state(tuple(rng.random(self.state_draws).tolist()), c, params)
         return np.array(x, np.float64), np.array(c, np.float64)
 
+    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+        """What makes an episode easy or hard, by name and unit, of its initial state (8,) and constants (nc,).
+
+        Evaluation bins its results by each of these. The default is the constants; a task overrides it where derived
+        quantities say more.
+        """
+        return dict(zip(self.constant_names, map(float, c), strict=True))
+
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         """Raises a ValueError that names the constant that makes no sense."""
 

@@ -120,6 +120,15 @@ class Orbit(Task):
         speed = orbit_speed(params, radius, between(z[1], self.min_steady_tilt, self.max_steady_tilt))
         return radius, ops.where(z[2] < 0.5, -1.0, 1.0) * speed
 
+    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+        radius, speed = map(float, c)
+        return {
+            "radius, m": radius,
+            "steady tilt, degrees": math.degrees(orbit_tilt(params, radius, speed)),
+            "speed, m/s": abs(speed),
+            "direction, 1 is counter-clockwise": math.copysign(1.0, speed),
+        }
+
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         smallest = params.pivot_inertia / params.first_moment
         if c[0] <= smallest:

@@ -86,6 +86,20 @@ class Stabilize(Task):
         limits = (self.start_position, self.start_lean, self.start_speed, self.start_lean_rate)
         return tuple(between(z[i], -limits[i // 2], limits[i // 2]) for i in range(8))
 
+    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+        """Distance, speeds and leans of the start."""
+        px, py, gamma, theta, vx, vy, gamma_dot, theta_dot = map(float, x)
+        # across the ground, of the length sin(tilt): the direction in which the body leans
+        lean_x, lean_y = math.sin(gamma) * math.cos(theta), math.sin(theta)
+        length = math.hypot(lean_x, lean_y)
+        return {
+            "distance, m": math.hypot(px, py),
+            "speed, m/s": math.hypot(vx, vy),
+            "tilt, degrees": math.degrees(dynamics.tilt(x)),
+            "speed along the lean, m/s": (vx * lean_x + vy * lean_y) / length if length else 0.0,
+            "tilt rate, rad/s": (lean_x * gamma_dot + lean_y * math.cos(gamma) * theta_dot) / length if length else 0.0,
+        }
+
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         px, py, *rest = ops.components(x)
         return (

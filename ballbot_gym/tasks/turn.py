@@ -102,6 +102,9 @@ class Turn(Task):
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         return (between(z[0], self.min_speed, self.max_speed),)
 
+    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+        return {"speed, m/s": float(c[0])}
+
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         if not 0 < c[0] <= self.MAX_SPEED:
             raise ValueError(f"{self.id}: speed must be in (0, {self.MAX_SPEED:g}] m/s, not {c[0]:g}")

@@ -115,6 +115,19 @@ class Weave(Task):
             obstacles.append(tuple(ops.where(i < count, new, old) for new, old in zip(drawn, last, strict=True)))
         return (distance, 0.0 * distance, *(value for obstacle in obstacles for value in obstacle))
 
+    def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
+        goal, obstacles = split_constants(c)
+        free = [
+            float(np.hypot(*(b - a)[:2]) - a[2] - b[2] - 2 * self.ball_radius) for a, b in itertools.pairwise(obstacles)
+        ]
+        return {
+            "obstacles": float(len(obstacles)),
+            "tightest gap, m": min(free, default=float(goal[0])),
+            "goal's distance, m": float(np.hypot(*(goal - x[:2]))),
+            "widest obstacle, m": float(obstacles[:, 2].max()),
+            "start y, m": float(x[1]),
+        }
+
     def check_constants(self, c: np.ndarray, params: BallbotParams) -> None:
         goal, obstacles = split_constants(c)
         for i, (x, y, radius) in enumerate(obstacles):

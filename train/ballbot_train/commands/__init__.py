@@ -9,6 +9,7 @@ from pathlib import Path
 
 COMMANDS: dict[str, str] = {
     "benchmark": "ballbot_train.commands.benchmark:benchmark",
+    "evaluate": "ballbot_train.commands.evaluate:evaluate",
     "compare": "ballbot_train.commands.compare:compare",
     "robustness": "ballbot_train.commands.robustness:robustness",
     "basins": "ballbot_train.commands.basins:basins",

@@ -40,7 +40,7 @@ def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
     if callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None)):
         return policy
     if callable(getattr(policy, "predict", None)):
-        return ActionController(task, params, _Predictor(policy))
+        return ActionController(task, params, Predictor(policy))
     if callable(policy):
         function = cast(Callable[[np.ndarray], np.ndarray], policy)
         return ActionController(task, params, lambda observation, begins: function(observation))
@@ -49,8 +49,11 @@ def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
     )
 
 
-class _Predictor:
-    """An SB3 model's deterministic action. It keeps the recurrent state, and normalizes observations as in training."""
+class Predictor:
+    """An SB3 model's deterministic actions (..., 2) for observations (..., no) of an episode, or of one episode per env.
+
+    It keeps the recurrent state, and normalizes observations as in training.
+    """
 
     def __init__(self, model: Any):
         self._model, self._state = model, None
@@ -61,7 +64,7 @@ class _Predictor:
         action, self._state = self._model.predict(
             self._seen(observation),
             state=None if begins else self._state,
-            episode_start=np.array([begins]),
+            episode_start=np.full(len(np.atleast_2d(observation)), begins),
             deterministic=True,
         )
         return action

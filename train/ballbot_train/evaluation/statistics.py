@@ -47,6 +47,14 @@ def interval(values: Sequence[float] | np.ndarray, seed: int = 0) -> tuple[float
     return float(result.low), float(result.high)
 
 
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """The 95 % Wilson interval of a probability, from `count` successes in `total` independent tries."""
+    from scipy import stats  # slow to import
+
+    found = stats.binomtest(count, total).proportion_ci(CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)
+
+
 def verdict(low: float, high: float, margin: float) -> Verdict:
     """What the interval of a difference says where more is better; differences up to the margin decide nothing."""
     if low > margin:

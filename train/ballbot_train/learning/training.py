@@ -1,4 +1,13 @@
-"""Training runs: any learner with progress, TensorBoard, evaluation on certified episodes, checkpoints and resumption.
+"""Training runs: any learner with progress, TensorBoard, evaluation, checkpoints and resumption.
+
+Two sets of episodes evaluate a policy while it learns. The validation set, 200 fresh episodes, chooses the run's best policy.
+The certified episodes are the test set: what a policy does on them is reported, and decides nothing. So the reported
+figures are no better than those of other episodes.
+
+The policy with the least mean cost on the validation set is the best. This is what the task asks for: costs are the task's
+own, with the price that it sets for failing, and an episode that ends without success costs at least as much as failing at
+once. All policies of a run meet the same episodes, so their costs compare without a reference. The optima of these episodes
+are not known. The cost of another controller would be no substitute: each fails in some of the episodes.
 
 A run is a folder:
 
@@ -7,8 +16,16 @@ A run is a folder:
 | config.json | learner, task, settings, seed, demonstrations and the command that made it |
 | checkpoint.pt | all that the learner needs to go on as if never stopped; tensors and plain values only |
 | policy.json, policy.safetensors | the best policy so far; at the end with what it measures in PyBullet |
-| evaluations.csv | iteration, wall time and what the policy then cost on the certified episodes |
+| evaluations.csv | a line per evaluation, with the columns below |
 | tensorboard/ | the learner's figures and those evaluations |
+
+| column of evaluations.csv | holds |
+|---|---|
+| iteration, seconds | of training; seconds without evaluations |
+| cost_ratio, regret_mean, regret_median, success, failures | on the certified episodes, the test set; see `Score` |
+| validation_cost, validation_success, validation_failures | on the validation set; see `Validation` |
+
+The best policy is that of the least validation_cost.
 """
 
 import io
@@ -18,7 +35,7 @@ import signal
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -33,11 +50,15 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
-from ballbot_train.evaluation import evaluate
+from ballbot_train.evaluation import evaluate, fresh
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
 from ballbot_train.provenance import provenance
 
 _CONFIG = "config.json"
+VALIDATION_EPISODES = 200
+"""Episodes of the validation set, the same in every run; see `evaluation.fresh.draw`."""
+
+_VALIDATION_SEED = 0
 _CHECKPOINT_LIMIT = 2**34  # bytes
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
 
@@ -86,7 +107,7 @@ class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
 
     cost_ratio: float
-    """Mean of cost / optimum; an episode without success costs at least as much as failing at once. The best has least."""
+    """Mean of cost / optimum; an episode without success costs at least as much as failing at once."""
     regret_mean: float
     """Mean of cost / optimum − 1 over the episodes that did not fail."""
     regret_median: float
@@ -103,12 +124,35 @@ def score(network: PolicyNetwork, task: Task) -> Score:
     batch = BallbotBatch(task, len(episodes), compile=False)
     run = run_episodes(batch, network, episodes.states, episodes.constants)
     ratio = run.cost.numpy() / episodes.costs
-    priced = np.where(run.success.numpy(), ratio, np.maximum(ratio, task.survival_pay / episodes.costs))
+    priced = fresh.priced(run.cost.numpy(), run.success.numpy(), task) / episodes.costs
     standing = ratio[~run.failure.numpy()] - 1
     return Score(
         cost_ratio=float(priced.mean()),
         regret_mean=float(standing.mean()) if standing.size else math.nan,
         regret_median=float(np.median(standing)) if standing.size else math.nan,
+        success=float(run.success.double().mean()),
+        failures=int(run.failure.sum()),
+    )
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What a policy costs on the validation set, in the batched closed-form model."""
+
+    cost: float
+    """Mean cost; an episode without success costs at least as much as failing at once. The best policy has the least."""
+    success: float
+    """Share of the episodes that ended in success."""
+    failures: int
+    """Number of episodes that failed."""
+
+
+def validate(network: PolicyNetwork, task: Task) -> Validation:
+    """Measures a policy on the validation set, which shares no episode with the certified ones nor with `evaluate_fresh`."""
+    states, constants = fresh.draw(task, range(VALIDATION_EPISODES), _VALIDATION_SEED, "validation")
+    run = run_episodes(BallbotBatch(task, VALIDATION_EPISODES, compile=False), network, states, constants)
+    return Validation(
+        cost=float(fresh.priced(run.cost.numpy(), run.success.numpy(), task).mean()),
         success=float(run.success.double().mean()),
         failures=int(run.failure.sum()),
     )
@@ -158,8 +202,8 @@ def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any]) -> evaluate
             for name, value in figures.items():
                 writer.add_scalar(name, value, learner.iteration)
             if learner.iteration % every == 0 or learner.iteration >= learner.iterations:
-                for name, value in asdict(run.score()).items():
-                    writer.add_scalar(f"certified/{name}", value, learner.iteration)
+                for name, value in run.score().items():
+                    writer.add_scalar(name, value, learner.iteration)
                 progress.update(bar, description=f"{config['learner']} {run.best_text}")
             if time.monotonic() - saved > _CHECKPOINT_SECONDS or interrupted():
                 run.save()
@@ -195,35 +239,50 @@ class _Run:
             state = torch.load(io.BytesIO(files.read(path, _CHECKPOINT_LIMIT)), weights_only=True)
             self.learner.load_state_dict(state["learner"])
             best = self._restored(state["policy"])
-            self.seconds, self.best, self.rows = float(state["seconds"]), float(state["best"]), list(state["rows"])
+            self.seconds, self.rows = float(state["seconds"]), list(state["rows"])
+            if "best_validation" in state:
+                self.best = float(state["best_validation"])
+            else:  # of an earlier version, which chose the best policy on the certified episodes
+                self.best = validate(best, self.task).cost
+                unknown = {f"validation_{field.name}": math.nan for field in fields(Validation)}
+                self.rows = [row | unknown for row in self.rows]
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
             raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error!r})") from error
         save_policy(self.out / "policy", best, self._about())
         self._write_rows()
 
-    def score(self) -> Score:
-        """Scores the present policy, and keeps it if it is the best."""
+    def score(self) -> dict[str, float]:
+        """Scores the present policy on both sets, and keeps it if it is the best on the validation set.
+
+        Returns:
+            The figures by their name in TensorBoard.
+        """
         network = self.learner.network
-        result = score(network, self.task)
-        self.rows.append({"iteration": self.learner.iteration, "seconds": round(self.seconds, 1), **asdict(result)})
+        certified_score, validation = asdict(score(network, self.task)), validate(network, self.task)
+        named = {f"validation_{name}": value for name, value in asdict(validation).items()}
+        self.rows.append(
+            {"iteration": self.learner.iteration, "seconds": round(self.seconds, 1), **certified_score, **named}
+        )
         self._write_rows()
-        if result.cost_ratio < self.best:
-            self.best = result.cost_ratio
+        if validation.cost < self.best:
+            self.best = validation.cost
             save_policy(self.out / "policy", network, self._about())
-        return result
+        certified_figures = {f"certified/{name}": value for name, value in certified_score.items()}
+        return certified_figures | {f"validation/{name}": value for name, value in asdict(validation).items()}
 
     @property
     def best_text(self) -> str:
         """The best so far, for the progress bar."""
-        best = min(self.rows, key=lambda row: row["cost_ratio"])
-        return f"{100 * best['regret_mean']:.2f} % regret, {best['failures']} fail"
+        known = [row for row in self.rows if not math.isnan(row["validation_cost"])]
+        best = min(known or self.rows, key=lambda row: row["validation_cost"])
+        return f"cost {best['validation_cost']:.2f}, {best['validation_failures']} fail"
 
     def save(self) -> None:
         """Writes the checkpoint, with the best policy in it, so that both are of the same iteration."""
         state = {
             "learner": self.learner.state_dict(),
             "seconds": self.seconds,
-            "best": self.best,
+            "best_validation": self.best,
             "rows": self.rows,
             "policy": load_network(self.out / "policy", self.task).state_dict(),
         }
@@ -241,6 +300,7 @@ class _Run:
         env.close()
         row = evaluate.summarize(results)
         measured = {
+            "episodes_are": "certified",
             "physics": env.physics,
             "episodes": row.episodes,
             "success": row.success,
@@ -259,6 +319,7 @@ class _Run:
     def _about(self) -> dict[str, Any]:
         return {
             "training": self.config,
+            "chosen_by": {"episodes": f"{VALIDATION_EPISODES} fresh, for validation", "cost": self.best},
             "iteration": self.learner.iteration,
             "training_seconds": round(self.seconds, 1),
         }

@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import patches
@@ -21,6 +22,12 @@ from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.robustness import NONE, STRESSES, StressRow, curve_of
 from ballbot_train.report.labels import COLORS as COLORS
 from ballbot_train.report.labels import LABELS, color, label
+
+if TYPE_CHECKING:
+    from ballbot_train.evaluation.fresh import Bin, FreshResult  # it imports torch
+
+_MAP_CELLS = 20  # along each axis of a map
+_CELL_EPISODES = 5  # in a cell, at least; the share of fewer is chance
 
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 
@@ -189,6 +196,60 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
         axis.set_xlabel("lean γ, degrees")
     figure.supxlabel("black: the boundary of what 350 N can recover; per cent: share of it recovered", fontsize=9)
     return figure
+
+
+def fresh_figure(result: "FreshResult", bins: "Sequence[Bin]") -> Figure:
+    """Fresh episodes by every quantity that makes them hard: episodes without success, mean cost, and maps of two quantities.
+
+    Bars have 95 % Wilson intervals. A map shows the share of episodes without success by one quantity and the next, where a
+    cell holds at least 5 episodes; others are white.
+    """
+    names = list(result.measures)
+    lines = 3 if len(names) > 1 else 2
+    figure = Figure(figsize=(max(6.0, 3.6 * len(names)), 0.9 + 2.7 * lines), layout="constrained")
+    axes = figure.subplots(lines, len(names), squeeze=False)
+    summary = result.summary()
+    figure.suptitle(
+        f"{label(result.policy)} on {len(result)} fresh episodes of {result.task.id}:\n"
+        f"{summary.success:.2%} success, {summary.failures} failures",
+        fontsize=12,
+    )
+    for k, name in enumerate(names):
+        _plot_bins(axes[0][k], axes[1][k], [entry for entry in bins if entry.measure == name and entry.episodes])
+        axes[1][k].set_xlabel(name, fontsize=9)
+        if lines == 3:
+            _plot_map(figure, axes[2][k], result, name, names[(k + 1) % len(names)])
+    axes[0][0].set_ylabel("without success, %\n(dark: limit violated)", fontsize=9)
+    axes[1][0].set_ylabel("mean cost", fontsize=9)
+    return figure
+
+
+def _plot_bins(above: Axes, below: Axes, bins: "Sequence[Bin]") -> None:
+    middles = [(entry.low + entry.high) / 2 for entry in bins]
+    apart = min(np.diff(middles), default=1.0)
+    widths = [entry.high - entry.low or 0.8 * apart for entry in bins]
+    missed = np.array([100 * (1 - entry.success) for entry in bins])
+    low = np.array([100 * (1 - entry.success_high) for entry in bins])
+    high = np.array([100 * (1 - entry.success_low) for entry in bins])
+    whiskers = np.clip([missed - low, high - missed], 0, None)  # rounding can put an end on the wrong side
+    above.bar(middles, missed, widths, color="#e8a87c", yerr=whiskers, error_kw={"lw": 0.6, "ecolor": "0.5"})
+    above.bar(middles, [100 * entry.failures / entry.episodes for entry in bins], widths, color="#8b1a1a")
+    above.set_ylim(0, max(1.0, 1.1 * missed.max(), min(100.0, 1.05 * high[missed > 0].max(initial=0))))
+    below.bar(middles, [entry.cost_mean for entry in bins], widths, color="#1f6fb2")
+    for axis in (above, below):
+        axis.grid(alpha=0.3)
+
+
+def _plot_map(figure: Figure, axis: Axes, result: "FreshResult", name: str, other: str) -> None:
+    x, y = result.measures[name], result.measures[other]
+    shape = [min(_MAP_CELLS, max(4, len(result) // 100))] * 2
+    count, *edges = np.histogram2d(x, y, shape)
+    missed, *_ = np.histogram2d(x, y, edges, weights=(~result.success).astype(float))
+    share = np.divide(100 * missed, count, out=np.full_like(count, np.nan), where=count >= _CELL_EPISODES)
+    mesh = axis.pcolormesh(*edges, share.T, cmap="YlOrRd", vmin=0, vmax=np.nanmax(share, initial=1.0))
+    figure.colorbar(mesh, ax=axis, label="without success, %")
+    axis.set_xlabel(name, fontsize=9)
+    axis.set_ylabel(other, fontsize=9)
 
 
 def add_circles(axis: Axes, circles: Sequence[Circle]) -> None:

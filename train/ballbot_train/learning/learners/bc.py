@@ -22,7 +22,7 @@ class BcConfig:
     total_iterations: int = 60
     """Number of iterations."""
     evaluations: int = 6
-    """Number of evaluations on the certified episodes, at equal distances."""
+    """Number of evaluations, at equal distances."""
     gradient_steps: int = 200
     """Gradient steps per iteration."""
     batch_size: int = 1024

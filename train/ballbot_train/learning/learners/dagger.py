@@ -50,7 +50,7 @@ class DaggerConfig:
     gathering_iterations: int = 35
     """Number of iterations at the start that gather samples; the others only fit."""
     evaluations: int = 6
-    """Number of evaluations on the certified episodes, at equal distances."""
+    """Number of evaluations, at equal distances."""
     episodes_per_iteration: int = 6
     """Episodes drawn and planned per gathering iteration."""
     candidate_episodes: int = 64

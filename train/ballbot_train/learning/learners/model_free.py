@@ -33,7 +33,7 @@ class ModelFreeConfig:
     num_steps: int
     """Control steps of each env per iteration."""
     evaluations: int = 20
-    """Number of evaluations on the certified episodes, at equal distances."""
+    """Number of evaluations, at equal distances."""
     episode_seconds: float = 4.0
     """Duration of an episode in training, s."""
     reward_scale: float = 0.02

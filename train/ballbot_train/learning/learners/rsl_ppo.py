@@ -42,7 +42,7 @@ class RslPpoConfig:
     total_iterations: int = 400
     """Iterations, each of `num_envs * num_steps` env steps."""
     evaluations: int = 20
-    """Number of evaluations on the certified episodes, at equal distances."""
+    """Number of evaluations, at equal distances."""
     num_envs: int = 2048
     """Envs that are stepped together."""
     num_steps: int = 24

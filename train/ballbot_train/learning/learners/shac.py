@@ -34,7 +34,7 @@ class ShacConfig:
     total_iterations: int = 4000
     """Number of iterations, each of `num_envs * horizon` env steps."""
     evaluations: int = 20
-    """Number of evaluations on the certified episodes, at equal distances."""
+    """Number of evaluations, at equal distances."""
     num_envs: int = 512
     """Envs that are stepped together."""
     horizon: int = 50

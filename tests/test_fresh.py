@@ -1,0 +1,232 @@
+"""Fresh episodes: they are fresh, what is said of them is what happened in them, and nothing hides in a mean."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from ballbot_gym import certified
+from ballbot_gym.params import default_params
+from ballbot_gym.rollout import rollout
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.orbit import Orbit, orbit_speed
+from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_gym.tasks.turn import Turn
+from ballbot_gym.tasks.weave import Weave
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train import evaluate_fresh
+from ballbot_train.commands.evaluate import evaluate
+from ballbot_train.evaluation import fresh
+from ballbot_train.evaluation.statistics import share_interval
+from ballbot_train.learning import training
+from ballbot_train.policy import load_policy, shipped_policies
+
+
+def idle(observation):
+    return torch.zeros(len(observation), 2)
+
+
+@pytest.fixture(scope="module")
+def turns():
+    """The shipped policy on 200 turns."""
+    return evaluate_fresh("dagger", "turn", 200)
+
+
+def test_fresh_episodes_are_neither_certified_nor_for_validation_nor_of_another_seed(task):
+    count = 200
+    sets = [
+        fresh.draw(task, range(count), 0),
+        fresh.draw(task, range(count), 1),
+        fresh.draw(task, range(count), 0, "validation"),
+    ]
+    episodes = certified.load(task)
+    sets.append((episodes.states, episodes.constants))
+    starts = np.concatenate([np.column_stack(group) for group in sets])
+    assert len(np.unique(starts, axis=0)) == 3 * count + len(episodes)
+
+
+def test_more_fresh_episodes_begin_with_the_same_ones(task):
+    for few, many in zip(fresh.draw(task, range(3), 7), fresh.draw(task, range(8), 7), strict=True):
+        np.testing.assert_array_equal(few, many[:3])
+
+
+def test_every_task_measures_its_episodes_in_finite_numbers(task):
+    for x, c in zip(*fresh.draw(task, range(20), 0), strict=True):
+        assert all(math.isfinite(value) for value in task.measures(x, c, default_params()).values())
+
+
+def test_measures_are_what_their_names_say(params):
+    x = np.array([3.0, 4.0, 0.2, 0.0, 2.0, 1.0, 0.5, 0.0])  # leans along x, and moves and tilts that way
+    assert Stabilize().measures(x, np.zeros(0), params) == pytest.approx(
+        {
+            "distance, m": 5.0,
+            "speed, m/s": math.sqrt(5),
+            "tilt, degrees": math.degrees(0.2),
+            "speed along the lean, m/s": 2.0,
+            "tilt rate, rad/s": 0.5,
+        }
+    )
+    speed = orbit_speed(params, 2.0, math.radians(30))
+    measured = Orbit().measures(x, np.array([2.0, -speed]), params)
+    assert measured["steady tilt, degrees"] == pytest.approx(30)
+    assert measured["direction, 1 is counter-clockwise"] == -1
+    obstacles = [(2.0, 0.3, 0.3), (4.0, 0.3, 0.4), (4.0, 0.3, 0.4), (4.0, 0.3, 0.4), (4.0, 0.3, 0.4)]
+    measured = Weave().measures(np.zeros(8), np.array([6.0, 0.0, *np.ravel(obstacles)]), params)
+    assert measured["obstacles"] == 2
+    assert measured["tightest gap, m"] == pytest.approx(2.0 - 0.3 - 0.4 - 0.2)
+    assert measured["widest obstacle, m"] == 0.4
+
+
+def test_the_tilt_rate_is_the_derivative_of_the_tilt(params):
+    x, dt = np.array([0.0, 0.0, 0.4, -0.3, 0.0, 0.0, 0.7, 0.9]), 1e-6
+    later = x.copy()
+    later[2:4] += dt * x[6:]
+    now, then = (Stabilize().measures(state, np.zeros(0), params) for state in (x, later))
+    change = math.radians(then["tilt, degrees"] - now["tilt, degrees"]) / dt
+    assert now["tilt rate, rad/s"] == pytest.approx(change, rel=1e-4)
+
+
+def test_a_fresh_episode_costs_what_it_costs_in_the_environment(turns, make_env):
+    env = make_env("turn", physics="rk4")
+    policy = load_policy(shipped_policies(Turn())["dagger"])
+    for i in turns.worst(3):
+        run = rollout(env, policy, options={"state": turns.states[i], "constants": turns.constants[i]})
+        assert run.success == turns.success[i]
+        if run.success:
+            assert run.cost == pytest.approx(turns.costs[i], rel=1e-3)  # the policy's sums are in single precision
+
+
+def test_every_failure_names_its_limit():
+    result = evaluate_fresh(idle, "stabilize", 40)
+    assert result.failure.all()
+    assert set(result.violated) <= {"tilt", "arena"}
+    assert result.summary().failed_by == {name: result.violated.count(name) for name in sorted(set(result.violated))}
+    weaving = evaluate_fresh(lambda o: torch.tensor([[0.02, 0.0]]).expand(len(o), 2), "weave", 20)
+    assert sum(weaving.summary().failed_by.values()) == weaving.failure.sum()
+
+
+def test_every_way_to_give_a_policy_gives_the_same_result(turns):
+    path = shipped_policies(Turn())["dagger"]
+    for policy in (path, load_policy(path)):
+        again = evaluate_fresh(policy, "turn", 20)
+        np.testing.assert_allclose(again.costs, turns.costs[:20], rtol=1e-3)
+
+
+def test_bins_hold_every_episode_once(turns):
+    bins = turns.bins(7)
+    assert len(bins) == 7
+    assert sum(entry.episodes for entry in bins) == len(turns)
+    assert sum(entry.failures for entry in bins) == turns.failure.sum()
+    assert np.dot([e.episodes for e in bins], [e.cost_mean for e in bins]) == pytest.approx(turns.costs.sum())
+    counted = list(fresh.intervals(np.array([2.0, 5.0, 2.0]), 80))
+    assert [(low, high, int(members.sum())) for low, high, members in counted] == [(2.0, 2.0, 2), (5.0, 5.0, 1)]
+
+
+def test_the_worst_episodes_are_those_without_success_and_then_the_dearest(turns):
+    order = turns.worst(len(turns))
+    missed = int((~turns.success).sum())
+    assert not turns.success[order[:missed]].any()
+    assert (np.diff(turns.costs[order[missed:]]) <= 0).all()
+
+
+def test_wilson_s_interval_is_not_empty_where_nothing_failed():
+    low, high = share_interval(0, 10_000)
+    assert low == pytest.approx(0, abs=1e-12)
+    assert high == pytest.approx(1.96**2 / (10_000 + 1.96**2), rel=1e-3)
+
+
+def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(tmp_path, monkeypatch):
+    optima = fresh.find_optima("stabilize", 2, 0, tmp_path, 1, lambda name, count: None)
+    from ballbot_baselines import optimum
+
+    monkeypatch.setattr(optimum, "find_optimum", None)  # whoever calls it again fails
+    again = fresh.find_optima("stabilize", 2, 0, tmp_path, 1, lambda name, count: None)
+    np.testing.assert_array_equal(optima, again)
+    result = evaluate_fresh("shac", "stabilize", 2)
+    assert (result.costs / optima - 1 > -1e-6).all()
+    with pytest.raises(ValueError, match="seed 0, not 1"):
+        fresh.find_optima("stabilize", 2, 1, tmp_path, 1, lambda name, count: None)
+
+
+def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    evaluate("dagger", task="turn", fresh=60, bins=5, episodes=1, physics="rk4", workers=1)
+    out = tmp_path / "runs" / "evaluate" / "turn-dagger"
+    document = json.loads((out / "fresh.json").read_text())
+    assert document["summary"][0]["episodes"] == 60
+    assert len(document["bins"]) == 5
+    assert document["about"]["policies"].keys() == {"turn/dagger"}
+    worst = document["worst"][0]
+    file = worst["replay"].removeprefix("ballbot replay ")
+    np.testing.assert_allclose(Trajectory.load(file).x[0], worst["start"])
+    for name, lines in (("bins", 5), ("worst", 10), ("fresh", 60)):
+        with (out / f"{name}.csv").open() as opened:
+            assert len(list(csv.DictReader(opened))) == lines
+    assert (out / "fresh.png").exists()
+    assert (out / "certified" / "leaderboard.csv").exists()
+    assert worst["replay"] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["stabilize", "weave"])
+def test_bins_are_drawn_for_every_measure(name):
+    from ballbot_train.report import figures
+
+    result = evaluate_fresh("shac", name, 30)
+    drawn = figures.fresh_figure(result, result.bins())
+    assert len(drawn.axes) >= 3 * len(result.measures)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"policy": "lqr"}, "lqr is an expert"),
+        ({"policy": "pid"}, "unknown controller pid"),
+        ({"policy": "dagger"}, "unknown controller dagger"),  # Stabilize has none
+        ({"policy": "shac", "task": "dance"}, "unknown task dance"),
+        ({"policy": "shac", "fresh": -1}, "fresh must be at least 0, not -1"),
+        ({"policy": "shac", "seed": -1}, "seed must be at least 0"),
+        ({"policy": "shac", "bins": 0}, "bins must be at least 1"),
+        ({"policy": "shac", "fresh": 5, "optima": 6}, "optima must be at most the 5 fresh episodes"),
+        ({"policy": "shac", "fresh": 0}, "nothing to run"),
+        ({"policy": "lqr", "episodes": 500}, "episodes must be at most 200"),
+        ({"policy": "nowhere.json"}, "nowhere.json is not a policy"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_is_written(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    policy = arguments.pop("policy")
+    with pytest.raises(ValueError, match=message):
+        evaluate(policy, **arguments)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_policy_file_names_its_task(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    evaluate(str(shipped_policies(Turn())["dagger"]), fresh=10, out=tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "fresh.json").read_text())["about"]["task"] == "turn"
+
+
+def test_numbers_out_of_range_are_refused():
+    with pytest.raises(ValueError, match="the number of fresh episodes must be 1 to 1,000,000, not 0"):
+        evaluate_fresh("shac", "stabilize", 0)
+    with pytest.raises(ValueError, match="seed must be 0 to"):
+        evaluate_fresh("shac", "stabilize", 1, seed=-1)
+
+
+def test_what_does_not_act_is_refused():
+    with pytest.raises(TypeError, match="is no policy"):
+        evaluate_fresh(3, "turn", 1)
+    with pytest.raises(ValueError, match="trajopt is an expert"):
+        evaluate_fresh("trajopt", "turn", 1)
+    with pytest.raises(ValueError, match="unknown policy 'sac'"):
+        evaluate_fresh("sac", "turn", 1)
+
+
+def test_validation_prices_an_episode_without_success_as_failing_at_once():
+    task = TASKS["stabilize"]()
+    validation = training.validate(idle, task)
+    assert validation.success == 0
+    assert validation.cost >= task.survival_pay

@@ -1,0 +1,198 @@
+"""`ballbot evaluate POLICY`: one policy on thousands of fresh episodes, or anything that acts on the certified ones."""
+
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from ballbot_baselines import CONTROLLERS
+from ballbot_gym import certified
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.rollout import rollout
+from ballbot_gym.tasks import TASKS
+from ballbot_train import jobs
+from ballbot_train.console import check_least, check_names, console, print_table, progress_bars
+from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
+from ballbot_train.evaluation.controllers import is_file, make_controller
+from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.policy_files import read_description
+from ballbot_train.provenance import provenance
+
+_FRESH = 10_000
+_WORST = 10
+_SHOWN_BINS = 6
+_FULL_BIN = 20  # episodes from which a bin is called weak
+
+
+def evaluate(
+    policy: str,
+    /,
+    task: str | None = None,
+    fresh: int | None = None,
+    seed: int = 0,
+    bins: int | None = None,
+    optima: int = 0,
+    episodes: int = 0,
+    physics: Literal["bullet", "rk4"] = "bullet",
+    out: Path | None = None,
+    workers: int = os.cpu_count() or 1,
+) -> None:
+    """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
+
+    Args:
+        policy: a policy file, or the name of a policy that comes with the package; with --episodes also an expert.
+        task: name of its task; default the one that its file names, or else stabilize.
+        fresh: how many fresh episodes, in the batched closed-form model; default 10000, or none where --episodes is given.
+            They are never the certified ones.
+        seed: of the fresh episodes.
+        bins: ranges into which each quantity is divided; default one per 125 episodes, 4 to 80.
+        optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
+            folder `optima` beside --out, for later calls and other policies.
+        episodes: how many of the certified episodes to run in PyBullet.
+        physics: of the certified episodes, "bullet" or "rk4".
+        out: folder of the results; default runs/evaluate/TASK-POLICY. An interrupted run continues here.
+        workers: processes, for optima and certified episodes.
+    """
+    task = _task_of(policy, task)
+    chosen = controllers_of([task], [policy])
+    check_least(0, seed=seed, optima=optima, episodes=episodes)
+    check_least(1, workers=workers, **({} if bins is None else {"bins": bins}))
+    if episodes > certified.EPISODES:
+        raise ValueError(f"episodes must be at most {certified.EPISODES}, the certified ones, not {episodes}")
+    fresh = (0 if episodes else _FRESH) if fresh is None else fresh
+    check_least(0, fresh=fresh)
+    if optima > fresh:
+        raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
+    if not fresh and not episodes:
+        raise ValueError("nothing to run: give --fresh or --episodes")
+    if fresh and policy in CONTROLLERS:
+        raise ValueError(
+            f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a policy, "
+            "or run the expert on certified episodes with --episodes"
+        )
+    out = Path("runs") / "evaluate" / f"{task}-{Path(policy).stem}" if out is None else out
+    if fresh:
+        _fresh(policy, task, fresh, seed, bins, optima, out, workers)
+    if episodes:
+        _certified(chosen, episodes, physics, out / "certified", workers)
+
+
+def _task_of(policy: str, task: str | None) -> str:
+    """The task that is named, or the registered one that a policy file names, or stabilize."""
+    if task is not None:
+        check_names("task", [task], TASKS)
+        return task
+    if not is_file(policy):
+        return "stabilize"
+    made_for = read_description(policy)["spec"]["task"]
+    named = next((name for name in TASKS if make_task(name).problem() == made_for), None)
+    if named is None:
+        raise ValueError(
+            f"{policy} was made for {made_for}, which is none of {', '.join(TASKS)} with its default fields"
+        )
+    return named
+
+
+def _fresh(
+    policy: str, task: str, episodes: int, seed: int, count: int | None, optima: int, out: Path, workers: int
+) -> None:
+    from ballbot_train.evaluation import fresh  # it imports torch
+    from ballbot_train.report import figures
+
+    fresh.check_fresh(episodes, seed)
+    facts = provenance() | {
+        "task": task,
+        "policy": policy,
+        "policies": policy_digests({task: [policy]}),
+        "seed": seed,
+        "episodes": episodes,
+        "physics": "closed form, batched, float64",
+    }
+    with progress_bars({"episodes": episodes}) as bars:
+        result = fresh.evaluate_fresh(
+            policy, task, episodes, seed, on_progress=lambda number: bars.advance("episodes", number)
+        )
+    if optima:
+        with progress_bars({task: optima}) as bars:
+            found = fresh.find_optima(
+                task, optima, seed, out.parent / "optima" / f"{task}-{seed}", workers, bars.advance
+            )
+        result = replace(result, optima=found)
+    binned = result.bins(count)
+    worst = _worst(result, policy, task, out / "worst")
+    fresh.write(result, binned, worst, facts, out)
+    picture = figures.save(figures.fresh_figure(result, binned), out / "fresh.png")
+    _print(result, binned, worst)
+    console.print(f"figure: {picture}\nall episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
+
+
+def _worst(result: Any, policy: str, task: str, folder: Path) -> list[dict[str, Any]]:
+    """The worst episodes, each with its trajectory in a file that `ballbot replay` draws."""
+    env = BallbotEnv(task, physics="rk4")
+    controller = make_controller(policy, env.task, env.params)
+    for stale in folder.glob("episode-*.npz"):  # of an earlier evaluation
+        stale.unlink()
+    worst = []
+    for i in result.worst(_WORST):
+        run = rollout(env, controller, options={"state": result.states[i], "constants": result.constants[i]})
+        path = run.trajectory.save(folder / f"episode-{i}.npz")
+        constants = dict(zip(env.task.constant_names, result.constants[i].tolist(), strict=True))
+        start = {"start": result.states[i].tolist(), "constants": constants}
+        worst.append(result.episode(i) | start | {"replay": shlex.join(["ballbot", "replay", str(path)])})
+    env.close()
+    return worst
+
+
+def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) -> None:
+    row = result.summary()
+    failed_by = ", ".join(f"{count} {name}" for name, count in row.failed_by.items())
+    facts = [
+        ["success [95 %]", f"{100 * row.success:.2f} % [{100 * row.success_low:.2f}, {100 * row.success_high:.2f}]"],
+        [
+            "failures per 10,000 [95 %]",
+            f"{row.failures_per_10000:.1f} [{row.failures_per_10000_low:.1f}, {row.failures_per_10000_high:.1f}]"
+            + (f" ({failed_by})" if failed_by else ""),
+        ],
+        [
+            "cost: mean, median, 99th percentile, worst",
+            f"{row.cost_mean:.2f}, {row.cost_median:.2f}, {row.cost_p99:.2f}, {row.cost_worst:.2f}",
+        ],
+    ]
+    if row.optima:
+        shares = (row.regret_mean, row.regret_median, row.regret_p99, row.regret_worst)
+        facts.append([f"regret on {row.optima} optima, the same", ", ".join(f"{share:.2%}" for share in shares)])
+    title = f"{result.policy}: {row.episodes} fresh episodes of {result.task.id}, seed {result.seed}"
+    print_table(title, ["", ""], facts)
+    weakest = sorted(
+        (entry for entry in binned if entry.episodes >= _FULL_BIN and entry.success < 1),
+        key=lambda entry: entry.success,
+    )
+    if weakest:
+        header = ["range with the least success", "", "episodes", "success", "failures", "mean cost"]
+        rows = [
+            [
+                entry.measure,
+                f"{entry.low:.4g}" if entry.low == entry.high else f"{entry.low:.4g} to {entry.high:.4g}",
+                f"{entry.episodes}",
+                f"{entry.success:.1%}",
+                f"{entry.failures}",
+                f"{entry.cost_mean:.1f}",
+            ]
+            for entry in weakest[:_SHOWN_BINS]
+        ]
+        print_table("", header, rows)
+    rows = [[str(entry["episode"]), entry["replay"], entry["failed"] or "–", f"{entry['cost']:.1f}"] for entry in worst]
+    print_table("", ["worst", "look at it with", "failed", "cost"], rows)
+
+
+def _certified(chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: int) -> None:
+    facts = open_run(out, chosen, workers, physics, 0, episodes=episodes)
+    with progress_bars(dict.fromkeys(chosen, episodes)) as bars:
+        results = benchmark(chosen, episodes, physics, out, workers, bars.advance)
+    rows = leaderboard(results)
+    write_leaderboard(rows, results, facts, out)
+    jobs.release(out)
+    print_table(f"{episodes} certified episodes, physics={physics}", HEADER, [cells(row) for row in rows])
+    console.print(f"all episodes: {out / 'episodes.csv'}")

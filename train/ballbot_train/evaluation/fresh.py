@@ -1,0 +1,388 @@
+"""A policy on thousands of fresh episodes: how often it fails, what it costs, and in which episodes.
+
+Fresh episodes are drawn with a seed, and none of them is certified. They all run at once in the batched closed-form model, in
+double precision. A mean over them hides nothing: `FreshResult.bins` gives success and cost for every range of every quantity
+that `Task.measures` names, and `FreshResult.worst` the worst episodes.
+
+Seeds give disjoint sets, the same on every machine, and the first n episodes of a set are the set of n episodes. The set on
+which training chooses a policy is drawn for another purpose, and so shares no episode with them.
+"""
+
+import itertools
+import math
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from ballbot_baselines import CONTROLLERS
+from ballbot_gym import files
+from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import Task
+from ballbot_train import jobs
+from ballbot_train.evaluation.controllers import is_file
+from ballbot_train.evaluation.evaluate import Predictor
+from ballbot_train.evaluation.results import to_json
+from ballbot_train.evaluation.statistics import share_interval
+from ballbot_train.policy import load_network, shipped_policies
+
+EPISODES = 10_000
+"""Fresh episodes by default."""
+
+_MOST_EPISODES = 1_000_000
+_BATCH = 2500  # episodes that run at once
+_CHUNK = 5  # episodes of a job that finds optima
+_PURPOSES = {"evaluation": 0, "validation": 1}
+_DISCRETE = 12  # a quantity with at most so many values gets a bin for each of them
+_PER_BIN = 125  # episodes of a bin on average, by default
+_MOST_BINS = 80
+
+
+@dataclass(frozen=True)
+class Bin:
+    """The episodes in which one quantity is between two values; equal ends are a single value."""
+
+    measure: str
+    low: float
+    high: float
+    episodes: int
+    success: float
+    """Share; NaN where there is no episode, as of all others."""
+    success_low: float
+    """Of its 95 % Wilson interval."""
+    success_high: float
+    failures: int
+    cost_mean: float
+    """A failure's price included."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a policy does on fresh episodes, in numbers. Intervals are Wilson's, of 95 %."""
+
+    episodes: int
+    success: float
+    """Share of the episodes."""
+    success_low: float
+    success_high: float
+    failures: int
+    """Episodes that ended at a violated limit."""
+    failures_per_10000: float
+    failures_per_10000_low: float
+    failures_per_10000_high: float
+    failed_by: dict[str, int]
+    """Failures by the limit that was violated: tilt, obstacle or arena."""
+    cost_mean: float
+    """Of all episodes, a failure's price included, as the next three."""
+    cost_median: float
+    cost_p99: float
+    cost_worst: float
+    optima: int = 0
+    """Episodes whose optimum is known: of those that did not fail, the regrets."""
+    regret_mean: float = math.nan
+    regret_median: float = math.nan
+    regret_p99: float = math.nan
+    regret_worst: float = math.nan
+
+
+@dataclass(frozen=True)
+class FreshResult:
+    """n fresh episodes of a task under one policy. Arrays have one entry per episode."""
+
+    task: Task
+    policy: str
+    seed: int
+    states: np.ndarray
+    """(n, 8) initial states."""
+    constants: np.ndarray
+    """(n, nc)."""
+    costs: np.ndarray
+    """(n,) a failure's price included."""
+    success: np.ndarray
+    """(n,) bool."""
+    failure: np.ndarray
+    """(n,) bool."""
+    violated: tuple[str, ...]
+    """The limit at which each episode ended, or ""."""
+    durations: np.ndarray
+    """(n,) s."""
+    measures: dict[str, np.ndarray]
+    """What `Task.measures` says of each episode."""
+    optima: np.ndarray
+    """(k,) optimal costs of the first k ≤ n episodes; NaN where none was found."""
+
+    def __len__(self) -> int:
+        return len(self.costs)
+
+    @property
+    def regrets(self) -> np.ndarray:
+        """(m,) cost / optimum − 1 of the episodes that did not fail and whose optimum is known."""
+        k = len(self.optima)
+        regrets = (self.costs[:k] / self.optima - 1)[~self.failure[:k]]
+        return regrets[np.isfinite(regrets)]
+
+    def summary(self) -> Summary:
+        """The numbers."""
+        n, failures = len(self), int(self.failure.sum())
+        success = int(self.success.sum())
+        success_low, success_high = share_interval(success, n)
+        failures_low, failures_high = share_interval(failures, n)
+        kinds = [name.partition(" ")[0] for name in self.violated if name]  # "obstacle 3" is an obstacle
+        costs = dict(zip(("mean", "median", "p99", "worst"), _spread(self.costs), strict=True))
+        regrets = dict(zip(("mean", "median", "p99", "worst"), _spread(self.regrets), strict=True))
+        return Summary(
+            episodes=n,
+            success=success / n,
+            success_low=success_low,
+            success_high=success_high,
+            failures=failures,
+            failures_per_10000=1e4 * failures / n,
+            failures_per_10000_low=1e4 * failures_low,
+            failures_per_10000_high=1e4 * failures_high,
+            failed_by={kind: kinds.count(kind) for kind in sorted(set(kinds))},
+            **{f"cost_{name}": value for name, value in costs.items()},
+            optima=int(np.isfinite(self.optima).sum()),
+            **{f"regret_{name}": value for name, value in regrets.items()},
+        )
+
+    def bins(self, count: int | None = None) -> list[Bin]:
+        """Success and cost by ranges of every measure, equally wide from its smallest to its largest value.
+
+        Args:
+            count: bins of a measure; default one per 125 episodes, 4 to 80. A measure with few values has a bin for each.
+        """
+        return [
+            self._bin(name, low, high, chosen)
+            for name, values in self.measures.items()
+            for low, high, chosen in intervals(values, self.bin_count if count is None else count)
+        ]
+
+    @property
+    def bin_count(self) -> int:
+        """Bins of a measure by default."""
+        return min(max(len(self) // _PER_BIN, 4), _MOST_BINS)
+
+    def _bin(self, measure: str, low: float, high: float, chosen: np.ndarray) -> Bin:
+        n, success = int(chosen.sum()), int(self.success[chosen].sum())
+        success_low, success_high = share_interval(success, n) if n else (math.nan, math.nan)
+        return Bin(
+            measure=measure,
+            low=low,
+            high=high,
+            episodes=n,
+            success=success / n if n else math.nan,
+            success_low=success_low,
+            success_high=success_high,
+            failures=int(self.failure[chosen].sum()),
+            cost_mean=float(self.costs[chosen].mean()) if n else math.nan,
+        )
+
+    def worst(self, count: int = 10) -> list[int]:
+        """The indices of the worst episodes: those without success first, and then the dearest."""
+        return np.lexsort((-self.costs, -priced(self.costs, self.success, self.task)))[:count].tolist()
+
+    def episode(self, i: int) -> dict[str, Any]:
+        """What episode i was and how it ended, as a line of a table."""
+        ending = self.violated[i] or ("" if self.success[i] else "goal missed")
+        return {
+            "episode": i,
+            "cost": float(self.costs[i]),
+            "success": bool(self.success[i]),
+            "failure": bool(self.failure[i]),
+            "failed": ending,
+            "duration": float(self.durations[i]),
+            **{name: float(values[i]) for name, values in self.measures.items()},
+        }
+
+
+def _spread(values: np.ndarray) -> tuple[float, float, float, float]:
+    """Mean, median, 99th percentile and largest; NaN where there is no value."""
+    if not len(values):
+        return math.nan, math.nan, math.nan, math.nan
+    return float(values.mean()), float(np.median(values)), float(np.percentile(values, 99)), float(values.max())
+
+
+def intervals(values: np.ndarray, count: int) -> Iterator[tuple[float, float, np.ndarray]]:
+    """Lower end, upper end and members (n,) bool of equally wide bins of values (n,); few values are a bin each."""
+    distinct = np.unique(values)
+    if len(distinct) <= _DISCRETE:
+        for value in distinct:
+            yield float(value), float(value), values == value
+        return
+    edges = np.linspace(values.min(), values.max(), count + 1)
+    number = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, count - 1)
+    for i in range(count):
+        yield float(edges[i]), float(edges[i + 1]), number == i
+
+
+def priced(costs: np.ndarray, success: np.ndarray, task: Task) -> np.ndarray:
+    """(n,) costs, in which an episode without success costs at least as much as failing at once."""
+    return np.where(success, costs, np.maximum(costs, task.survival_pay))
+
+
+def draw(
+    task: Task,
+    episodes: Iterable[int],
+    seed: int,
+    purpose: Literal["evaluation", "validation"] = "evaluation",
+) -> tuple[np.ndarray, np.ndarray]:
+    """Initial states (n, 8) and constants (n, nc) of fresh episodes.
+
+    Args:
+        task: the task.
+        episodes: their numbers.
+        seed: of the set.
+        purpose: what the set is for; sets for different purposes share no episode.
+    """
+    entropy, params = zlib.crc32(task.id.encode()), default_params()
+    sequences = (np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, i)) for i in episodes)
+    drawn = [task.sample(np.random.default_rng(sequence), params) for sequence in sequences]
+    return np.array([x for x, _ in drawn]), np.array([c for _, c in drawn])
+
+
+def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.Tensor]:
+    """A policy as a function from observations (B, no) to actions (B, 2), for one episode of each of B environments.
+
+    Args:
+        policy: a policy file, the name of a shipped policy, a model with Stable-Baselines3's `predict`, or a function of
+            tensors such as a `PolicyNetwork`. It is given float32.
+        task: what it is to do.
+
+    Raises:
+        ValueError: nothing of that name, or a controller that does not run in the batch.
+        PolicyError: a policy file that is damaged or of another task.
+        TypeError: it is none of these.
+    """
+    if isinstance(policy, str | Path):
+        name, shipped = str(policy), shipped_policies(task)
+        if name in CONTROLLERS:
+            raise ValueError(
+                f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
+                "policy, or run the expert on certified episodes with evaluate"
+            )
+        if name not in shipped and not is_file(name):
+            raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
+        network = load_network(shipped.get(name, name), task).eval()
+        return lambda observation: network(observation.float())
+    if callable(getattr(policy, "predict", None)):
+        predictor, begins = Predictor(policy), itertools.chain([True], itertools.repeat(False))
+        return lambda observation: torch.as_tensor(predictor(observation.float().numpy(), next(begins)))
+    if callable(policy):
+        function: Any = policy
+        return lambda observation: function(observation.float())
+    raise TypeError(f"{policy!r} is no policy: give a name, a file, a model with predict, or a function of tensors")
+
+
+def evaluate_fresh(
+    policy: Any,
+    task: str | Task = "stabilize",
+    episodes: int = EPISODES,
+    seed: int = 0,
+    name: str | None = None,
+    on_progress: Callable[[int], None] = lambda count: None,
+) -> FreshResult:
+    """Runs a policy on fresh episodes.
+
+    Args:
+        policy: as of `as_batch_policy`.
+        task: a name in `TASKS`, or a Task.
+        episodes: how many.
+        seed: of the episodes.
+        name: of the policy in the result; default, its own.
+        on_progress: called with a number of finished episodes.
+
+    Raises:
+        TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.
+    """
+    task = make_task(task)
+    check_fresh(episodes, seed)
+    states, constants = draw(task, range(episodes), seed)
+    runs = []
+    for start in range(0, episodes, _BATCH):
+        x, c = states[start : start + _BATCH], constants[start : start + _BATCH]
+        batch = BallbotBatch(task, len(x), compile=False, dtype=torch.float64)
+        runs.append(run_episodes(batch, as_batch_policy(policy, task), x, c))
+        on_progress(len(x))
+    described = [task.measures(x, c, default_params()) for x, c in zip(states, constants, strict=True)]
+    numbers = torch.cat([run.violated for run in runs]).tolist()
+    return FreshResult(
+        task=task,
+        policy=name or (str(policy) if isinstance(policy, str | Path) else type(policy).__name__),
+        seed=seed,
+        states=states,
+        constants=constants,
+        costs=torch.cat([run.cost for run in runs]).numpy(),
+        success=torch.cat([run.success for run in runs]).numpy(),
+        failure=torch.cat([run.failure for run in runs]).numpy(),
+        violated=tuple(task.limit_names[number] if number >= 0 else "" for number in numbers),
+        durations=torch.cat([run.steps for run in runs]).numpy() * task.control_dt,
+        measures={key: np.array([entry[key] for entry in described]) for key in described[0]},
+        optima=np.zeros(0),
+    )
+
+
+def check_fresh(episodes: int, seed: int) -> None:
+    """Raises a ValueError for a number of fresh episodes, or a seed, that is out of its range."""
+    if not 1 <= episodes <= _MOST_EPISODES:
+        raise ValueError(f"the number of fresh episodes must be 1 to {_MOST_EPISODES:,}, not {episodes}")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
+
+
+def find_optima(
+    task: str, episodes: int, seed: int, out: Path, workers: int, on_progress: Callable[[str, int], None]
+) -> np.ndarray:
+    """(n,) optimal costs of the first fresh episodes of a seed, NaN where none was found.
+
+    Args:
+        task: name of the task.
+        episodes: how many.
+        seed: of the episodes.
+        out: folder in which the optima stay, so that a later call finds only those that are missing.
+        workers: processes.
+        on_progress: called with the task's name and a number of optima that are there.
+    """
+    jobs.claim(out, {"task": make_task(task).problem(), "seed": seed})
+    try:
+        work = [
+            jobs.Job(f"optima-{start:06d}", _optima, (task, seed), items, task)
+            for start in range(0, episodes, _CHUNK)
+            for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
+        ]
+        done = jobs.run(work, out, workers, on_progress)
+    finally:
+        jobs.unlock(out)
+    return np.array([entry.get("cost", math.nan) for entries in done for entry in entries])
+
+
+def _optima(task_name: str, seed: int, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
+    from ballbot_baselines.optimum import find_optimum  # it imports CasADi
+
+    task = make_task(task_name)
+    for i, x, c in zip(episodes, *draw(task, episodes, seed), strict=True):
+        try:
+            yield {"episode": i, "cost": find_optimum(task, default_params(), x, c).cost}
+        except PlanError as error:
+            yield {"episode": i, "error": str(error)}
+
+
+def write(
+    result: FreshResult, bins: Sequence[Bin], worst: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], out: Path
+) -> None:
+    """Writes fresh.json, with the facts as "about", summary, bins and worst episodes; and bins, worst and fresh.csv.
+
+    fresh.csv has a line for each episode.
+    """
+    document = {"about": facts, "summary": [result.summary()], "bins": list(bins), "worst": list(worst)}
+    files.write(out / "fresh.json", to_json(document))
+    files.write_csv(out / "bins.csv", [asdict(entry) for entry in bins])
+    flat = ("start", "constants")  # lists, which are in the JSON file
+    files.write_csv(out / "worst.csv", [{key: entry[key] for key in entry if key not in flat} for entry in worst])
+    files.write_csv(out / "fresh.csv", [result.episode(i) for i in range(len(result))])
