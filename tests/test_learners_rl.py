@@ -6,9 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO, SAC
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
+from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_train.learning.actors import spec_for
+from ballbot_train.learning.critics import CriticInputs, value_of_living
 from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
 from ballbot_train.learning.learners.model_free import ScopedRng, TrainingEnv
@@ -23,6 +27,7 @@ TINY = {
         episode_seconds=0.4,
         hidden=(16, 8),
         batch_size=32,
+        demo_batch_size=32,
         update_epochs=2,
         **IMITATING,
     ),
@@ -50,8 +55,8 @@ def name(request):
     return request.param
 
 
-def make(name, demos=None, seed=0):
-    return LEARNERS[name].make(make_task("stabilize"), default_params(), TINY[name], seed, demos)
+def make(name, demos=None, seed=0, **settings):
+    return LEARNERS[name].make(make_task("stabilize"), default_params(), replace(TINY[name], **settings), seed, demos)
 
 
 def run(learner, iterations=None):
@@ -59,6 +64,10 @@ def run(learner, iterations=None):
         figures = learner.iterate()
     assert all(np.isfinite(float(value)) for value in figures.values())
     return learner
+
+
+def observed(batch, size=8):
+    return torch.randn(batch, size, generator=torch.Generator().manual_seed(0))
 
 
 def parameters(learner):
@@ -150,6 +159,80 @@ def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
     assert float(sample.rewards[1]) == pytest.approx(-3 * TINY["sac"].reward_scale)
     assert float(sample.dones[1]) == 0
     assert sample.actions[1].tolist() == [0.5, 0.5]
+
+
+@pytest.mark.parametrize("frame", [None, "radial"])
+def test_a_quadratic_value_is_linear_in_what_the_critic_sees(frame):
+    entries = 8 if frame is None else FRAMES[frame].size
+    observation = observed(400, 8 if frame is None else 13)
+    seen = CriticInputs(observation.shape[1], products=True, frame=frame)(observation).double()
+    plain = CriticInputs(observation.shape[1], products=False, frame=frame)(observation).double()
+    form = torch.randn(entries, entries, dtype=torch.double)
+    wanted = ((plain @ form) * plain).sum(1, keepdim=True) + plain[:, :1]
+    fitted = seen @ torch.linalg.lstsq(seen, wanted, driver="gelsd").solution
+    torch.testing.assert_close(fitted, wanted, rtol=1e-4, atol=1e-4)
+    assert seen.shape[1] == entries + entries * (entries + 1) // 2
+
+
+def test_critics_have_a_linear_path_and_start_at_the_value_of_living_for_ever(name):
+    task, learner = make_task("stabilize"), make(name)
+    value = value_of_living(task, TINY[name].reward_scale, TINY[name].gamma)
+    assert value == pytest.approx(TINY[name].reward_scale * 100 * task.control_dt / (1 - TINY[name].gamma))
+    observation, action = observed(50), torch.zeros(50, 2)
+    policy = learner._model.policy
+    if name == "ppo":
+        values, critics = [policy.predict_values(observation)], [policy.mlp_extractor.critic]
+    else:
+        values, critics = policy.critic(observation, action), policy.critic.q_networks
+        assert all(map(torch.equal, values, policy.critic_target(observation, action)))
+    trained = {id(part) for optimizer in learner._optimizers for part in optimizer.param_groups[0]["params"]}
+    for start, critic in zip(values, critics, strict=True):
+        torch.testing.assert_close(start, torch.full((50, 1), value), atol=0.5, rtol=0)
+        assert critic.linear.in_features == (44 if name == "ppo" else 65)
+        assert trained >= {id(part) for part in critic.parameters()}
+
+
+def test_the_value_of_living_is_finite_without_a_discount():
+    task = make_task("stabilize")
+    assert value_of_living(task, 1.0, 1.0) == pytest.approx(task.survival_pay)
+
+
+def test_without_products_the_networks_are_those_of_stable_baselines3(name):
+    learner = make(name, products=False)
+    config, model = TINY[name], learner._model
+    if name == "ppo":
+        plain = PPO("MlpPolicy", learner._env, n_steps=16, batch_size=32, policy_kwargs={"net_arch": [16, 8]}, seed=0)
+    else:
+        kwargs = {"net_arch": [16, 8], "n_critics": config.num_critics, "activation_fn": torch.nn.SiLU}
+        plain = SAC("MlpPolicy", learner._env, buffer_size=100, policy_kwargs=kwargs, seed=0)
+    assert type(model.policy) is type(plain.policy)
+    set_by_us = ("log_std", "actor.log_std.weight", "actor.log_std.bias")
+    for key, expected in plain.policy.state_dict().items():
+        assert key in set_by_us or torch.equal(model.policy.state_dict()[key], expected), key
+
+
+def test_products_change_nothing_about_what_an_actor_sees(name):
+    assert make(name).network.spec == make(name, products=False).network.spec
+
+
+@pytest.mark.parametrize(("task", "symmetry"), [("stabilize", "odd"), ("weave", "mirrors"), ("orbit", "frame")])
+def test_the_actor_of_ppo_has_the_symmetry_of_its_task(task, symmetry):
+    settings = replace(TINY["ppo"], symmetry=symmetry, rl_iterations=1)
+    assert LEARNERS["ppo"].settings(task).symmetry == symmetry
+    learner = LEARNERS["ppo"].make(make_task(task), default_params(), settings, 0, None)
+    start = parameters(learner)
+    run(learner)
+    assert not torch.equal(parameters(learner), start)
+    assert learner.network.spec == spec_for(make_task(task), symmetry, (16, 8))
+    observation = observed(20, learner.network.spec.observations)
+    expected, _ = learner._model.predict(observation.numpy(), deterministic=True)
+    with torch.no_grad():
+        np.testing.assert_allclose(learner.network(observation).numpy(), expected, atol=1e-6)  # float32
+
+
+def test_ppo_refuses_a_symmetry_that_the_task_has_not():
+    with pytest.raises(ValueError, match="BallbotTurn-v0 has no mirror images"):
+        LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], symmetry="mirrors"), 0, None)
 
 
 def test_training_envs_never_end_together():

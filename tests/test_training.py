@@ -168,9 +168,9 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path):
         (["sorcery"], 1, "unknown learner sorcery"),
         (["shac", "--task", "hop"], 1, "unknown task hop"),
         (["shac", "--demos", "nothing"], 1, "shac uses no demonstrations"),
-        (["shac", "--threads", "0"], 1, "threads must be at least 1, not 0"),
-        (["shac", *SETTINGS, "--total-iterations", "-5"], 1, "iterations must be at least 1, not -5"),
-        (["shac", *SETTINGS, "--evaluations", "0"], 1, "evaluations must be at least 1, not 0"),
+        (["shac", "--threads", "0"], 1, "threads must be 1 to 1024, not 0"),
+        (["shac", *SETTINGS, "--total-iterations", "-5"], 1, "total_iterations must be 1 to 1000000000, not -5"),
+        (["shac", *SETTINGS, "--evaluations", "0"], 1, "evaluations must be 1 to 1000000000, not 0"),
     ],
 )
 def test_wrong_options_are_named_before_anything_is_written(arguments, status, message, tmp_path):

@@ -42,6 +42,8 @@ class ModelFreeConfig:
     """Discount factor per control step."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers of actor and critics."""
+    products: bool = True
+    """Whether the critics have a linear path, and see the products of all pairs of their inputs; see `learning.critics`."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
@@ -74,9 +76,7 @@ class ModelFree(ABC):
         self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
         self._env = TrainingEnv(task, params, config.num_envs, config.episode_seconds, config.reward_scale)
 
-    def _set_model(
-        self, model: BaseAlgorithm, actor: nn.Sequential, optimizers: Sequence[torch.optim.Optimizer]
-    ) -> None:
+    def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
         self._model, self._actor, self._optimizers = model, actor, optimizers
         model.set_logger(Logger(folder=None, output_formats=[]))

@@ -13,24 +13,32 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.type_aliases import Schedule
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, value_of_living
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
-from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 
 @dataclass(frozen=True)
 class PpoConfig(ModelFreeConfig):
     """Settings of `Ppo`."""
 
-    rl_iterations: int = 400
-    num_envs: int = 256
-    num_steps: int = 64
+    rl_iterations: int = 700
+    num_envs: int = 32
+    num_steps: int = 256
+    critic_warmup_iterations: int = 20
     imitation_weight: float = 0.3
     """Weight of the imitation loss, the expert's negative log-likelihood, at the start; falls linearly to 0."""
+    symmetry: Symmetry = "none"
+    """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
+    over the task's mirror images, or it sees and acts in the task's frame."""
     gae_lambda: float = 0.95
     """λ of generalized advantage estimation."""
     relative_advantage_floor: float = 0.0
@@ -43,8 +51,10 @@ class PpoConfig(ModelFreeConfig):
     """Learning rate at the end, as a fraction of that at the start. It falls linearly."""
     update_epochs: int = 5
     """Passes over the rollouts of an iteration."""
-    batch_size: int = 2048
+    batch_size: int = 512
     """Env steps per gradient step."""
+    demo_batch_size: int = 2048
+    """In place of `batch_size` if there are demonstrations."""
     clip_range: float = 0.2
     """Range to which the ratio of new and old probability is clipped, about 1."""
     max_grad_norm: float = 0.5
@@ -57,8 +67,13 @@ class PpoConfig(ModelFreeConfig):
     """In place of `std` if there are demonstrations."""
 
 
-TUNED: dict[str, PpoConfig] = {"turn": PpoConfig(episode_seconds=8.0), "weave": PpoConfig(episode_seconds=8.0)}
-"""Settings by name of task; every other task takes the defaults."""
+TUNED: dict[str, PpoConfig] = {
+    "stabilize": PpoConfig(symmetry="odd"),
+    "orbit": PpoConfig(symmetry="frame"),
+    "weave": PpoConfig(symmetry="mirrors", episode_seconds=8.0),
+    "turn": PpoConfig(episode_seconds=8.0),
+}
+"""Settings by name of task."""
 
 
 class RelativeRollouts(RolloutBuffer):
@@ -73,27 +88,94 @@ class RelativeRollouts(RolloutBuffer):
         self.advantages /= np.abs(self.values) + self._floor
 
 
+class MeanAction(torch.nn.Module):
+    """A policy network before its output is clipped, which is the mean of the actions."""
+
+    def __init__(self, network: PolicyNetwork):
+        super().__init__()
+        self.network = network
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return self.network.raw(observation)
+
+
+class Branches(torch.nn.Module):
+    """Actor and critic in the place of SB3's `MlpExtractor`. Their outputs are mean actions and values."""
+
+    latent_dim_pi, latent_dim_vf = 2, 1
+
+    def __init__(self, actor: MeanAction, critic: QuadraticCritic):
+        super().__init__()
+        self.actor, self.critic = actor, critic
+
+    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.actor(features), self.critic(features)
+
+    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+        return self.actor(features)
+
+    def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
+        return self.critic(features)
+
+
+class BranchedPolicy(ActorCriticPolicy):
+    """SB3's policy around an actor that respects a symmetry and a critic that sees products."""
+
+    def __init__(self, *args: Any, spec: PolicySpec, products: bool, value: float, **kwargs: Any):
+        """Args: spec: of the actor; products: whether the critic sees them; value: of every state at the start."""
+        self._spec, self._products, self._value = spec, products, value
+        super().__init__(*args, **kwargs)
+
+    def _build_mlp_extractor(self) -> None:
+        inputs = CriticInputs(self.features_dim, self._products, self._spec.frame)
+        self.branches = Branches(
+            MeanAction(PolicyNetwork(self._spec)), QuadraticCritic(inputs, self._spec.hidden, torch.nn.Tanh)
+        )
+        self.mlp_extractor = cast(MlpExtractor, self.branches)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        # the branches hold the last layers, and SB3 has just initialized them as if they were inner ones
+        self.action_net = self.value_net = cast(torch.nn.Linear, torch.nn.Identity())
+        with torch.no_grad():  # so that the first policy does next to nothing
+            cast(torch.nn.Linear, self.branches.actor.network.mlp[-1]).weight.mul_(0.01)
+        self.branches.critic.start_at(self._value)
+        rate: dict[str, Any] = {"lr": lr_schedule(1)}
+        self.optimizer = self.optimizer_class(self.parameters(), **rate, **self.optimizer_kwargs)
+
+
 class Ppo(ModelFree):
     """The learner; see `training.Learner`."""
 
     def __init__(self, task: Task, params: BallbotParams, config: PpoConfig, seed: int = 0, demos: Demos | None = None):
-        """Args: demos: demonstrations to imitate, or None."""
+        """Takes demonstrations to imitate, or None.
+
+        Raises:
+            ValueError: the task does not have the symmetry that the settings ask for.
+        """
+        spec = spec_for(task, config.symmetry, config.hidden)
         super().__init__(task, params, config, demos)
         self.config = config
         self._std = config.std if demos is None else config.demo_std
         rate = config.learning_rate if demos is None else config.demo_learning_rate
+        value = value_of_living(task, config.reward_scale, config.gamma)
+        plain = config.symmetry == "none" and not config.products
         model = PPO(
-            "MlpPolicy",
+            "MlpPolicy" if plain else BranchedPolicy,
             self._env,
             learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
             n_steps=config.num_steps,
-            batch_size=config.batch_size,
+            batch_size=config.batch_size if demos is None else config.demo_batch_size,
             n_epochs=config.update_epochs,
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,
             clip_range=config.clip_range,
             max_grad_norm=config.max_grad_norm,
-            policy_kwargs={"net_arch": list(config.hidden)},
+            policy_kwargs=(
+                {"net_arch": list(config.hidden)}
+                if plain
+                else {"spec": spec, "products": config.products, "value": value}
+            ),
             rollout_buffer_class=RelativeRollouts if config.relative_advantage_floor else None,
             rollout_buffer_kwargs=(
                 {"floor": config.relative_advantage_floor} if config.relative_advantage_floor else None
@@ -104,12 +186,17 @@ class Ppo(ModelFree):
         policy = cast(ActorCriticPolicy, model.policy)
         self._log_std = cast(torch.nn.Parameter, policy.log_std)
         self._log_std.requires_grad_(False)
-        actor = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
+        if isinstance(policy, BranchedPolicy):
+            actor = policy.branches.actor
+        else:
+            actor = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
         self._set_model(model, actor, (policy.optimizer,))
 
     @property
     def network(self) -> PolicyNetwork:
-        return as_policy(self._actor, self._task, activation="tanh", squash="clip")
+        if isinstance(self._actor, MeanAction):
+            return self._actor.network
+        return as_policy(self._actor.children(), self._task, activation="tanh", squash="clip")
 
     def _improve(self) -> dict[str, float]:
         std = schedules.geometric(self._std, self.config.final_std, self._progress)
@@ -124,6 +211,6 @@ def make(task: Task, params: BallbotParams, config: PpoConfig, seed: int, demos:
     """Makes the learner.
 
     Raises:
-        ValueError: the demonstrations are of another task.
+        ValueError: the demonstrations are of another task, or the task does not have the symmetry that the settings ask for.
     """
     return Ppo(task, params, config, seed, None if demos is None else load_demos(demos, task))

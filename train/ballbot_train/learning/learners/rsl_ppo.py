@@ -2,9 +2,8 @@
 
 What makes the tasks learnable, besides rewards that pay for living (see `ballbot_gym.tasks.base.Task`):
 
-- The critic sees, besides the observation, the products of all pairs of its entries, and it has a linear path. The value of
-  a control problem is nearly a quadratic form. A tanh network alone fits it badly near the goal, and so the robot rests
-  beside the goal.
+- The critic sees, besides the observation, the products of all pairs of its entries, and it has a linear path. `critics`
+  says why.
 - The standard deviation of the actions and the step size fall on a schedule. PPO left to itself narrows the distribution
   before the hardest starts are learnt.
 - The actor sees a task's symmetries: in its frame, or averaged over its mirror images.
@@ -13,7 +12,7 @@ What makes the tasks learnable, besides rewards that pay for living (see `ballbo
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -25,11 +24,12 @@ from tensordict import TensorDict
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.learning.critics import CriticInputs, start_at, value_of_living
 from ballbot_train.learning.learners.model_free import ScopedRng
 from ballbot_train.learning.rsl import RslVecEnv
-from ballbot_train.policy import PolicyNetwork, PolicySpec
+from ballbot_train.policy import PolicyNetwork
 
 _GROUPS = {"actor": ["policy"], "critic": ["policy"]}
 _RETAINED = 0.9  # of the averaged actor per iteration
@@ -61,7 +61,7 @@ class RslPpoConfig:
     """Units of the critic's hidden layers."""
     products: bool = True
     """Whether the critic sees the products of all pairs of observed quantities."""
-    symmetry: Literal["none", "odd", "mirrors", "frame"] = "none"
+    symmetry: Symmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
     over the task's mirror images, or it sees and acts in the task's frame."""
     learning_rate: float = 2e-3
@@ -135,29 +135,17 @@ class Critic(MLPModel):
         self, observations: TensorDict, hidden: tuple[int, ...], frame: str | None, products: bool, value: float
     ):
         """Args: value: of every state at the start."""
-        self._frame = None if frame is None else FRAMES[frame]
-        size = observations["policy"].shape[-1] if self._frame is None else self._frame.size
-        self._pairs = torch.triu_indices(size, size) if products else None
-        self._inputs = size + (0 if self._pairs is None else self._pairs.shape[1])
+        self._seen = CriticInputs(observations["policy"].shape[-1], products, frame)
         super().__init__(observations, _GROUPS, "critic", 1, hidden, activation="tanh")
-        self.linear = torch.nn.Linear(self._inputs, 1)
-        with torch.no_grad():
-            self.linear.weight.zero_()
-            self.linear.bias.fill_(value)
-            last_layer(self.mlp).weight.mul_(0.1)
+        self.linear = torch.nn.Linear(self._seen.size, 1)
+        start_at(value, self.linear, last_layer(self.mlp))
 
     def _get_latent_dim(self) -> int:
-        return self._inputs
+        return self._seen.size
 
     def get_latent(self, obs: TensorDict, masks: Any = None, hidden_state: Any = None) -> torch.Tensor:
         """(B, inputs) what the network sees."""
-        seen = obs["policy"]
-        if self._frame is not None:
-            seen = torch.stack(self._frame.features(seen.unbind(-1))[0], -1)
-        if self._pairs is None:
-            return seen
-        first, second = self._pairs
-        return torch.cat([seen, seen[:, first] * seen[:, second]], -1)
+        return self._seen(obs["policy"])
 
     def forward(self, obs: TensorDict, masks: Any = None, hidden_state: Any = None, **_: Any) -> torch.Tensor:
         """(B, 1) values."""
@@ -179,9 +167,8 @@ class RslPpo:
             self._env = RslVecEnv(BallbotBatch(shorter, config.num_envs, compile=False, params=params), seed)
             self._env.episode_length_buf = torch.randint(shorter.steps, (config.num_envs,))
             self._seen = seen = self._env.get_observations()
-            spec = spec_for(task, config)
-            # living for ever without cost: PPO clips how fast values change, and this is far from 0
-            value = config.reward_scale * task.survival_reward * task.control_dt / (1 - config.gamma)
+            spec = spec_for(task, config.symmetry, config.hidden)
+            value = value_of_living(task, config.reward_scale, config.gamma)
             self._actor = Actor(seen, PolicyNetwork(spec), config.std)
             with torch.no_grad():  # so that the first policy does next to nothing
                 last_layer(self._actor.network.mlp).weight.mul_(0.1)
@@ -264,28 +251,6 @@ class RslPpo:
         self._env.batch.state = BatchState(*state["batch"])
         self._seen = self._env.get_observations()
         self._random.load_state_dict(state["random"])
-
-
-def spec_for(task: Task, config: RslPpoConfig) -> PolicySpec:
-    """The shape of the policy.
-
-    Raises:
-        ValueError: the task does not have the symmetry that the settings ask for.
-    """
-    fields: dict[str, Any] = {"hidden": config.hidden, "linear": False, "squash": "clip"}
-    if config.symmetry == "odd":
-        if not any(set(mirror.state) == {-1} for mirror in task.mirrors):
-            raise ValueError(f'{task.id} is not odd; give "none", "mirrors" or "frame" as its symmetry')
-        fields["odd"] = True
-    elif config.symmetry == "mirrors":
-        if not task.mirrors:
-            raise ValueError(f'{task.id} has no mirror images; give "none" as its symmetry')
-        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
-    elif config.symmetry == "frame":
-        if task.frame is None:
-            raise ValueError(f'{task.id} has no frame; give "none" or "mirrors" as its symmetry')
-        fields["frame"] = task.frame
-    return PolicySpec.of(task, **fields)
 
 
 def make(task: Task, params: BallbotParams, config: RslPpoConfig, seed: int, demos: Path | None) -> RslPpo:

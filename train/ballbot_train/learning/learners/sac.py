@@ -10,15 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.sac.policies import SACPolicy
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
+from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, value_of_living
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
 from ballbot_train.policy import PolicyNetwork
@@ -99,6 +105,48 @@ class SymmetricReplay(ReplayBuffer):
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
+class ProductCritic(ContinuousCritic):
+    """SB3's critics, each a `QuadraticCritic` on observation and action."""
+
+    def __init__(
+        self,
+        observation_space: gymnasium.Space,
+        action_space: gymnasium.spaces.Box,
+        net_arch: list[int],
+        *,
+        features_dim: int,
+        activation_fn: type[torch.nn.Module],
+        value: float,
+        **kwargs: Any,
+    ):
+        """Args: value: of every state and action at the start; the others are SB3's."""
+        super().__init__(
+            observation_space,
+            action_space,
+            net_arch,
+            features_dim=features_dim,
+            activation_fn=activation_fn,
+            **kwargs,
+        )
+        inputs = CriticInputs(features_dim + get_action_dim(action_space))
+        self.q_networks = [QuadraticCritic(inputs, net_arch, activation_fn, value) for _ in range(self.n_critics)]
+        for index, critic in enumerate(self.q_networks):
+            self.add_module(f"qf{index}", critic)
+
+
+class ProductPolicy(SACPolicy):
+    """SB3's policy with critics that see products."""
+
+    def __init__(self, *args: Any, value: float, **kwargs: Any):
+        """Args: value: of every state and action at the start; the others are SB3's."""
+        self._value = value
+        super().__init__(*args, **kwargs)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return ProductCritic(**kwargs, value=self._value).to(self.device)
+
+
 class Sac(ModelFree):
     """The learner; see `training.Learner`."""
 
@@ -107,8 +155,9 @@ class Sac(ModelFree):
         super().__init__(task, params, config, demos)
         self.config = config
         rate = config.learning_rate
+        value = value_of_living(task, config.reward_scale, config.gamma)
         model = SAC(
-            "MlpPolicy",
+            ProductPolicy if config.products else "MlpPolicy",
             self._env,
             learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
             buffer_size=config.rl_iterations * config.num_steps * config.num_envs,
@@ -125,6 +174,7 @@ class Sac(ModelFree):
                 "net_arch": list(config.hidden),
                 "n_critics": config.num_critics,
                 "activation_fn": torch.nn.SiLU,
+                **({"value": value} if config.products else {}),
             },
             seed=seed,
             device="cpu",
@@ -143,7 +193,7 @@ class Sac(ModelFree):
 
     @property
     def network(self) -> PolicyNetwork:
-        return as_policy(self._actor, self._task, activation="silu", squash="tanh")
+        return as_policy(self._actor.children(), self._task, activation="silu", squash="tanh")
 
     def state_dict(self) -> dict[str, Any]:
         own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}

@@ -1,0 +1,32 @@
+"""The shapes of actors that respect the symmetry of their task."""
+
+from typing import Any, Literal
+
+from ballbot_gym.tasks import Task
+from ballbot_train.policy import PolicySpec
+
+Symmetry = Literal["none", "odd", "mirrors", "frame"]
+"""How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
+the task's mirror images, or it sees and acts in the task's frame."""
+
+
+def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...]) -> PolicySpec:
+    """The shape of a policy whose output is clipped.
+
+    Raises:
+        ValueError: the task does not have the symmetry that the settings ask for.
+    """
+    fields: dict[str, Any] = {"hidden": hidden, "linear": False, "squash": "clip"}
+    if symmetry == "odd":
+        if not any(set(mirror.state) == {-1} for mirror in task.mirrors):
+            raise ValueError(f'{task.id} is not odd; give "none", "mirrors" or "frame" as its symmetry')
+        fields["odd"] = True
+    elif symmetry == "mirrors":
+        if not task.mirrors:
+            raise ValueError(f'{task.id} has no mirror images; give "none" as its symmetry')
+        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
+    elif symmetry == "frame":
+        if task.frame is None:
+            raise ValueError(f'{task.id} has no frame; give "none" or "mirrors" as its symmetry')
+        fields["frame"] = task.frame
+    return PolicySpec.of(task, **fields)

@@ -1,0 +1,78 @@
+"""What a critic sees, and the value that it starts from.
+
+The value of a control problem is nearly a quadratic form. A tanh network alone fits it badly near the goal, and so the robot
+rests beside the goal. A linear path over the products of all pairs of observed quantities fits it exactly.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+
+from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import FRAMES
+
+
+class CriticInputs:
+    """An observation as a critic sees it: in the task's frame if one is named, and with the products of its entries."""
+
+    def __init__(self, observations: int, products: bool = True, frame: str | None = None):
+        """Args: observations: their number; products: of all pairs, squares included; frame: name in `FRAMES`, or None."""
+        self._frame = None if frame is None else FRAMES[frame]
+        entries = observations if self._frame is None else self._frame.size
+        self._pairs = torch.triu_indices(entries, entries) if products else None
+        self.size = entries + (0 if self._pairs is None else self._pairs.shape[1])
+        """Number of inputs."""
+
+    def __call__(self, observation: torch.Tensor) -> torch.Tensor:
+        """(B, observations) to (B, size)."""
+        if self._frame is not None:
+            observation = torch.stack(self._frame.features(observation.unbind(-1))[0], -1)
+        if self._pairs is None:
+            return observation
+        first, second = self._pairs
+        return torch.cat([observation, observation[:, first] * observation[:, second]], -1)
+
+
+class QuadraticCritic(torch.nn.Module):
+    """The sum of a network and a linear path, both on what `CriticInputs` gives."""
+
+    def __init__(
+        self, inputs: CriticInputs, hidden: Sequence[int], activation: type[torch.nn.Module], value: float = 0.0
+    ):
+        """Args: hidden: units of the network's hidden layers; value: of every state at the start, about."""
+        super().__init__()
+        self._inputs = inputs
+        layers: list[torch.nn.Module] = []
+        for fan_in, fan_out in itertools.pairwise((inputs.size, *hidden)):
+            layers += [torch.nn.Linear(fan_in, fan_out), activation()]
+        self.mlp = torch.nn.Sequential(*layers, torch.nn.Linear((inputs.size, *hidden)[-1], 1))
+        self.linear = torch.nn.Linear(inputs.size, 1)
+        self.start_at(value)
+
+    def start_at(self, value: float) -> None:
+        """Makes all values about `value`."""
+        start_at(value, self.linear, cast(torch.nn.Linear, self.mlp[-1]))
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """(B, observations) to values (B, 1)."""
+        seen = self._inputs(observation)
+        return self.mlp(seen) + self.linear(seen)
+
+
+def value_of_living(task: Task, reward_scale: float, gamma: float) -> float:
+    """Discounted sum of scaled rewards of living for ever without cost; without a discount, for the task's duration.
+
+    Critics start from it, because the values of good policies are near it and far from 0.
+    """
+    paid = reward_scale * task.survival_reward * task.control_dt
+    return paid / (1 - gamma) if gamma < 1 else paid * task.steps
+
+
+def start_at(value: float, linear: torch.nn.Linear, last: torch.nn.Linear) -> None:
+    """Makes the sum of a linear path and a network about `value` everywhere, by the path and the network's last layer."""
+    with torch.no_grad():
+        linear.weight.zero_()
+        linear.bias.fill_(value)
+        last.weight.mul_(0.1)
