@@ -32,6 +32,7 @@ TINY = {
         **IMITATING,
     ),
     "sac": sac.SacConfig(
+        products=True,
         rl_iterations=3,
         num_envs=4,
         num_steps=8,
@@ -100,7 +101,7 @@ def test_a_learner_goes_on_from_its_state_as_if_never_stopped(name, demonstrated
 
 
 def test_the_policy_acts_as_the_actor_does(name, tmp_path):
-    task, learner = make_task("stabilize"), make(name)
+    task, learner = make_task("stabilize"), make(name, products=True)
     run(learner, 1)
     observation = np.random.default_rng(0).normal(size=(100, 8)).astype(np.float32)
     save_policy(tmp_path / "policy", learner.network, {})
@@ -175,7 +176,7 @@ def test_a_quadratic_value_is_linear_in_what_the_critic_sees(frame):
 
 
 def test_critics_have_a_linear_path_and_start_at_the_value_of_living_for_ever(name):
-    task, learner = make_task("stabilize"), make(name)
+    task, learner = make_task("stabilize"), make(name, products=True)
     value = value_of_living(task, TINY[name].reward_scale, TINY[name].gamma)
     assert value == pytest.approx(TINY[name].reward_scale * 100 * task.control_dt / (1 - TINY[name].gamma))
     observation, action = observed(50), torch.zeros(50, 2)
@@ -212,7 +213,7 @@ def test_without_products_the_networks_are_those_of_stable_baselines3(name):
 
 
 def test_products_change_nothing_about_what_an_actor_sees(name):
-    assert make(name).network.spec == make(name, products=False).network.spec
+    assert make(name, products=True).network.spec == make(name, products=False).network.spec
 
 
 @pytest.mark.parametrize(("task", "symmetry"), [("stabilize", "odd"), ("weave", "mirrors"), ("orbit", "frame")])

@@ -34,6 +34,9 @@ from ballbot_train.policy import PolicyNetwork
 class SacConfig(ModelFreeConfig):
     """Settings of `Sac`."""
 
+    products: bool = False
+    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions. The only
+    trial so far, 50,000 steps on Stabilize, learnt nothing with them."""
     rl_iterations: int = 200
     num_envs: int = 16
     num_steps: int = 63
