@@ -202,7 +202,7 @@ def test_only_the_command_that_is_called_is_imported():
         (["-h"], 0, "usage: ballbot COMMAND"),
         (["--version"], 0, "ballbot 0."),
         (["trian"], 2, "no command 'trian'; did you mean train?"),
-        (["[red]x"], 2, "no command '[red]x'; the commands are benchmark, compare"),
+        (["[red]x"], 2, "no command '[red]x'; the commands are benchmark, evaluate, compare"),
         (["compare"], 2, "ballbot compare"),
     ],
 )
