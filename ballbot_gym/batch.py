@@ -414,6 +414,8 @@ def run_episodes(
 ) -> BatchEpisodes:
     """Runs one episode of each environment, all at once and without gradients.
 
+    It stops when the last episode has ended, unless states are recorded.
+
     Args:
         batch: where to run; it is reset with seed 0.
         policy: from observations (B, no) to actions (B, 2).
@@ -441,6 +443,8 @@ def run_episodes(
         running &= ~(result.terminated | result.truncated)
         if record:
             states.append(result.final_x)
+        elif not running.any():
+            break
     recorded = torch.stack(states) if record else None
     return BatchEpisodes(cost, success, failure, violated, terminated, steps, recorded)
 

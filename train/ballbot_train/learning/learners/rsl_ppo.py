@@ -191,7 +191,7 @@ class RslPpo:
 
     @property
     def network(self) -> PolicyNetwork:
-        """The average of the actor's last iterations, which is better than any one of them."""
+        """A running average of the actor over its last ten or so iterations."""
         return self._average
 
     def iterate(self) -> dict[str, float]:
