@@ -39,7 +39,7 @@ EPISODES = 10_000
 _MOST_EPISODES = 1_000_000
 _BATCH = 2500  # episodes that run at once
 _CHUNK = 5  # episodes of a job that finds optima
-_PURPOSES = {"evaluation": 0, "validation": 1}
+_PURPOSES = {"evaluation": 0, "validation": 1, "training": 2}
 _DISCRETE = 12  # a quantity with at most so many values gets a bin for each of them
 _PER_BIN = 125  # episodes of a bin on average, by default
 _MOST_BINS = 80
@@ -231,7 +231,7 @@ def draw(
     task: Task,
     episodes: Iterable[int],
     seed: int,
-    purpose: Literal["evaluation", "validation"] = "evaluation",
+    purpose: Literal["evaluation", "validation", "training"] = "evaluation",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Initial states (n, 8) and constants (n, nc) of fresh episodes.
 

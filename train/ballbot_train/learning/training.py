@@ -102,6 +102,16 @@ class Finetunable(Protocol):
         """Takes the weights of a policy; raises a ValueError for a network of another shape."""
 
 
+@runtime_checkable
+class Staged(Protocol):
+    """A learner whose training begins easier than the task."""
+
+    @property
+    def difficulty(self) -> dict[str, float]:
+        """How far its curriculum has come, by name; empty where it has none."""
+        ...
+
+
 @dataclass(frozen=True)
 class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
@@ -317,11 +327,13 @@ class _Run:
         return network
 
     def _about(self) -> dict[str, Any]:
+        reached = self.learner.difficulty if isinstance(self.learner, Staged) else {}
         return {
             "training": self.config,
             "chosen_by": {"episodes": f"{VALIDATION_EPISODES} fresh, for validation", "cost": self.best},
             "iteration": self.learner.iteration,
             "training_seconds": round(self.seconds, 1),
+            **({"curriculum_reached": reached} if reached else {}),
         }
 
     def _write_rows(self) -> None:
