@@ -15,9 +15,8 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, console, print_table, progress_bars
 from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
-from ballbot_train.evaluation.controllers import is_file, make_controller
+from ballbot_train.evaluation.controllers import is_file, is_made_for, made_for, make_controller
 from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
-from ballbot_train.policy_files import read_description
 from ballbot_train.provenance import provenance
 
 _FRESH = 10_000
@@ -42,8 +41,10 @@ def evaluate(
     """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
 
     Args:
-        policy: a policy file, or the name of a policy that comes with the package; with --episodes also an expert.
-        task: name of its task; default the one that its file names, or else stabilize.
+        policy: a policy file, a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt), or the name of a policy that comes
+            with the package; with --episodes also an expert. Statistics of VecNormalize are read from
+            MODEL.vecnormalize.npz beside the model, which `ballbot_train.save_vecnormalize` writes.
+        task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
         fresh: how many fresh episodes, in the batched closed-form model; default 10000, or none where --episodes is given.
             They are never the certified ones.
         seed: of the fresh episodes.
@@ -86,11 +87,10 @@ def _task_of(policy: str, task: str | None) -> str:
         return task
     if not is_file(policy):
         return "stabilize"
-    made_for = read_description(policy)["spec"]["task"]
-    named = next((name for name in TASKS if make_task(name).problem() == made_for), None)
+    named = next((name for name in TASKS if is_made_for(policy, make_task(name))), None)
     if named is None:
         raise ValueError(
-            f"{policy} was made for {made_for}, which is none of {', '.join(TASKS)} with its default fields"
+            f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields"
         )
     return named
 

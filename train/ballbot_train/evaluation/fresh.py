@@ -27,11 +27,12 @@ from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import is_file
+from ballbot_train.evaluation.controllers import is_file, is_saved_model
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.policy import load_network, shipped_policies
+from ballbot_train.saved_models import load_actor
 
 EPISODES = 10_000
 """Fresh episodes by default."""
@@ -251,8 +252,8 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
     """A policy as a function from observations (B, no) to actions (B, 2), for one episode of each of B environments.
 
     Args:
-        policy: a policy file, the name of a shipped policy, a model with Stable-Baselines3's `predict`, or a function of
-            tensors such as a `PolicyNetwork`. It is given float32.
+        policy: a policy file, a saved model, the name of a shipped policy, a model with Stable-Baselines3's `predict`, or a
+            function of tensors such as a `PolicyNetwork`. It is given float32.
         task: what it is to do.
 
     Raises:
@@ -269,7 +270,9 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
             )
         if name not in shipped and not is_file(name):
             raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
-        network = load_network(shipped.get(name, name), task).eval()
+        network = (
+            load_actor(name, task) if is_saved_model(name) else load_network(shipped.get(name, name), task)
+        ).eval()
         return lambda observation: network(observation.float())
     if callable(getattr(policy, "predict", None)):
         predictor, begins = Predictor(policy), itertools.chain([True], itertools.repeat(False))
