@@ -19,6 +19,7 @@ COMMANDS: dict[str, str] = {
     "certify": "ballbot_train.commands.certify:certify",
     "demos": "ballbot_train.commands.demos:demos",
     "train": "ballbot_train.commands.train:train",
+    "tune": "ballbot_train.commands.tune:tune",
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 
