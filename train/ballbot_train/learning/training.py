@@ -246,6 +246,8 @@ class _Run:
                 self.best = validate(best, self.task).cost
                 unknown = {f"validation_{field.name}": math.nan for field in fields(Validation)}
                 self.rows = [row | unknown for row in self.rows]
+        except MemoryError:
+            raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
             raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error!r})") from error
         save_policy(self.out / "policy", best, self._about())
