@@ -1,5 +1,6 @@
 """What is not installed is named, with the extra that brings it."""
 
+import json
 import subprocess
 import sys
 
@@ -81,3 +82,16 @@ def test_without_pybullet_the_default_is_rk4_with_one_notice_and_bullet_says_how
 def test_with_pybullet_the_default_is_bullet():
     pytest.importorskip("pybullet")
     assert "bullet" in run("import ballbot_gym; print(ballbot_gym.BallbotEnv().physics)")
+
+
+def test_commands_run_without_pybullet_and_say_once_which_physics_they_use(tmp_path):
+    typed = f"robustness --tasks turn --controllers lqr --stresses com --episodes 1 --workers 1 --out {tmp_path}"
+    wrote = run(
+        "import os\nos.environ['BALLBOT_IN_PROCESS'] = '1'\n"
+        f"from ballbot_train.cli import main\nsys.argv = ['ballbot', *{typed.split()!r}]\nmain()\n",
+        "pybullet",
+    )
+    assert "physics=rk4" in wrote
+    assert wrote.count('PyBullet is not installed: physics="rk4" is used') == 1
+    assert "Warning" not in wrote
+    assert json.loads((tmp_path / "robustness.json").read_text())["about"]["physics"] == "rk4"
