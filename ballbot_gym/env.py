@@ -17,7 +17,8 @@ from ballbot_gym.scene import Scene
 from ballbot_gym.simulator import PHYSICS, State, default_physics
 from ballbot_gym.tasks import TASKS, Task
 
-_LARGEST = 1e6  # of any number that reset takes
+LARGEST = 1e6
+"""Of any number that `reset` takes."""
 
 
 class EnvState(NamedTuple):
@@ -457,6 +458,6 @@ def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:
         vector = np.zeros(())
     if vector.shape != (size,) or not np.isfinite(vector).all():
         raise ValueError(f"{what} must be {size} finite numbers, not {value!r}")
-    if (np.abs(vector) > _LARGEST).any():
-        raise ValueError(f"{what} must be numbers within ±{_LARGEST:g}, not {value!r}")
+    if (np.abs(vector) > LARGEST).any():
+        raise ValueError(f"{what} must be numbers within ±{LARGEST:g}, not {value!r}")
     return vector

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import make_task
+from ballbot_gym.lazy import missing
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
@@ -33,6 +33,11 @@ from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.policy import load_network, shipped_policies
 from ballbot_train.saved_models import load_actor
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 EPISODES = 10_000
 """Fresh episodes by default."""

@@ -272,6 +272,8 @@ class _Run:
                 self.best = float(state["best_validation"])
             else:  # of an earlier version, which chose the best policy on the certified episodes
                 self.best = validate(best, self.task).cost
+        except MemoryError:
+            raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
             raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error!r})") from error
         save_policy(self.out / "policy", best, self._about())
