@@ -376,9 +376,14 @@ def _optima(task_name: str, seed: int, episodes: Sequence[int]) -> Iterator[jobs
     task = make_task(task_name)
     for i, x, c in zip(episodes, *draw(task, episodes, seed), strict=True):
         try:
-            yield {"episode": i, "cost": find_optimum(task, default_params(), x, c).cost}
+            optimum = find_optimum(task, default_params(), x, c)
         except PlanError as error:
             yield {"episode": i, "error": str(error)}
+            continue
+        if optimum.is_optimal:
+            yield {"episode": i, "cost": optimum.cost}
+        else:
+            yield {"episode": i, "error": f"only a feasible episode was found ({optimum.solver_status})"}
 
 
 def write(

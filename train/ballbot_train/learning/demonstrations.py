@@ -441,8 +441,8 @@ def _optimum(env: BallbotEnv, x: np.ndarray, c: np.ndarray) -> dict[str, Any]:
     except PlanError as error:
         return {"optimum": math.nan, "solver_status": str(error), "violation": math.nan}
     return {
-        "optimum": optimum.cost,
-        "solver_status": f"{optimum.solver}: {optimum.status}",
+        "optimum": optimum.cost if optimum.is_optimal else math.nan,
+        "solver_status": f"{optimum.solver}: {optimum.solver_status}",
         "violation": optimum.violation,
     }
 
