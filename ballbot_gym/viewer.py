@@ -137,7 +137,7 @@ class Viewer:
         if self._looks.get(key) != (look := (params, robot.color, robot.alpha, grab)):
             self._remove(key)
             self._nodes[key], self._looks[key] = self._add_robot(params, robot, grab), look
-        ball, body, *_ = self._nodes[key]
+        ball, body, _ = self._nodes[key]
         place = pose(params, robot.x)
         ball.position, body.position, body.wxyz = place.ball, place.body, place.turn
         keys = {key, f"force {robot.name}", f"push {robot.name}"}
@@ -150,7 +150,9 @@ class Viewer:
         return keys
 
     def _add_robot(self, params: BallbotParams, robot: Robot, grab: bool) -> list[Any]:
+        """The nodes that move, then the one that holds them all."""
         scene, name = self.server.scene, f"/world/{_node_name(robot.name)}"
+        root = scene.add_frame(name, show_axes=False)
         opacity = None if robot.alpha == 1 else robot.alpha
         ball, body = (scene.add_frame(f"{name}/{part}", show_axes=False) for part in ("ball", "body"))
         look = {"opacity": opacity, "cast_shadow": False, "receive_shadow": False}
@@ -165,7 +167,7 @@ class Viewer:
             position=(0.0, 0.0, 0.44 * length),
             **look,
         )
-        shadow = scene.add_cylinder(
+        scene.add_cylinder(
             f"{name}/ball/shadow",
             1.3 * params.ball_radius,
             0.002,
@@ -178,7 +180,7 @@ class Viewer:
         if grab:
             for part in (sphere, shape, cap):
                 part.on_drag("left")(self._grabbed)
-        return [ball, body, sphere, shape, cap, shadow]
+        return [ball, body, root]
 
     def _draw_arrow(self, key: str, ends: tuple[np.ndarray, np.ndarray] | None, color: str) -> None:
         if key not in self._nodes:
@@ -231,7 +233,8 @@ class Viewer:
         )
 
     def _remove(self, key: str) -> None:
-        for node in reversed(self._nodes.pop(key, [])):
+        nodes = self._nodes.pop(key, [])
+        for node in nodes[-1:] if key.startswith("robot ") else nodes:
             node.remove()
         self._looks.pop(key, None)
 

@@ -4,6 +4,9 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+_ONE_JOB = threading.Lock()  # solvers are kept for reuse, and none may be used by two threads at once
+_CLOSING = 30.0  # s, that `close` waits for the job that is being done
+
 
 class Background:
     """One thread that does jobs by key, in the order in which they came. Solvers let the simulation run while they compute.
@@ -57,12 +60,13 @@ class Background:
             return self._changed.wait_for(lambda: all(self._ended(key) for key in self._wanted), seconds)
 
     def close(self) -> None:
-        """Ends the thread after the job that it does; may be called again."""
+        """Ends the thread after the job that it does, and waits for that; may be called again."""
         with self._changed:
             self._closed = True
             self._jobs.clear()
             self._wanted.clear()
             self._changed.notify_all()
+        self._thread.join(_CLOSING)
 
     def _ended(self, key: str) -> bool:
         return key in self._done and self._done[key][0] == self._wanted[key]
@@ -76,7 +80,8 @@ class Background:
                 key = next(iter(self._jobs))
                 number, job = self._jobs.pop(key)
             try:
-                value = job()
+                with _ONE_JOB:
+                    value = job()
             except Exception as error:  # the simulation decides what an error means
                 value = error
             with self._changed:

@@ -33,12 +33,14 @@ _TEXT_HZ = 4.0
 _STARVED = 0.25  # s, after which a moment is drawn even if steps are due
 _MOST_STEPS = 10  # between two looks at the requests
 _IDLE = 0.02  # s, between two looks while nothing moves
-_IMPULSE_PER_METRE = 6.0  # N·s of a push by dragging the robot
+_IMPULSE_PER_METRE = 10.0  # N·s of a push by dragging the robot
 _STICK_METRES = 1.0  # of a drag that puts the stick fully out
 _HELD = 0.25  # s, after which a button of the pad counts as let go
 _KEY_HELD = 0.6  # s, the same for a key: keyboards repeat a held key only after half a second
 _OTHERS = 4  # ghosts that the plots have lines for
 _PLOT_POINTS = 200
+_NARROW = 600  # px, of a phone's page, whose lower part viser covers with the controls
+_NARROW_EYE, _NARROW_AIM = (-3.4, -2.4, 2.4), (-1.55, -1.1, 0.0)  # m: the robot is in the upper part
 _DIRECTIONS = {"forward": (1.0, 0.0), "left": (0.0, 1.0), "back": (-1.0, 0.0), "right": (0.0, -1.0)}
 _KEYS = {"W": "forward", "A": "left", "S": "back", "D": "right"}
 _ARROWS = {"arrowup": "forward", "arrowleft": "left", "arrowdown": "back", "arrowright": "right"}
@@ -156,6 +158,8 @@ class PlayPage:
         button = client.gui.add_button("Take the controls", order=-19)
         button.on_click(lambda _: self._take_over(client.client_id))
         self._roles[client.client_id] = text, button
+        if client.camera.image_width < _NARROW:
+            client.camera.position, client.camera.look_at = _NARROW_EYE, _NARROW_AIM
         self._show_roles()
 
     def _on_disconnect(self, client: Any) -> None:
@@ -293,7 +297,7 @@ class PlayPage:
     def _build_push(self) -> None:
         gui = self._gui
         with gui.add_folder("Push"):
-            self._impulse = gui.add_slider("N·s", 0.0, LARGEST_PUSH, step=0.5, initial_value=5.0)
+            self._impulse = gui.add_slider("N·s", 0.0, LARGEST_PUSH, step=0.5, initial_value=10.0)
             self._bearing = gui.add_slider("Direction, °", 0, 360, step=5, initial_value=0, hint="from the x axis")
             for control in (self._impulse, self._bearing):
                 held = [control.value]

@@ -69,7 +69,7 @@ _PAUSE = 1.5  # s, between the end of an episode and the next
 _PUSH_SHOWN = 0.3  # s, for which a push is drawn
 _AHEAD = 1.0  # s before the end of an episode at which the plan for the next one is begun
 _PLAN_POINTS = 60  # of a drawn plan
-_SETTLE = 120.0  # s
+_SETTLE = 900.0  # s: the first time in a task, solvers are compiled
 _EPISODES_KEPT = 100
 _LEAST_COST = 0.01  # of an optimum to which a cost is compared; one that starts at rest costs nothing
 
@@ -234,12 +234,14 @@ class Playground:
             if self._pause_left == 0:
                 self._begin_next()
             return True
+        if self._plan_again():
+            return False
         dt = self.task.control_dt
         noise = tuple(self._rng.random(Randomization.NOISE_DRAWS).tolist())
         push = self._take_push()
         left = (self.task.steps - self._elapsed - 1) * dt
         for key, runner in self._runners.items():
-            if not runner.violated:
+            if not runner.stands_still:
                 runner.step(self._step, self._command(key, runner, noise), push, self._c, left)
         self._step += 1
         self._elapsed += 1
@@ -604,6 +606,22 @@ class Playground:
         runner.name, step, controller = value
         runner.take_controller(controller, step)
 
+    def _plan_again(self) -> bool:
+        """Whether a robot waits because its plan to a first-exit goal is over, and it is not there.
+
+        NMPC would plan within `act`. But solvers must not run in two threads, so the background plans.
+        """
+        if not self.task.first_exit:
+            return False
+        for key, runner in self._runners.items():
+            plan = getattr(runner.controller, "plan", None)
+            if plan is None or runner.stands_still or not hasattr(runner.controller, "predicted"):
+                continue
+            if runner.seconds_of_controller(self._step) > plan.trajectory.duration - 0.5 * self.task.control_dt:
+                runner.take_controller(None, self._step)
+                self._request(key, runner.x)
+        return self.preparing
+
     def _command(self, key: str, runner: Runner, noise: tuple[float, ...]) -> tuple[float, float]:
         try:
             return runner.act(self._step, noise)
@@ -626,8 +644,7 @@ class Playground:
 
     def _after_step(self) -> None:
         main, steps = self.main, self.task.steps
-        x = main.x
-        if main.violated or (self.task.first_exit and self.task.is_goal(x, self._c)):
+        if main.stands_still:
             self._end()
             return
         ahead = round(_AHEAD / self.task.control_dt)

@@ -45,7 +45,9 @@ class Runner:
         self.push = (0.0, 0.0)
         self.cost = 0.0
         self.violated = ""
-        """The limit that was violated: the robot then stands still. "" while all is well."""
+        """The limit that was violated, or ""."""
+        self.arrived = False
+        """Whether the goal of a first-exit task is reached."""
         self.trace: deque[tuple[float, float]] = deque(maxlen=TRACE_STEPS)
         self.samples: deque[Sample] = deque(maxlen=TRACE_STEPS)
         self._task, self._nominal = task, params
@@ -54,6 +56,11 @@ class Runner:
         self._simulator = PHYSICS[physics](params, task.control_dt)
         self.set_plant(Randomization())
         self.begin(self.x)
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether its episode is over."""
+        return self.violated != "" or self.arrived
 
     @property
     def trajectory(self) -> Trajectory | None:
@@ -79,7 +86,8 @@ class Runner:
 
     def place(self, x: State) -> None:
         """Puts the robot upright, or however x (8,) says."""
-        self.x, self.force, self.push, self.violated = x, (0.0, 0.0), (0.0, 0.0), ""
+        self.x, self.force, self.push = x, (0.0, 0.0), (0.0, 0.0)
+        self.violated, self.arrived = "", False
         self._simulator.reset(x)
 
     def take_controller(self, controller: Controller | None, step: int) -> None:
@@ -142,6 +150,7 @@ class Runner:
         self.violated = task.violated(x, c)
         if not all(map(math.isfinite, x)):
             x = self.x
+        self.arrived = task.first_exit and not self.violated and task.is_goal(x, c)
         self.x = x
         sample = Sample((step + 1) * dt, dynamics.tilt(x), math.hypot(*self.force), self.cost, self._act_seconds)
         self.samples.append(sample)
