@@ -81,6 +81,7 @@ class PlayPage:
         self._saved = 0
         self._gui.configure_theme(show_logo=False, show_share_button=False)
         self._build()
+        self._refresh()
         viewer.on_grab = self._on_grab
         viewer.server.on_client_connect(self._on_connect)
         viewer.server.on_client_disconnect(self._on_disconnect)
@@ -142,7 +143,7 @@ class PlayPage:
                 break
             try:
                 request()
-            except (ValueError, TypeError, OSError) as error:
+            except Exception as error:  # whatever a browser sends, the simulation goes on
                 self.playground.notice = str(error)
             self._refresh()
         for job in [job for job in self._jobs if job[0].done()]:
