@@ -219,7 +219,7 @@ class BallbotEnv(gymnasium.Env):
         return self._scene.draw(tuple(map(float, x)))
 
     def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:
-        """The keys of `gymnasium.utils.play.play(env, noop=np.zeros(2))`: w, a, s and d push the ball as seen in the picture."""
+        """Keys for `gymnasium.utils.play.play(env, noop=np.zeros(2))`: w, a, s, d push the ball as seen on the screen."""
         ahead = np.array([math.sin(_VIEW), math.cos(_VIEW)])
         aside = np.array([-ahead[1], ahead[0]])
         ways = {"w": ahead, "a": aside, "s": -ahead, "d": -aside}
