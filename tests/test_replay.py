@@ -15,7 +15,7 @@ from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
 from ballbot_train.report.film import film_frames, film_times, write_film
-from ballbot_train.report.perspective import Camera, body_axis
+from ballbot_train.report.perspective import Camera
 from ballbot_train.report.replay import Replay, Take, certified_replay, file_replay, with_ghosts
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
@@ -33,14 +33,6 @@ def lean(to, seconds=1.0, steps=50):
 def two_takes():
     takes = (Take("still", lean(0.0), "#c0392b"), Take("leaning", lean(0.8, seconds=0.6), "#1f6fb2", "note"))
     return Replay("a title", takes, (Marker((1.0, 0.0), 0.3, 0.25, (0.8, 0.1, 0.1, 1.0)),))
-
-
-def test_body_axis_tilts_as_the_urdf_does():
-    x = np.array([0, 0, 0.3, -0.4, 0, 0, 0, 0])
-    axis = body_axis(x)
-    assert np.linalg.norm(axis) == pytest.approx(1)
-    assert math.acos(axis[2]) == pytest.approx(math.acos(math.cos(0.3) * math.cos(0.4)))
-    assert axis[0] > 0 > axis[1]
 
 
 def test_camera_looks_at_its_target_and_sees_up_as_up_and_far_as_small():

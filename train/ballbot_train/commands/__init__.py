@@ -20,6 +20,7 @@ COMMANDS: dict[str, str] = {
     "paper": "ballbot_train.commands.paper:paper",
     "optimize": "ballbot_train.commands.optimize:optimize",
     "replay": "ballbot_train.commands.replay:replay",
+    "play": "ballbot_train.commands.play:play",
     "certify": "ballbot_train.commands.certify:certify",
     "demos": "ballbot_train.commands.demos:demos",
     "train": "ballbot_train.commands.train:train",

@@ -18,12 +18,11 @@ from PIL import Image
 from ballbot_gym import dynamics, files
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
-from ballbot_train.report.perspective import GroundPath, PerspectiveView, Robot
-from ballbot_train.report.replay import Replay, Take
+from ballbot_train.report.perspective import PerspectiveView
+from ballbot_train.report.replay import Replay
 
 Format = Literal["png", "mp4", "gif", "webp"]
 
-_GHOST = "#3d4b66"
 _FAILED = "#c01818"
 _GIF_COLORS = 128
 _INCHES = (
@@ -41,7 +40,7 @@ def write_strip(replay: Replay, path: Path, frames: int, seconds: float) -> Path
     axes = figure.subplots(rows, frames, squeeze=False)
     for row, take in zip(axes, replay.takes, strict=True):
         for axis, t in zip(row, np.linspace(0, seconds, frames), strict=True):
-            _draw_take(PerspectiveView(axis, replay.params, replay.markers, aspect=4 / 3), take, t)
+            PerspectiveView(axis, aspect=4 / 3).draw(replay.drawing(take, t))
             axis.set_aspect("equal")
             held = min(t, take.end)
             axis.set_title(f"{held:.2f} s, {_tilt(take.trajectory.state(held)):.0f}°", fontsize=9)
@@ -157,7 +156,7 @@ class _Film:
     def frame(self, t: float) -> np.ndarray:
         self._clock.set_text(f"{t:5.2f} s")
         for take, stage in zip(self._replay.takes, self._stages, strict=True):
-            _draw_take(stage.view, take, t)
+            stage.view.draw(self._replay.drawing(take, t))
             stage.tilt.set_text(f"{_tilt(take.trajectory.state(t)):.0f}°")
             ended = t >= take.trajectory.duration
             stage.end.set_visible(take.failed and ended)
@@ -182,7 +181,7 @@ class _Film:
             left, bottom = 0.005 + i % columns * width, 0.95 - (i // columns + 1) * height
             axis = self._figure.add_axes((left + 0.003, bottom, width - 0.006, height - 0.055))
             aspect = (width - 0.006) * 16 / ((height - 0.055) * 9)
-            view = PerspectiveView(axis, self._replay.params, self._replay.markers, aspect)
+            view = PerspectiveView(axis, aspect)
             axis.set_title(take.label, fontsize=11, color=take.color, loc="left", pad=4)
             corner = {"transform": axis.transAxes, "va": "top"}
             tilt = axis.text(0.03, 0.97, "", fontsize=16, color=take.color, **corner)
@@ -230,24 +229,6 @@ class _Film:
         self._cursors = [axis.axvline(0, color="0.2", lw=1) for axis in (tilt, force)]
         self._dots = [path.plot([], [], "o", color=take.color, ms=6)[0] for take in self._replay.takes]
         self._moving += [*self._cursors, *self._dots]
-
-
-def _draw_take(view: PerspectiveView, take: Take, t: float) -> None:
-    """Draws a take at time t, s. After its end the robot stands still. The camera keeps the ghost in view."""
-    x, ghost = take.trajectory.state(t), take.ghost_state(t)
-    u = take.trajectory.force(t) if t < take.trajectory.duration else None
-    robots, paths = [Robot(x, take.color, u)], [GroundPath(_driven_path(take.trajectory, t), take.color)]
-    middle, apart = x[:2], 0.0
-    if ghost is not None and take.ghost is not None:
-        robots.insert(0, Robot(ghost, _GHOST, alpha=0.4))
-        paths.append(GroundPath(_driven_path(take.ghost, t - take.ghost_start), _GHOST, dashed=True))
-        middle, apart = (x[:2] + ghost[:2]) / 2, float(np.hypot(*(x - ghost)[:2]))
-    view.draw(middle, robots, paths, zoom_out=apart)
-
-
-def _driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
-    """(n, 2) the ground path until time t, m."""
-    return np.concatenate([trajectory.x[trajectory.t < t, :2], trajectory.state(t)[None, :2]])
 
 
 def _drawstyle(trajectory: Trajectory) -> str:

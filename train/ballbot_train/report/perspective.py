@@ -6,7 +6,6 @@ first.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from scipy.spatial import ConvexHull
 
+from ballbot_gym.drawing import BALL, FORCE, Drawing, GroundPath, Robot, arrow, body_axis
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 
@@ -28,32 +28,10 @@ _AIM_HEIGHT = 0.55  # m above the floor
 _NEAR = 0.4  # m: points closer to the camera's plane are not drawn
 _FLOOR_REACH = 12  # m
 _LIGHT = np.array([-0.45, -0.55, 1.0]) / math.sqrt(0.45**2 + 0.55**2 + 1)  # towards the light
-_BALL = (0.16, 0.18, 0.23)
-_FORCE = (0.85, 0.1, 0.55)
-_FORCE_SCALE = 1 / 400  # m/N of the arrow
 _ANGLES = np.linspace(0, 2 * math.pi, 28, endpoint=False)
 
 Rgb = tuple[float, float, float]
 Rgba = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Robot:
-    """A ballbot to draw: state x (8,), colour, force u (2,), N, or None to draw no arrow, and opacity."""
-
-    x: np.ndarray
-    color: str
-    u: np.ndarray | None = None
-    alpha: float = 1.0
-
-
-@dataclass(frozen=True)
-class GroundPath:
-    """A line on the floor through points (n, 2), m."""
-
-    points: np.ndarray
-    color: str
-    dashed: bool = False
 
 
 class Camera:
@@ -76,9 +54,8 @@ class Camera:
 class PerspectiveView:
     """One axes with robots, paths and markers on a chequered floor. Each call of `draw` replaces its contents."""
 
-    def __init__(self, axis: Axes, params: BallbotParams, markers: Sequence[Marker], aspect: float):
+    def __init__(self, axis: Axes, aspect: float):
         """Args: aspect is the axes' width over its height."""
-        self._params, self._markers, self._aspect = params, markers, aspect
         axis.set(xlim=(-_HALF_HEIGHT * aspect, _HALF_HEIGHT * aspect), ylim=(-_HALF_HEIGHT, _HALF_HEIGHT))
         axis.set_xticks([])
         axis.set_yticks([])
@@ -93,21 +70,16 @@ class PerspectiveView:
         self._solids.set_snap(False)  # snapping makes the edges of thin upright bodies wavy
         self.artists = (self._floor, self._lines, self._solids)
 
-    def draw(
-        self,
-        middle: np.ndarray,
-        robots: Sequence[Robot],
-        paths: Sequence[GroundPath] = (),
-        zoom_out: float = 0.0,
-    ) -> None:
-        """Draws robots and paths; the camera looks at the ground point `middle` (2,), m, from `zoom_out` m farther away."""
-        camera = Camera(np.array([*middle, _AIM_HEIGHT]), _DISTANCE + zoom_out)
-        self._draw_floor(camera, middle)
-        self._draw_lines(camera, paths)
-        solids = [(0.0, _shadow(camera, self._params, robot)) for robot in robots]  # shadows lie under all bodies
-        bodies = [_marker(camera, marker) for marker in self._markers if not marker.ring]
-        for robot in robots:
-            bodies += _robot(camera, self._params, robot)
+    def draw(self, drawing: Drawing) -> None:
+        """Draws a moment. The camera looks at the robots' centre, from the farther away the more they spread."""
+        camera = Camera(np.array([*drawing.centre, _AIM_HEIGHT]), _DISTANCE + drawing.spread)
+        params = drawing.params
+        self._draw_floor(camera, drawing.centre)
+        self._draw_lines(camera, drawing.paths, drawing.markers)
+        solids = [(0.0, _shadow(camera, params, robot)) for robot in drawing.robots]  # shadows lie under all bodies
+        bodies = [_marker(camera, marker) for marker in drawing.markers if not marker.ring]
+        for robot in drawing.robots:
+            bodies += _robot(camera, params, robot)
         solids += sorted(bodies, key=lambda body: -body[0])
         faces = [face for _, body in solids for face in body]
         self._solids.set_verts([outline for outline, _ in faces])
@@ -128,11 +100,11 @@ class PerspectiveView:
         self._floor.set_verts(list(places[seen]))
         self._floor.set_facecolor([(0.80, 0.83, 0.88, 0.8 * share) for share in fade])
 
-    def _draw_lines(self, camera: Camera, paths: Sequence[GroundPath]) -> None:
+    def _draw_lines(self, camera: Camera, paths: Sequence[GroundPath], markers: Sequence[Marker]) -> None:
         lines: list[tuple[np.ndarray, Sequence[float], Any, float]] = [
             (path.points, to_rgb(path.color), "--" if path.dashed else "-", 2.2) for path in paths
         ]
-        for marker in self._markers:
+        for marker in markers:
             if marker.ring:
                 around = marker.radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
                 fine = np.concatenate([around, around[:1]]) + np.array(marker.position)
@@ -156,25 +128,17 @@ Face = tuple[np.ndarray, Rgba]
 """A polygon (n, 2) of the picture and its colour, RGBA."""
 
 
-def body_axis(x: np.ndarray) -> np.ndarray:
-    """(3,) the upward unit vector along the body in state x (8,)."""
-    gamma, theta = x[2], x[3]
-    return np.array(
-        [math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)],
-    )
-
-
 def _robot(camera: Camera, params: BallbotParams, robot: Robot) -> list[tuple[float, list[Face]]]:
     ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
     axis = body_axis(robot.x)
     middle = ball + params.com_height * axis
     half = params.body_length / 2 * axis
     parts = [
-        _sphere(camera, ball, params.ball_radius, _BALL, robot.alpha),
+        _sphere(camera, ball, params.ball_radius, to_rgb(BALL), robot.alpha),
         _cylinder(camera, middle - half, middle + half, params.body_radius, to_rgb(robot.color), robot.alpha),
     ]
-    if robot.u is not None and np.hypot(*robot.u) > 2:
-        parts.append(_arrow(camera, ball, _FORCE_SCALE * robot.u, robot.alpha))
+    if (ends := arrow(params, robot)) is not None:
+        parts.append(_arrow(camera, *ends, robot.alpha))
     return parts
 
 
@@ -230,12 +194,12 @@ def _cylinder(
     return depth, faces
 
 
-def _arrow(camera: Camera, start: np.ndarray, vector: np.ndarray, alpha: float) -> tuple[float, list[Face]]:
-    """A horizontal arrow from `start` along `vector`, m."""
-    length = float(np.hypot(*vector))
-    along, head = np.array([*vector, 0.0]) / length, min(0.16, length)
+def _arrow(camera: Camera, start: np.ndarray, end: np.ndarray, alpha: float) -> tuple[float, list[Face]]:
+    """A horizontal arrow between points (3,), m."""
+    length = float(np.linalg.norm(end - start))
+    along, head = (end - start) / length, min(0.16, length)
     aside = np.array([-along[1], along[0], 0.0])
-    neck, tip = start + (length - head) * along, start + length * along
+    neck, tip = start + (length - head) * along, end
     outline = np.array(
         [
             start - 0.02 * aside,
@@ -248,7 +212,7 @@ def _arrow(camera: Camera, start: np.ndarray, vector: np.ndarray, alpha: float) 
         ]
     )
     places, depth = camera.project(outline)
-    return float(depth.mean()), [(places, (*_FORCE, alpha))]
+    return float(depth.mean()), [(places, (*to_rgb(FORCE), alpha))]
 
 
 def _hull(points: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
+from ballbot_gym.drawing import GHOST, GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.rollout import Controller, PlanError, rollout
@@ -61,6 +62,23 @@ class Replay:
     def duration(self) -> float:
         """The duration of the longest take or ghost, s."""
         return max(take.end for take in self.takes)
+
+    def drawing(self, take: Take, t: float) -> Drawing:
+        """One of the takes at time t, s, with its ghost and the paths so far. After its end the robot stands still."""
+        x, ghost = take.trajectory.state(t), take.ghost_state(t)
+        u = take.trajectory.force(t) if t < take.trajectory.duration else None
+        robots = [Robot(x, take.color, u)]
+        paths = [GroundPath(_driven_path(take.trajectory, t), take.color)]
+        if ghost is not None and take.ghost is not None:
+            robots.insert(0, Robot(ghost, GHOST, alpha=GHOST_OPACITY, name="ghost"))
+            driven = _driven_path(take.ghost, t - take.ghost_start)
+            paths.append(GroundPath(driven, GHOST, dashed=True, name="ghost"))
+        return Drawing(self.params, tuple(robots), tuple(paths), self.markers)
+
+
+def _driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
+    """(n, 2) the ground path until time t, m."""
+    return np.concatenate([trajectory.x[trajectory.t < t, :2], trajectory.state(t)[None, :2]])
 
 
 def certified_replay(

@@ -1,0 +1,119 @@
+"""What a picture of ballbots shows, as plain data that every renderer draws: robots, ghosts, markers, paths and forces.
+
+A `Drawing` is one moment. Films, strips of pictures and live pages draw one after the other. Nothing here knows a library
+that draws.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks.marker import Marker
+
+BALL = "#292e3b"
+"""Colour of the ball."""
+BODY = "#d97706"
+"""Colour of a body that stands for no controller."""
+GHOST = "#3d4b66"
+"""Colour of a ghost that stands for no controller."""
+FORCE = "#d91a8c"
+"""Colour of the force's arrow."""
+PUSH = "#1a9e5c"
+"""Colour of a push's arrow."""
+GHOST_OPACITY = 0.4
+FORCE_SCALE = 1 / 400
+"""Length of the force's arrow, m/N."""
+LEAST_FORCE = 2.0
+"""N: smaller forces get no arrow."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A ballbot: state x (8,), colour "#rrggbb", force u (2,), N, or None for no arrow, and opacity, less than 1 for ghosts.
+
+    `push` (2,), N, is a force from outside, drawn as an arrow at the body's top, or None. Each robot of a drawing has a name
+    of its own.
+    """
+
+    x: np.ndarray
+    color: str = BODY
+    u: np.ndarray | None = None
+    alpha: float = 1.0
+    name: str = "robot"
+    push: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class GroundPath:
+    """A line on the floor through points (n, 2), m: where a robot was, dashed where it plans to go.
+
+    Each path of a drawing has a name of its own.
+    """
+
+    points: np.ndarray
+    color: str
+    dashed: bool = False
+    name: str = "path"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One moment. The robot that matters most is the last one. Of it a renderer's camera keeps `centre` in view."""
+
+    params: BallbotParams
+    robots: tuple[Robot, ...]
+    paths: tuple[GroundPath, ...] = ()
+    markers: tuple[Marker, ...] = ()
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(2,) the middle of the robots on the floor, m; the origin if there is no robot."""
+        return np.mean([robot.x[:2] for robot in self.robots], axis=0) if self.robots else np.zeros(2)
+
+    @property
+    def spread(self) -> float:
+        """The largest distance of a robot from the last one, m."""
+        return max((float(np.hypot(*(robot.x - self.robots[-1].x)[:2])) for robot in self.robots), default=0.0)
+
+
+class Pose(NamedTuple):
+    """Where a ballbot's parts are, m. The body is an upright cylinder about `body`, turned by `turn`."""
+
+    ball: np.ndarray
+    """(3,) centre of the ball."""
+    body: np.ndarray
+    """(3,) centre of the body."""
+    top: np.ndarray
+    """(3,) upper end of the body."""
+    turn: np.ndarray
+    """(4,) the body's rotation as a unit quaternion w, x, y, z."""
+
+
+def pose(params: BallbotParams, x: np.ndarray) -> Pose:
+    """The pose of a ballbot in state x (8,). γ turns the body about the y axis, then θ about the turned −x axis."""
+    ball = np.array([x[0], x[1], params.ball_radius])
+    axis = body_axis(x)
+    half_gamma, half_theta = 0.5 * x[2], 0.5 * x[3]
+    cos_g, sin_g, cos_t, sin_t = math.cos(half_gamma), math.sin(half_gamma), math.cos(half_theta), math.sin(half_theta)
+    turn = np.array([cos_g * cos_t, -cos_g * sin_t, sin_g * cos_t, sin_g * sin_t])  # about y, times about −x
+    body = ball + params.com_height * axis
+    return Pose(ball, body, body + params.body_length / 2 * axis, turn)
+
+
+def body_axis(x: np.ndarray) -> np.ndarray:
+    """(3,) the upward unit vector along the body in state x (8,)."""
+    gamma, theta = x[2], x[3]
+    return np.array(
+        [math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)],
+    )
+
+
+def arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:
+    """Start and end (3,), m, of the arrow of a robot's force at the ball's centre; None where there is none to draw."""
+    if robot.u is None or math.hypot(*robot.u) <= LEAST_FORCE:
+        return None
+    ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
+    return ball, ball + FORCE_SCALE * np.array([*robot.u, 0.0])

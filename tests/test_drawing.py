@@ -1,0 +1,47 @@
+"""Where the parts of a drawn robot are."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ballbot_gym.drawing import FORCE_SCALE, Drawing, Robot, arrow, body_axis, pose
+
+LEANING = np.array([0.5, -0.2, 0.3, -0.4, 0, 0, 0, 0])
+
+
+def rotated(turn, vector):
+    """A vector under the rotation of a unit quaternion."""
+    w, axis = turn[0], turn[1:]
+    return vector + 2 * np.cross(axis, np.cross(axis, vector) + w * vector)
+
+
+def test_body_axis_tilts_as_the_urdf_does():
+    axis = body_axis(LEANING)
+    assert np.linalg.norm(axis) == pytest.approx(1)
+    assert math.acos(axis[2]) == pytest.approx(math.acos(math.cos(0.3) * math.cos(0.4)))
+    assert axis[0] > 0 > axis[1]
+
+
+def test_the_quaternion_turns_about_y_by_gamma_then_about_minus_x_by_theta(params):
+    ball, body, top, turn = pose(params, LEANING)
+    assert rotated(turn, np.array([0, 0, 1.0])) == pytest.approx(body_axis(LEANING))
+    assert rotated(turn, np.array([1.0, 0, 0])) == pytest.approx([math.cos(0.3), 0, -math.sin(0.3)])  # θ leaves x alone
+    assert np.linalg.norm(body - ball) == pytest.approx(params.com_height)
+    assert top - body == pytest.approx(params.body_length / 2 * body_axis(LEANING))
+
+
+def test_the_arrow_of_a_force_starts_in_the_ball_and_small_forces_have_none(params):
+    start, end = arrow(params, Robot(LEANING, u=np.array([100.0, 0.0])))
+    assert start == pytest.approx([0.5, -0.2, params.ball_radius])
+    assert end - start == pytest.approx([100 * FORCE_SCALE, 0, 0])
+    assert arrow(params, Robot(LEANING, u=np.array([1.0, 0.0]))) is None
+    assert arrow(params, Robot(LEANING)) is None
+
+
+def test_the_camera_is_told_the_middle_of_the_robots_and_how_far_they_are_apart(params):
+    there = LEANING + np.array([3.0, 4.0, 0, 0, 0, 0, 0, 0])
+    drawing = Drawing(params, (Robot(there, name="ghost"), Robot(LEANING)))
+    assert drawing.centre == pytest.approx([2.0, 1.8])
+    assert drawing.spread == pytest.approx(5.0)
+    assert Drawing(params, ()).centre == pytest.approx([0, 0])
