@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     "replay": "ballbot_train.commands.replay:replay",
     "certify": "ballbot_train.commands.certify:certify",
     "demos": "ballbot_train.commands.demos:demos",
+    "export": "ballbot_train.commands.export:export",
     "train": "ballbot_train.commands.train:train",
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""

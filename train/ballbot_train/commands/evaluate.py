@@ -9,15 +9,13 @@ from typing import Any, Literal
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
-from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
-from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import check_least, check_names, console, print_table, progress_bars
+from ballbot_train.console import check_least, console, print_table, progress_bars
 from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
-from ballbot_train.evaluation.controllers import is_file, make_controller
+from ballbot_train.evaluation.controllers import make_controller, task_name
 from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
-from ballbot_train.policy_files import read_description
 from ballbot_train.provenance import provenance
 
 _FRESH = 10_000
@@ -55,7 +53,7 @@ def evaluate(
         out: folder of the results; default runs/evaluate/TASK-POLICY. An interrupted run continues here.
         workers: processes, for optima and certified episodes.
     """
-    task = _task_of(policy, task)
+    task = task_name(policy, task)
     chosen = controllers_of([task], [policy])
     check_least(0, seed=seed, optima=optima, episodes=episodes)
     check_least(1, workers=workers, **({} if bins is None else {"bins": bins}))
@@ -77,22 +75,6 @@ def evaluate(
         _fresh(policy, task, fresh, seed, bins, optima, out, workers)
     if episodes:
         _certified(chosen, episodes, physics, out / "certified", workers)
-
-
-def _task_of(policy: str, task: str | None) -> str:
-    """The task that is named, or the registered one that a policy file names, or stabilize."""
-    if task is not None:
-        check_names("task", [task], TASKS)
-        return task
-    if not is_file(policy):
-        return "stabilize"
-    made_for = read_description(policy)["spec"]["task"]
-    named = next((name for name in TASKS if make_task(name).problem() == made_for), None)
-    if named is None:
-        raise ValueError(
-            f"{policy} was made for {made_for}, which is none of {', '.join(TASKS)} with its default fields"
-        )
-    return named
 
 
 def _fresh(
