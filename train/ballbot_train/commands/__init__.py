@@ -16,6 +16,7 @@ COMMANDS: dict[str, str] = {
     "paper": "ballbot_train.commands.paper:paper",
     "optimize": "ballbot_train.commands.optimize:optimize",
     "replay": "ballbot_train.commands.replay:replay",
+    "page": "ballbot_train.commands.page:page",
     "certify": "ballbot_train.commands.certify:certify",
     "demos": "ballbot_train.commands.demos:demos",
     "export": "ballbot_train.commands.export:export",
