@@ -69,7 +69,11 @@ def javascript_function(name: str, function: Callable[..., object], arguments: M
 
 
 def _printed(name: str, arguments: list[str], traced: casadi.Function) -> str:
-    lines, names, returned = [], {}, ["0"] * traced.size1_out(0)  # names: of what each place of the work vector holds now
+    lines, names, returned = (
+        [],
+        {},
+        ["0"] * traced.size1_out(0),
+    )  # names: of what each place of the work vector holds now
     for k in range(traced.n_instructions()):
         operation, takes, gives = traced.instruction_id(k), traced.instruction_input(k), traced.instruction_output(k)
         if operation == casadi.OP_OUTPUT:

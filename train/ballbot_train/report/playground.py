@@ -7,7 +7,6 @@ weights. The model and the tasks are printed as JavaScript from the lines that P
 import base64
 import functools
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import casadi
 import jinja2
 import numpy as np
+import safetensors.numpy
 from markupsafe import Markup
 
 from ballbot_baselines.lqr import LqrController
@@ -25,7 +25,7 @@ from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.evaluation.controllers import task_name
-from ballbot_train.policy_files import PolicySpec, read_description, shipped_policies
+from ballbot_train.policy_files import PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
 from ballbot_train.report.javascript import javascript_function
 
@@ -59,7 +59,12 @@ SCENARIOS = (
         "stabilize",
         push=(0.6, 90.0, 0.5),
     ),
-    Scenario("Throw", "Both start fast and leaning, and are to come to rest on the green spot. Braking takes a lean of 40°.", "stabilize", 7),
+    Scenario(
+        "Throw",
+        "Both start fast and leaning, and are to come to rest on the green spot. Braking takes a lean of 40°.",
+        "stabilize",
+        7,
+    ),
     Scenario("Orbit", "From rest onto a circle at 5.5 m/s, which takes a steady lean of 43°.", "orbit", 17),
     Scenario("Turn", "A right-angled turn through the gate at 6.8 m/s, with as little force as possible.", "turn", 1),
     Scenario("Weave", "Round five obstacles, and to rest behind them. LQR does not know of obstacles.", "weave", 12),
@@ -134,23 +139,32 @@ def _policies(given: Sequence[str]) -> dict[str, dict[str, Any]]:
         task = task_name(str(policy), None)
         if task in paths:
             raise ValueError(f"{paths[task]} and {policy} are both policies for {task}; give one")
+        _check_policy(Path(policy), make_task(task))
         paths[task] = Path(policy)
     shipped = {task: shipped_policies(make_task(task))[learner] for task, learner in _LEARNERS.items()}
     return {task: _policy_data(paths.get(task, path), make_task(task)) for task, path in shipped.items()}
 
 
-def _policy_data(path: Path, task: Task) -> dict[str, Any]:
-    """What a policy computes with, the numbers packed."""
+def _check_policy(path: Path, task: Task) -> None:
+    """Raises a PolicyError where a file is no policy of the task."""
     from ballbot_train.policy import load_network  # it imports torch
 
-    network = load_network(path, task)
-    spec: PolicySpec = network.spec
-    name = str(read_description(path).get("training", {}).get("learner", path.stem))
+    load_network(path, task)
+
+
+def _policy_data(path: Path, task: Task) -> dict[str, Any]:
+    """What a policy computes with, the numbers packed. torch is not imported: the files hold all."""
+    described = read_description(path)
+    spec = PolicySpec.read(described["spec"])
+    name = str(described.get("training", {}).get("learner", path.stem))
+    weights = safetensors.numpy.load(files.read(paths_of(path)[0]))
+    # activations lie between the layers, which are numbered with them
+    layers = [f"mlp.{2 * i}" for i in range(len(spec.hidden) + 1)]
     return {
         "label": labels.label(name),
         "color": labels.color(name, 0),
-        "layers": [_layer(part) for part in network.mlp if hasattr(part, "weight")],
-        "linear": None if network.linear is None else _layer(network.linear),
+        "layers": [_layer(weights, layer) for layer in layers],
+        "linear": _layer(weights, "linear") if spec.linear else None,
         "activation": spec.activation,
         "squash": spec.squash,
         "mirrors": spec.mirrors,
@@ -158,9 +172,12 @@ def _policy_data(path: Path, task: Task) -> dict[str, Any]:
     }
 
 
-def _layer(part: Any) -> dict[str, str | None]:
-    weight = _packed(part.weight.detach().numpy(), np.float32)
-    return {"weight": weight, "bias": None if part.bias is None else _packed(part.bias.detach().numpy(), np.float32)}
+def _layer(weights: Mapping[str, np.ndarray], name: str) -> dict[str, str | None]:
+    bias = weights.get(f"{name}.bias")
+    return {
+        "weight": _packed(weights[f"{name}.weight"], np.float32),
+        "bias": None if bias is None else _packed(bias, np.float32),
+    }
 
 
 def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:

@@ -20,6 +20,7 @@ class Playground {
     }
     [this.playing, this.last] = [true, null];
     [this.distance, this.zoom] = [NEAR, 1];
+    this.wake();
     DATA.scenarios.forEach((scenario, i) => {
       const chip = document.createElement("button");
       chip.type = "button";
@@ -87,6 +88,7 @@ class Playground {
 
   /** All robots in one state, at time 0. */
   restart(state) {
+    this.wake();
     for (const robot of this.robots) robot.reset(state);
     this.disturbed = false; // a regret is that of an episode that nobody disturbs
     this.time = 0;
@@ -95,7 +97,13 @@ class Playground {
     this.tilts = this.robots.map(() => []);
   }
 
+  /** Draws for a while even if time stands still: what is shown has changed, and the camera comes after it. */
+  wake() {
+    this.awake = performance.now() + 1500;
+  }
+
   setPlaying(playing) {
+    this.wake();
     this.playing = playing;
     this.last = null;
     find(".play").textContent = playing ? "Pause" : "Play";
@@ -146,7 +154,7 @@ class Playground {
     }
     const elapsed = this.last === null ? 0 : Math.min((now - this.last) / 1000, 0.1);
     this.last = now;
-    this.draw(elapsed);
+    if (this.playing || this.drag || now < this.awake) this.draw(elapsed);
     requestAnimationFrame((next) => this.tick(next));
   }
 
@@ -262,6 +270,7 @@ class Playground {
   listen() {
     const view = find(".view");
     const place = (event) => [event.offsetX, event.offsetY];
+    window.addEventListener("resize", () => this.wake());
     view.onpointerdown = (event) => {
       if (!this.scene) return;
       const robot = this.robotAt(place(event));
@@ -285,6 +294,7 @@ class Playground {
       }
     };
     view.onpointerup = () => {
+      this.wake();
       const pull = this.drag?.pull;
       this.drag = null;
       if (pull) this.hit(pull);
@@ -295,6 +305,7 @@ class Playground {
       (event) => {
         if (!this.scene) return;
         event.preventDefault();
+        this.wake();
         this.zoom = Math.min(Math.max(this.zoom * Math.exp(event.deltaY * 0.001), 0.4), 4);
       },
       { passive: false },

@@ -134,7 +134,7 @@ class Scene {
     this.canvas = canvas;
     this.robot = robot;
     this.look = look;
-    const gl = (this.gl = canvas.getContext("webgl2", { antialias: true, stencil: true }));
+    const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true }));
     if (!gl) throw new Error("no WebGL 2");
     this.solid = this.program(SOLID_VERTEX, SOLID_FRAGMENT);
     this.floor = this.program(SOLID_VERTEX, FLOOR_FRAGMENT);
