@@ -28,6 +28,7 @@ FORCE_SCALE = 1 / 400
 """Length of the force's arrow, m/N."""
 LEAST_FORCE = 2.0
 """N: smaller forces get no arrow."""
+_NEAR, _FAR = 3.0, 6.0  # m from the last robot: from where on another counts less, and from where on not at all
 
 
 @dataclass(frozen=True)
@@ -70,13 +71,23 @@ class Drawing:
 
     @property
     def centre(self) -> np.ndarray:
-        """(2,) the middle of the robots on the floor, m; the origin if there is no robot."""
-        return np.mean([robot.x[:2] for robot in self.robots], axis=0) if self.robots else np.zeros(2)
+        """(2,) the middle of the robots near the last one, m; the origin if there is no robot."""
+        if not self.robots:
+            return np.zeros(2)
+        return np.average([robot.x[:2] for robot in self.robots], axis=0, weights=self._nearness())
 
     @property
     def spread(self) -> float:
-        """The largest distance of a robot from the last one, m."""
-        return max((float(np.hypot(*(robot.x - self.robots[-1].x)[:2])) for robot in self.robots), default=0.0)
+        """The largest distance of a robot near the last one from it, m."""
+        return float(max(self._nearness() * self._distances(), default=0.0))
+
+    def _distances(self) -> np.ndarray:
+        """(n,) distances from the last robot, m."""
+        return np.array([np.hypot(*(robot.x - self.robots[-1].x)[:2]) for robot in self.robots])
+
+    def _nearness(self) -> np.ndarray:
+        """(n,) 1 for robots near the last one, 0 for those far away, so that a camera leaves smoothly who falls behind."""
+        return np.clip((_FAR - self._distances()) / (_FAR - _NEAR), 0.0, 1.0)
 
 
 class Pose(NamedTuple):

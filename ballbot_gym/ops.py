@@ -59,10 +59,12 @@ def clip(a: Any, low: float, high: float) -> Any:
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:
-    """a where the condition holds, else b, elementwise. Not for CasADi, because optimizers need smooth functions."""
+    """a where the condition holds, else b, elementwise. Not for what optimizers differentiate: they need smooth functions."""
     if isinstance(condition, bool):
         return a if condition else b
     library = _library(condition)
+    if library.__name__ == "casadi":
+        return library.if_else(condition, a, b)
     if library.__name__ == "torch":
         as_tensor = functools.partial(library.as_tensor, device=condition.device)
         return library.where(condition, as_tensor(a), as_tensor(b))

@@ -1,8 +1,13 @@
-"""The site shows files of the repository's root: `<!-- file: README.md -->` in a page stands for that file."""
+"""What mkdocs does for the site besides its pages.
+
+`<!-- file: README.md -->` in a page stands for that file of the repository's root. The playground's page is written anew.
+"""
 
 import re
 from pathlib import Path
 from typing import Any
+
+from ballbot_train.report.playground import write_playground
 
 _ROOT = Path(__file__).parent.parent
 _FILE = re.compile(r"<!-- file: (\S+) -->")
@@ -16,6 +21,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         FileNotFoundError: a page names a file that does not exist.
     """
     return _FILE.sub(lambda match: _with_links_of_the_site((_ROOT / match[1]).read_text(encoding="utf-8")), markdown)
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Called by mkdocs after the pages: writes the playground that docs/playground.md shows."""
+    write_playground(Path(config["site_dir"]) / "playground" / "page.html")
 
 
 def _with_links_of_the_site(text: str) -> str:

@@ -147,4 +147,5 @@ def test_the_site_builds_without_a_warning(tmp_path):
     start = (tmp_path / "index.html").read_text()
     assert "<!-- file" not in start
     assert "Two commands" in start
+    assert (tmp_path / "playground" / "page.html").stat().st_size > 1e6
     assert "discrete_lqr" in (tmp_path / "api" / "baselines" / "index.html").read_text()

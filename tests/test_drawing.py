@@ -40,8 +40,18 @@ def test_the_arrow_of_a_force_starts_in_the_ball_and_small_forces_have_none(para
 
 
 def test_the_camera_is_told_the_middle_of_the_robots_and_how_far_they_are_apart(params):
-    there = LEANING + np.array([3.0, 4.0, 0, 0, 0, 0, 0, 0])
+    there = LEANING + np.array([1.2, 1.6, 0, 0, 0, 0, 0, 0])
     drawing = Drawing(params, (Robot(there, name="ghost"), Robot(LEANING)))
-    assert drawing.centre == pytest.approx([2.0, 1.8])
-    assert drawing.spread == pytest.approx(5.0)
+    assert drawing.centre == pytest.approx([1.1, 0.6])
+    assert drawing.spread == pytest.approx(2.0)
     assert Drawing(params, ()).centre == pytest.approx([0, 0])
+
+
+def test_the_camera_leaves_smoothly_who_falls_far_behind(params):
+    aside = np.array([1.0, 0, 0, 0, 0, 0, 0, 0])
+    drawings = [Drawing(params, (Robot(d * aside), Robot(0 * aside))) for d in np.linspace(0, 8, 161)]
+    assert drawings[-1].spread == 0
+    assert drawings[-1].centre == pytest.approx([0, 0])
+    # per 0.05 m: at most twice as fast as the robot moves away
+    assert np.abs(np.diff([drawing.spread for drawing in drawings])).max() < 0.11
+    assert np.abs(np.diff([drawing.centre[0] for drawing in drawings])).max() < 0.11

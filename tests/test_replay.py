@@ -16,7 +16,7 @@ from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
 from ballbot_train.report.film import film_frames, film_times, write_film
 from ballbot_train.report.perspective import Camera
-from ballbot_train.report.replay import Replay, Take, certified_replay, file_replay, with_ghosts
+from ballbot_train.report.replay import Replay, Take, certified_replay, file_replay, with_companions, with_ghosts
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
 
@@ -124,22 +124,41 @@ def test_where_lqr_falls_the_ghost_goes_on_from_its_state_to_the_goal():
     (take,) = shown.takes
     assert take.note == "fails at 0.40 s"
     (take,) = with_ghosts(shown, "stabilize", FALLING, at=0.1, expert="trajopt", physics="bullet").takes
-    np.testing.assert_array_equal(take.ghost.x[0], take.trajectory.state(0.1))
-    np.testing.assert_array_equal(take.ghost_state(0.1), take.ghost.x[0])
-    assert take.ghost_state(0.08) is None
+    (ghost,) = take.ghosts
+    np.testing.assert_array_equal(ghost.trajectory.x[0], take.trajectory.state(0.1))
+    np.testing.assert_array_equal(ghost.state(0.1), ghost.trajectory.x[0])
+    assert ghost.state(0.08) is None
     assert take.note.endswith("ghost from 0.10 s: at the goal")
-    assert np.hypot(*take.ghost.x[-1, :2]) < 0.1
+    assert np.hypot(*ghost.trajectory.x[-1, :2]) < 0.1
     assert Replay("", (take,)).duration == pytest.approx(8.1)  # the ghost is watched to its end
     seen, hidden = film_frames(shown, [0.4], width=320), film_frames(Replay("", (take,), shown.markers), [0.4], 320)
     assert (next(seen) != next(hidden)).any()
 
 
+def test_ghosts_from_the_start_are_drawn_beside_every_take_but_their_own():
+    shown = certified_replay("stabilize", ["lqr", "ppo"], FALLING, physics="rk4")
+    lqr, ppo = with_companions(shown, Replay("", shown.takes[:1])).takes
+    assert lqr.ghosts == ()
+    (ghost,) = ppo.ghosts
+    assert (ghost.label, ghost.color, ghost.start) == ("LQR", lqr.color, 0.0)
+    together = replace(shown, takes=(lqr, ppo))
+    beside, alone = together.drawing(ppo, 0.2), together.drawing(lqr, 0.2)
+    assert [robot.alpha < 1 for robot in beside.robots] == [True, False]
+    np.testing.assert_array_equal(beside.robots[0].x, alone.robots[0].x)
+    assert [path.dashed for path in beside.paths] == [False, True]
+    assert together.duration == ppo.trajectory.duration
+    with_ghost, without = (film_frames(replay, [0.2], width=320) for replay in (together, shown))
+    changed = (next(with_ghost) != next(without)).any(axis=2)
+    assert changed[:110, 160:].any()
+    assert not changed[:110, :160].any()
+
+
 def test_where_the_expert_is_too_late_the_replay_says_so():
     shown = certified_replay("stabilize", ["lqr", "trajopt"], FALLING, physics="rk4")
     late, early = with_ghosts(shown, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4").takes
-    assert late.ghost is None
+    assert late.ghosts == ()
     assert late.note.endswith("trajopt finds no way on from 0.36 s")
-    assert early.ghost is not None
+    assert len(early.ghosts) == 1
     alone = Replay("", shown.takes[:1])
     with pytest.raises(PlanError, match=r"finds no way on from 0\.36 s under LQR"):
         with_ghosts(alone, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4")
@@ -183,6 +202,12 @@ def test_the_command_films_a_trajectory_file(tmp_path):
         (("stabilize",), {"ghost_by": "nobody", "ghost_at": 0.1}, "unknown expert nobody"),
         (("nowhere.npz",), {}, "not a trajectory file"),
         (("nowhere.npz",), {"ghost_at": 1.0}, "has no ghost"),
+        (("nowhere.npz",), {"ghosts": ("lqr",)}, "give the ghosts as files too"),
+        (
+            ("stabilize",),
+            {"controllers": ("lqr",), "ghosts": ("nobody",), "physics": "rk4"},
+            "unknown controller 'nobody'",
+        ),
         (
             ("stabilize",),
             {"controllers": ("lqr",), "episode": FALLING, "ghost_at": 0.5},

@@ -120,6 +120,8 @@ class LqrController:
 
     About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
     gain is periodic, and the nearest point of the reference says which gain to use.
+
+    After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
     """
 
     def __init__(self, task: Task, params: BallbotParams):
@@ -128,17 +130,17 @@ class LqrController:
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         task, params = self._task, self._params
         self._start = t
-        self._reference = reference = task.reference(x, c, params)
+        self.reference = reference = task.reference(x, c, params)
         if reference.closed:
-            self._gains = closed_gains(task, params, reference, c)
+            self.gains = closed_gains(task, params, reference, c)
         else:
             p_final = final_weight(task, params, reference.x[-1], c)
-            self._gains = tracking_gains(task, params, reference.x, reference.u, c, p_final)
+            self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        reference = self._reference
+        reference = self.reference
         if reference.closed:
             i = int(np.argmin(np.sum((reference.x[:, :2] - x[:2]) ** 2, axis=1)))
         else:
             i = min(round((t - self._start) / self._task.control_dt), len(reference.x) - 1)
-        return reference.u[i] - self._gains.k[i] @ (x - reference.x[i])
+        return reference.u[i] - self.gains.k[i] @ (x - reference.x[i])

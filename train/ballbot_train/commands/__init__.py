@@ -21,8 +21,10 @@ COMMANDS: dict[str, str] = {
     "optimize": "ballbot_train.commands.optimize:optimize",
     "replay": "ballbot_train.commands.replay:replay",
     "play": "ballbot_train.commands.play:play",
+    "page": "ballbot_train.commands.page:page",
     "certify": "ballbot_train.commands.certify:certify",
     "demos": "ballbot_train.commands.demos:demos",
+    "export": "ballbot_train.commands.export:export",
     "train": "ballbot_train.commands.train:train",
     "tune": "ballbot_train.commands.tune:tune",
 }

@@ -9,21 +9,19 @@ from typing import Any
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
-from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
-from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.console import (
     Physics,
     check_least,
-    check_names,
     console,
     physics_or_default,
     print_table,
     progress_bars,
 )
 from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
-from ballbot_train.evaluation.controllers import is_file, is_made_for, made_for, make_controller
+from ballbot_train.evaluation.controllers import make_controller, task_name
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
 from ballbot_train.provenance import LoadRecord, provenance
 
@@ -64,7 +62,7 @@ def evaluate(
         out: folder of the results; default runs/evaluate/TASK-POLICY. An interrupted run continues here.
         workers: processes, for optima and certified episodes.
     """
-    task = _task_of(policy, task)
+    task = task_name(policy, task)
     chosen = controllers_of([task], [policy])
     check_least(0, seed=seed, optima=optima, episodes=episodes)
     check_least(1, workers=workers, **({} if bins is None else {"bins": bins}))
@@ -86,21 +84,6 @@ def evaluate(
         _fresh(policy, task, fresh, seed, bins, optima, out, workers)
     if episodes:
         _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers)
-
-
-def _task_of(policy: str, task: str | None) -> str:
-    """The task that is named, or the registered one that a policy file names, or stabilize."""
-    if task is not None:
-        check_names("task", [task], TASKS)
-        return task
-    if not is_file(policy):
-        return "stabilize"
-    named = next((name for name in TASKS if is_made_for(policy, make_task(name))), None)
-    if named is None:
-        raise ValueError(
-            f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields"
-        )
-    return named
 
 
 def _fresh(

@@ -7,7 +7,7 @@ from ballbot_baselines import CONTROLLERS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import Physics, check_names, console, physics_or_default, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
-from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_ghosts
+from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_companions, with_ghosts
 
 _MOST_FRAMES = 100_000
 _WIDTHS = {"mp4": 1280, "gif": 640, "webp": 640}  # px
@@ -25,6 +25,7 @@ def replay(
     fps: int = 25,
     speed: float = 1.0,
     width: int | None = None,
+    ghosts: tuple[str, ...] = (),
     ghost_at: float | None = None,
     ghost_by: str = "trajopt",
     out: Path = Path("runs/replay"),
@@ -42,6 +43,7 @@ def replay(
         fps: frames per second of a film.
         speed: seconds of the episode per second of film; 0.5 is slow motion.
         width: width of a film, px; default 1280 for mp4, 640 for gif and webp.
+        ghosts: names of controllers or policy files; what they do from the same start is drawn translucent in every picture.
         ghost_at: time from which a ghost shows what an expert would do, s.
         ghost_by: name of that expert.
         out: folder of the file. The file is named after task, controllers and episode.
@@ -52,7 +54,7 @@ def replay(
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
     physics = physics_or_default(physics)
-    shown, name = _read(source, controllers, episode, physics, ghost_at, ghost_by)
+    shown, name = _read(source, controllers, episode, physics, ghosts, ghost_at, ghost_by)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":
@@ -71,12 +73,14 @@ def _read(
     controllers: tuple[str, ...],
     episode: int,
     physics: str,
+    ghosts: tuple[str, ...],
     ghost_at: float | None,
     ghost_by: str,
 ) -> tuple[Replay, str]:
     """The replay to draw, and the name of its file."""
     if all(Path(entry).suffix == ".npz" for entry in source):
         _check(bool(source), "give the name of a task, or trajectory files")
+        _check(not ghosts, "trajectory files do not say which episode they are of: give the ghosts as files too")
         _check(ghost_at is None, "a trajectory file does not say which task it is of, so it has no ghost")
         paths = [Path(entry) for entry in source]
         return file_replay(paths), "-".join(path.stem for path in paths)
@@ -87,6 +91,9 @@ def _read(
     _check(bool(controllers), "give at least one controller")
     shown = certified_replay(task, controllers, episode, physics)
     name = f"{task}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
+    if ghosts:
+        shown = with_companions(shown, certified_replay(task, ghosts, episode, physics))
+        name = f"{name}-beside-{'-'.join(Path(ghost).stem for ghost in ghosts)}"
     if ghost_at is None:
         return shown, name
     return with_ghosts(shown, task, episode, ghost_at, ghost_by, physics), f"{name}-ghost"

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 from ballbot_baselines import CONTROLLERS
+from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
-from ballbot_gym.tasks import Task
+from ballbot_gym.tasks import TASKS, Task
+from ballbot_train.console import check_names
 from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
 
 _SAVED_MODELS = (".zip", ".pt", ".pth")
@@ -59,6 +61,42 @@ def digest_of(name: str) -> str:
 
         return digest(name)
     return weights_digest(name)
+
+
+def task_name(policy: str, task: str | None) -> str:
+    """The task that is named, or the registered one that a policy file names, or stabilize.
+
+    Raises:
+        ValueError: no such task.
+        PolicyError: a policy file that is missing or damaged.
+    """
+    if task is not None:
+        check_names("task", [task], TASKS)
+        return task
+    if not is_file(policy):
+        return "stabilize"
+    named = next((name for name in TASKS if is_made_for(policy, make_task(name))), None)
+    if named is None:
+        raise ValueError(
+            f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields"
+        )
+    return named
+
+
+def policy_path(name: str, task: Task) -> Path:
+    """The file of a policy that comes with the package, or that is named by its path.
+
+    Raises:
+        ValueError: it is an expert, or nothing of that name.
+    """
+    shipped = shipped_policies(task)
+    if name in shipped:
+        return shipped[name]
+    if name in CONTROLLERS:
+        raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
+    if not is_file(name):
+        raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
+    return Path(name)
 
 
 def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:

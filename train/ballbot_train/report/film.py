@@ -16,10 +16,11 @@ from matplotlib.text import Text
 from PIL import Image
 
 from ballbot_gym import dynamics, files
+from ballbot_gym.drawing import GHOST
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
 from ballbot_train.report.perspective import PerspectiveView
-from ballbot_train.report.replay import Replay
+from ballbot_train.report.replay import Ghost, Replay
 
 Format = Literal["png", "mp4", "gif", "webp"]
 
@@ -44,7 +45,7 @@ def write_strip(replay: Replay, path: Path, frames: int, seconds: float) -> Path
             axis.set_aspect("equal")
             held = min(t, take.end)
             axis.set_title(f"{held:.2f} s, {_tilt(take.trajectory.state(held)):.0f}°", fontsize=9)
-        if rows > 1 or take.ghost is not None:
+        if rows > 1 or take.ghosts:
             row[0].set_ylabel(f"{take.label}\n{take.note}".strip().replace("; ", "\n"), fontsize=8, color=take.color)
     return figures.save(figure, path)
 
@@ -200,6 +201,16 @@ class _Film:
             self._stages.append(_Stage(view, tilt, note, end))
             self._moving += [*view.artists, tilt, note, end]
 
+    def _ghosts(self) -> list[tuple[str, Ghost]]:
+        """Every ghost once, with its colour in the traces: its own, or that of the take it goes on from."""
+        found = {id(ghost.trajectory): (take, ghost) for take in self._replay.takes for ghost in take.ghosts}
+        shown = {id(take.trajectory) for take in self._replay.takes}
+        return [
+            (take.color if ghost.color == GHOST else ghost.color, ghost)
+            for key, (take, ghost) in found.items()
+            if key not in shown
+        ]
+
     def _add_traces(self, seconds: float) -> None:
         tilt, force, path = (
             self._figure.add_axes((left, 0.075, width, 0.21))
@@ -210,12 +221,13 @@ class _Film:
             tilt.plot(t, np.degrees(take.trajectory.tilt), color=take.color, lw=1.6)
             force.plot(t[: len(u)], np.hypot(*u.T), color=take.color, lw=1.2, drawstyle=_drawstyle(take.trajectory))
             path.plot(*take.trajectory.x[:, :2].T, color=take.color, lw=1.6)
-            if take.ghost is not None:
-                ghost = {"color": take.color, "lw": 1.2, "ls": "--", "alpha": 0.7}
-                later = take.ghost_start + take.ghost.t
-                tilt.plot(later, np.degrees(take.ghost.tilt), **ghost)
-                force.plot(later[:-1], np.hypot(*take.ghost.u.T), drawstyle="steps-post", **ghost)
-                path.plot(*take.ghost.x[:, :2].T, **ghost)
+        for color, ghost in self._ghosts():
+            look = {"color": color, "lw": 1.2, "ls": "--", "alpha": 0.7}
+            later, force_style = ghost.start + ghost.trajectory.t, _drawstyle(ghost.trajectory)
+            u = ghost.trajectory.u
+            tilt.plot(later, np.degrees(ghost.trajectory.tilt), **look)
+            force.plot(later[: len(u)], np.hypot(*u.T), drawstyle=force_style, **look)
+            path.plot(*ghost.trajectory.x[:, :2].T, **look)
         tilt.set(xlim=(0, seconds), xlabel="time, s", title="tilt, deg")
         force.set(xlim=(0, seconds), xlabel="time, s", title="force, N")
         path.set(title="ground path, m")

@@ -21,11 +21,30 @@ _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 
 @dataclass(frozen=True)
+class Ghost:
+    """Another controller's trajectory beside a take, from time `start` of the take on, s; its own times begin at 0."""
+
+    label: str
+    trajectory: Trajectory
+    color: str = GHOST
+    start: float = 0.0
+
+    @property
+    def end(self) -> float:
+        """The time of the take at which it has ended, s."""
+        return self.start + self.trajectory.duration
+
+    def state(self, t: float) -> np.ndarray | None:
+        """(8,) its state at time t of the take, s; None before it starts."""
+        return None if t < self.start else self.trajectory.state(t - self.start)
+
+
+@dataclass(frozen=True)
 class Take:
     """One trajectory to watch.
 
-    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle. `ghost` is the trajectory that an
-    expert would have driven from time `ghost_start` on, s; the times of the ghost itself begin at 0.
+    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle. `ghosts` are drawn translucent
+    beside it: other controllers from the same start, or an expert that goes on from the middle.
     """
 
     label: str
@@ -33,20 +52,12 @@ class Take:
     color: str
     note: str = ""
     failed: bool = False
-    ghost: Trajectory | None = None
-    ghost_start: float = 0.0
+    ghosts: tuple[Ghost, ...] = ()
 
     @property
     def end(self) -> float:
-        """The time at which the trajectory and its ghost have both ended, s."""
-        ghost_end = self.ghost_start + self.ghost.duration if self.ghost is not None else 0.0
-        return max(self.trajectory.duration, ghost_end)
-
-    def ghost_state(self, t: float) -> np.ndarray | None:
-        """(8,) the state of the ghost at time t of the take, s; None before the ghost starts or without a ghost."""
-        if self.ghost is None or t < self.ghost_start:
-            return None
-        return self.ghost.state(t - self.ghost_start)
+        """The time at which the trajectory and its ghosts have all ended, s."""
+        return max(self.trajectory.duration, *(ghost.end for ghost in self.ghosts), 0.0)
 
 
 @dataclass(frozen=True)
@@ -64,15 +75,15 @@ class Replay:
         return max(take.end for take in self.takes)
 
     def drawing(self, take: Take, t: float) -> Drawing:
-        """One of the takes at time t, s, with its ghost and the paths so far. After its end the robot stands still."""
-        x, ghost = take.trajectory.state(t), take.ghost_state(t)
+        """One of the takes at time t, s, with its ghosts and the paths so far. After its end a robot stands still."""
         u = take.trajectory.force(t) if t < take.trajectory.duration else None
-        robots = [Robot(x, take.color, u)]
-        paths = [GroundPath(_driven_path(take.trajectory, t), take.color)]
-        if ghost is not None and take.ghost is not None:
-            robots.insert(0, Robot(ghost, GHOST, alpha=GHOST_OPACITY, name="ghost"))
-            driven = _driven_path(take.ghost, t - take.ghost_start)
-            paths.append(GroundPath(driven, GHOST, dashed=True, name="ghost"))
+        robots, paths = [], [GroundPath(_driven_path(take.trajectory, t), take.color)]
+        for i, ghost in enumerate(take.ghosts):
+            if (x := ghost.state(t)) is not None:
+                name = f"ghost {i}"
+                robots.append(Robot(x, ghost.color, alpha=GHOST_OPACITY, name=name))
+                paths.append(GroundPath(_driven_path(ghost.trajectory, t - ghost.start), ghost.color, True, name))
+        robots.append(Robot(take.trajectory.state(t), take.color, u))
         return Drawing(self.params, tuple(robots), tuple(paths), self.markers)
 
 
@@ -132,6 +143,19 @@ def _take(
     return Take(labels.label(name), run.trajectory, labels.color(Path(name).stem, i), note, run.failure)
 
 
+def with_companions(replay: Replay, others: Replay) -> Replay:
+    """Adds all takes of another replay of the same episode to every take, as ghosts in their own colours.
+
+    A take gets no ghost of its own controller.
+    """
+    ghosts = tuple(Ghost(take.label, take.trajectory, take.color) for take in others.takes)
+    takes = tuple(
+        replace(take, ghosts=(*take.ghosts, *(ghost for ghost in ghosts if ghost.label != take.label)))
+        for take in replay.takes
+    )
+    return replace(replay, takes=takes)
+
+
 def with_ghosts(replay: Replay, task: str, episode: int, at: float, expert: str, physics: str) -> Replay:
     """Adds a ghost to every take of a certified episode: the expert's trajectory from the take's state at time `at`, s.
 
@@ -161,8 +185,9 @@ def with_ghosts(replay: Replay, task: str, episode: int, at: float, expert: str,
                 continue
             end = "fails" if run.failure else "at the goal" if run.success else "goes on"
             note = f"{take.note}; ghost from {start:.2f} s: {end}"
-            takes.append(replace(take, ghost=run.trajectory, ghost_start=start, note=note))
-        if all(take.ghost is None for take in takes):
+            ghost = Ghost(labels.label(expert), run.trajectory, start=start)
+            takes.append(replace(take, ghosts=(*take.ghosts, ghost), note=note))
+        if not any(ghost.color == GHOST for take in takes for ghost in take.ghosts):
             raise PlanError(f"{expert} finds no way on from {at:g} s under {', '.join(take.label for take in takes)}")
         return replace(replay, takes=tuple(takes))
     finally:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from ballbot_gym import files
 from ballbot_train.console import console
@@ -20,6 +21,7 @@ from ballbot_train.report.page import (
     replay_section,
     table_section,
 )
+from ballbot_train.report.playground import playground_page
 from ballbot_train.report.replay import Replay, certified_replay
 
 
@@ -59,6 +61,7 @@ def leaderboard_sections(
             "The same start under every controller. Drag to turn the camera; play, or drag the time; "
             "the pink line is the force on the ball.",
         ),
+        playground_section(),
         regret_section(results),
         pictures_section(
             "Basins of attraction",
@@ -80,6 +83,13 @@ def replay_of(task: str, controllers: Sequence[str], results: Sequence[Result], 
             failures.setdefault(result.episode, set()).add(result.failure)
     episode = next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
     return certified_replay(task, controllers, episode, physics, skip_planless=True)
+
+
+def playground_section() -> Section:
+    """The playground, which runs in the page."""
+    frame = Markup('<iframe class="playground" title="the playground" loading="lazy" srcdoc="{}"></iframe>')
+    lead = "A learned policy and LQR, computed in this page. Push them."
+    return Section("Push them yourself", frame.format(playground_page()), lead)
 
 
 def regret_section(results: Sequence[Result]) -> Section | None:

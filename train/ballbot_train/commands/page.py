@@ -1,0 +1,18 @@
+"""`ballbot page`: the playground as one HTML page that needs no Python."""
+
+from pathlib import Path
+
+from ballbot_train.console import console
+
+
+def page(policies: tuple[str, ...] = (), /, out: Path = Path("runs/page/playground.html")) -> None:
+    """Writes the playground as one HTML page: push a learned policy and LQR, without Python and without network.
+
+    Args:
+        policies: policy files, each shown in place of the shipped policy of its task.
+        out: path of the page.
+    """
+    from ballbot_train.report.playground import write_playground  # it imports casadi
+
+    written = write_playground(out, policies)
+    console.print(f"page: {written}, {written.stat().st_size / 1e6:.2f} MB; open it in a browser")

@@ -1,0 +1,158 @@
+// The playground's mathematics, without a page: robots that a policy or LQR controls. `step`, `push`, `MODELS` and `DATA`
+// come before it, printed by playground.py. The same code runs in the browser and, in tests, in node.
+"use strict";
+
+/** Numbers that Python packed, as an array. */
+function unpacked(base64, Kind) {
+  const text = atob(base64);
+  const bytes = Uint8Array.from(text, (letter) => letter.charCodeAt(0));
+  return new Kind(bytes.buffer);
+}
+
+const ACTIVATIONS = { tanh: Math.tanh, relu: (a) => Math.max(a, 0), silu: (a) => a / (1 + Math.exp(-a)) };
+
+/** A learned policy: force = limit · squash(W o + MLP(o)), averaged over mirror images or seen in a frame, as in policy.py. */
+class Policy {
+  constructor(data, model) {
+    this.data = data;
+    this.model = model;
+    const layer = ({ weight, bias }) => ({
+      weight: unpacked(weight, Float32Array),
+      bias: bias === null ? null : unpacked(bias, Float32Array),
+    });
+    this.layers = data.layers.map(layer);
+    this.linear = data.linear === null ? null : layer(data.linear);
+  }
+
+  reset() {}
+
+  act(k, x, c) {
+    const observation = Array.from(Float32Array.from(this.model.observe(x, c)));
+    const squash = this.data.squash === "tanh" ? Math.tanh : (a) => Math.min(Math.max(a, -1), 1);
+    return this.raw(observation).map((a) => DATA.force_limit * Math.fround(squash(a)));
+  }
+
+  raw(observation) {
+    if (this.model.features) return this.model.back(observation, this.sum(this.model.features(observation)));
+    const total = this.sum(observation);
+    for (const [signs, action] of this.data.mirrors) {
+      const mirrored = this.sum(observation.map((value, i) => signs[i] * value));
+      total.forEach((_, i) => (total[i] += action[i] * mirrored[i]));
+    }
+    return total.map((value) => value / (1 + this.data.mirrors.length));
+  }
+
+  sum(inputs) {
+    const activate = ACTIVATIONS[this.data.activation];
+    let values = inputs;
+    this.layers.forEach((layer, i) => {
+      values = affine(layer, values);
+      if (i < this.layers.length - 1) values = values.map(activate);
+    });
+    if (this.linear === null) return values;
+    return affine(this.linear, inputs).map((value, i) => value + values[i]);
+  }
+}
+
+/** W v + b, with W in rows. */
+function affine({ weight, bias }, values) {
+  const outputs = new Array(weight.length / values.length);
+  for (let row = 0, k = 0; row < outputs.length; row++) {
+    let sum = bias === null ? 0 : bias[row];
+    for (let column = 0; column < values.length; column++, k++) sum += weight[k] * values[column];
+    outputs[row] = sum;
+  }
+  return outputs;
+}
+
+/** LQR about a reference motion: force = u_ref − K (x − x_ref), as LqrController in lqr.py. */
+class Lqr {
+  constructor(data) {
+    this.closed = data.closed;
+    [this.x, this.u, this.k] = [data.x, data.u, data.k].map((part) => unpacked(part, Float64Array));
+    this.points = this.u.length / 2;
+  }
+
+  act(k, x) {
+    const i = this.closed ? this.nearest(x) : Math.min(k, this.points - 1);
+    return [0, 1].map((row) => {
+      let force = this.u[2 * i + row];
+      for (let j = 0; j < 8; j++) force -= this.k[16 * i + 8 * row + j] * (x[j] - this.x[8 * i + j]);
+      return force;
+    });
+  }
+
+  nearest(x) {
+    let [best, least] = [0, Infinity];
+    for (let i = 0; i < this.points; i++) {
+      const distance = (this.x[8 * i] - x[0]) ** 2 + (this.x[8 * i + 1] - x[1]) ** 2;
+      if (distance < least) [best, least] = [i, distance];
+    }
+    return best;
+  }
+}
+
+/** One ballbot in a scenario under one controller, as BallbotEnv with physics="rk4". */
+class Robot {
+  constructor(controller, scenario) {
+    this.controller = controller;
+    this.scenario = scenario;
+    this.model = MODELS[scenario.task];
+    this.reset(scenario.state);
+  }
+
+  reset(state) {
+    this.x = [...state];
+    this.before = this.x; // one control step ago, for pictures between the steps
+    this.force = [0, 0];
+    this.steps = 0;
+    this.cost = 0;
+    this.peak = this.tilt;
+    this.ended = ""; // the limit that it violated, or "goal"
+    this.path = [[this.x[0], this.x[1]]];
+  }
+
+  get tilt() {
+    return Math.acos(Math.min(1, Math.max(-1, Math.cos(this.x[2]) * Math.cos(this.x[3]))));
+  }
+
+  get failed() {
+    return this.ended !== "" && this.ended !== "goal";
+  }
+
+  /** Holds a force for one control step. */
+  advance() {
+    this.before = this.x;
+    if (this.ended) return;
+    const c = this.scenario.constants;
+    const limit = DATA.force_limit;
+    this.force = this.controller.act(this.steps, this.x, c).map((f) => Math.min(Math.max(f, -limit), limit));
+    const { optimum, duration } = this.scenario;
+    const counts = optimum === null || this.steps * DATA.dt < duration - 1e-9; // an episode's cost ends with it
+    if (counts) this.cost += this.model.cost(this.x, this.force, c)[0] * DATA.dt;
+    this.x = step(this.x, this.force);
+    this.steps += 1;
+    this.peak = Math.max(this.peak, this.tilt);
+    this.path.push([this.x[0], this.x[1]]);
+    this.judge();
+  }
+
+  /** A horizontal impulse on the body's centre of mass, N·s. */
+  hit(impulse) {
+    if (this.ended || !impulse.every(Number.isFinite)) return;
+    this.x = push(this.x, impulse);
+  }
+
+  judge() {
+    const c = this.scenario.constants;
+    const violated = this.model.limits(this.x, c).findIndex((limit) => !(limit >= 0));
+    if (violated >= 0) this.ended = this.model.limit_names[violated];
+    else if (this.model.first_exit && this.model.goal(this.x, c).every((excess) => excess <= 0)) this.ended = "goal";
+  }
+}
+
+/** The robots of a scenario: the policy's, then LQR's. */
+function robotsOf(scenario) {
+  const model = MODELS[scenario.task];
+  return [new Robot(new Policy(DATA.policies[scenario.task], model), scenario), new Robot(new Lqr(scenario.lqr), scenario)];
+}

@@ -1,0 +1,258 @@
+"""The playground without Python: one HTML page in which a learned policy and LQR balance, and the reader pushes them.
+
+Everything is in the page: the closed-form model, the tasks' costs, limits and observations, LQR's gains and the policies'
+weights. The model and the tasks are printed as JavaScript from the lines that Python runs; see `javascript`.
+"""
+
+import base64
+import functools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi
+import jinja2
+import numpy as np
+import safetensors.numpy
+from markupsafe import Markup
+
+from ballbot_baselines.lqr import LqrController
+from ballbot_gym import certified, drawing, dynamics, files
+from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_train.evaluation.controllers import task_name
+from ballbot_train.policy_files import PolicySpec, paths_of, read_description, shipped_policies
+from ballbot_train.report import labels
+from ballbot_train.report.javascript import javascript_function
+
+LARGEST = 1_500_000
+"""Bytes that the page may have."""
+
+_ASSETS = Path(__file__).parent / "assets"
+_LEARNERS = {"stabilize": "sac", "turn": "dagger", "orbit": "dagger", "weave": "shac"}
+"""The shipped policy of each task that the page shows: the one with the least regret."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What the robots of the page are up to."""
+
+    title: str
+    text: str
+    """What to look at, in a sentence or two."""
+    task: str
+    episode: int | None = None
+    """The certified episode that it is; None is standing at rest at the origin."""
+    push: tuple[float, float, float] | None = None
+    """A push that comes by itself: time, s, impulse, N·s, and bearing, rad."""
+
+
+SCENARIOS = (
+    Scenario(
+        "Push",
+        "Both robots stand still and get the same push of 90 N·s. LQR is right for small leans only, and falls. "
+        "The learned policy leans 45°, brakes and comes back.",
+        "stabilize",
+        push=(0.6, 90.0, 0.5),
+    ),
+    Scenario(
+        "Throw",
+        "Both start fast and leaning, and are to come to rest on the green spot. Braking takes a lean of 40°.",
+        "stabilize",
+        7,
+    ),
+    Scenario("Orbit", "From rest onto a circle at 5.5 m/s, which takes a steady lean of 43°.", "orbit", 17),
+    Scenario("Turn", "A right-angled turn through the gate at 6.8 m/s, with as little force as possible.", "turn", 1),
+    Scenario("Weave", "Round five obstacles, and to rest behind them. LQR does not know of obstacles.", "weave", 12),
+)
+"""Every scenario of the page."""
+
+
+def pushed(params: BallbotParams, x: casadi.SX, impulse: casadi.SX) -> casadi.SX:
+    """The state just after a horizontal impulse (2,), N·s, on the body's centre of mass, of CasADi columns.
+
+    M Δq̇ = Jᵀ p, with the mass matrix M and the Jacobian J of the centre of mass's horizontal position.
+    """
+    gamma, theta = x[2], x[3]
+    centre = x[:2] + params.com_height * casadi.vertcat(casadi.sin(gamma) * casadi.cos(theta), casadi.sin(theta))
+    mass = casadi.hessian(dynamics.energy(params, x), x)[0][4:, 4:]
+    slope = casadi.jacobian(centre, x)[:, :4]
+    return x + casadi.vertcat(casadi.SX.zeros(4), casadi.solve(mass, slope.T @ impulse))
+
+
+def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
+    """Writes the page; arguments and errors as `playground_page`."""
+    return files.write(path, playground_page(policies))
+
+
+def playground_page(policies: Sequence[str] = ()) -> str:
+    """The page as HTML.
+
+    Args:
+        policies: files of policies, each shown in place of the shipped one of its task.
+
+    Raises:
+        PolicyError: a file is no policy.
+        ValueError: a policy is of no registered task, two are of one task, or the page would be larger than `LARGEST`.
+    """
+    loader = jinja2.FileSystemLoader(_ASSETS)
+    templates = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    page = templates.get_template("playground.html.j2").render(
+        style=_asset("playground.css"),
+        scripts=[Markup(engine_script(policies)), _asset("scene.js"), _asset("playground.js")],
+    )
+    size = len(page.encode())
+    if size > LARGEST:
+        raise ValueError(f"the page would have {size / 1e6:.2f} MB, and at most {LARGEST / 1e6:g} MB load at once")
+    return page
+
+
+def engine_script(policies: Sequence[str] = ()) -> str:
+    """All of the page that computes, as JavaScript without a page: what the tests run in node."""
+    params = default_params()
+    data = {
+        "dt": make_task("stabilize").control_dt,
+        "force_limit": params.force_limit,
+        "robot": {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")},
+        "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
+        "force_scale": drawing.FORCE_SCALE,
+        "least_force": drawing.LEAST_FORCE,
+        "ghost_opacity": drawing.GHOST_OPACITY,
+        "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr", 0)},
+        "policies": _policies(policies),
+        "scenarios": [_scenario_data(scenario, params) for scenario in SCENARIOS],
+    }
+    # Within a script, "<" could end it.
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    specs = {name: policy["frame"] for name, policy in data["policies"].items()}
+    return "\n".join([_model_script(params, specs), f"const DATA = {text};", _asset("engine.js")])
+
+
+def _policies(given: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The policy of each task."""
+    paths: dict[str, Path] = {}
+    for policy in given:
+        task = task_name(str(policy), None)
+        if task in paths:
+            raise ValueError(f"{paths[task]} and {policy} are both policies for {task}; give one")
+        _check_policy(Path(policy), make_task(task))
+        paths[task] = Path(policy)
+    shipped = {task: shipped_policies(make_task(task))[learner] for task, learner in _LEARNERS.items()}
+    return {task: _policy_data(paths.get(task, path), make_task(task)) for task, path in shipped.items()}
+
+
+def _check_policy(path: Path, task: Task) -> None:
+    """Raises a PolicyError where a file is no policy of the task."""
+    from ballbot_train.policy import load_network  # it imports torch
+
+    load_network(path, task)
+
+
+def _policy_data(path: Path, task: Task) -> dict[str, Any]:
+    """What a policy computes with, the numbers packed. torch is not imported: the files hold all."""
+    described = read_description(path)
+    spec = PolicySpec.read(described["spec"])
+    name = str(described.get("training", {}).get("learner", path.stem))
+    weights = safetensors.numpy.load(files.read(paths_of(path)[0]))
+    # activations lie between the layers, which are numbered with them
+    layers = [f"mlp.{2 * i}" for i in range(len(spec.hidden) + 1)]
+    return {
+        "label": labels.label(name),
+        "color": labels.color(name, 0),
+        "layers": [_layer(weights, layer) for layer in layers],
+        "linear": _layer(weights, "linear") if spec.linear else None,
+        "activation": spec.activation,
+        "squash": spec.squash,
+        "mirrors": spec.mirrors,
+        "frame": spec.frame,
+    }
+
+
+def _layer(weights: Mapping[str, np.ndarray], name: str) -> dict[str, str | None]:
+    bias = weights.get(f"{name}.bias")
+    return {
+        "weight": _packed(weights[f"{name}.weight"], np.float32),
+        "bias": None if bias is None else _packed(bias, np.float32),
+    }
+
+
+def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
+    task = make_task(scenario.task)
+    state, constants, optimum = np.zeros(8), np.zeros(0), None
+    if scenario.episode is not None:
+        episodes = certified.load(task)
+        state, constants = episodes.states[scenario.episode], episodes.constants[scenario.episode]
+        optimum = float(episodes.costs[scenario.episode])
+    lqr = LqrController(task, params)
+    lqr.reset(0.0, state, constants)
+    return {
+        "title": scenario.title,
+        "text": scenario.text,
+        "task": scenario.task,
+        "state": state.tolist(),
+        "constants": constants.tolist(),
+        "duration": task.duration,
+        "optimum": optimum,
+        "push": scenario.push,
+        "markers": [asdict(marker) for marker in task.markers(constants)],
+        "lqr": {
+            "closed": lqr.reference.closed,
+            "x": _packed(lqr.reference.x, np.float64),
+            "u": _packed(lqr.reference.u, np.float64),
+            "k": _packed(lqr.gains.k, np.float64),
+        },
+    }
+
+
+def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> str:
+    """The functions `step` and `push`, and `MODELS`: every task's functions by the task's name."""
+    dt = make_task("stabilize").control_dt
+    substeps = dynamics.substeps_for(dt)
+    parts = [
+        javascript_function("step", lambda x, u: dynamics.step(params, x, u, dt, substeps), {"x": 8, "u": 2}),
+        javascript_function("push", functools.partial(pushed, params), {"x": 8, "impulse": 2}),
+    ]
+    models = []
+    for name in TASKS:
+        source, entry = _task_script(name, make_task(name), frames.get(name))
+        parts.append(source)
+        models.append(entry)
+    return "\n".join([*parts, "const MODELS = {\n" + "\n".join(models) + "\n};"])
+
+
+def _task_script(name: str, task: Task, frame: str | None) -> tuple[str, str]:
+    """The source of a task's functions, and its line of `MODELS`."""
+    constants = len(task.constant_names)
+    of_state = {"x": 8, "c": constants}
+    functions = {
+        "observe": (task.observe, of_state),
+        "cost": (task.cost, {"x": 8, "u": 2, "c": constants}),
+        "limits": (task.limits, of_state),
+        "goal": (task.goal, of_state),
+    }
+    if frame is not None:
+        seen = {"o": len(task.observation_scale)}
+        features = FRAMES[frame].features
+        functions["features"] = (lambda o: features(tuple(casadi.vertsplit(o)))[0], seen)
+        functions["back"] = (
+            lambda o, a: features(tuple(casadi.vertsplit(o)))[1]((a[0], a[1])),
+            {**seen, "a": 2},
+        )
+    sources = [javascript_function(f"{name}_{key}", *function) for key, function in functions.items()]
+    entries = ", ".join(f"{key}: {name}_{key}" for key in functions)
+    facts = f"limit_names: {json.dumps(task.limit_names)}, first_exit: {json.dumps(task.first_exit)}"
+    return "\n".join(sources), f"  {name}: {{ {entries}, {facts} }},"
+
+
+def _packed(numbers: np.ndarray, kind: type) -> str:
+    """Numbers in base64, little-endian, as every browser's machine reads them."""
+    return base64.b64encode(np.ascontiguousarray(numbers, np.dtype(kind).newbyteorder("<")).tobytes()).decode()
+
+
+def _asset(name: str) -> Markup:
+    """The text of one of this package's own scripts or styles."""
+    return Markup((_ASSETS / name).read_text(encoding="utf-8"))
