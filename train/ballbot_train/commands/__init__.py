@@ -26,6 +26,7 @@ COMMANDS: dict[str, str] = {
     "demos": "ballbot_train.commands.demos:demos",
     "export": "ballbot_train.commands.export:export",
     "train": "ballbot_train.commands.train:train",
+    "curves": "ballbot_train.commands.curves:curves",
     "tune": "ballbot_train.commands.tune:tune",
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""

@@ -2,15 +2,15 @@
 
 import argparse
 import shlex
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_names, console, physics_or_default
+from ballbot_train.console import check_names, console, physics_or_default, print_table, progress_bar
 from ballbot_train.learning.learners import LEARNERS, check_settings
 
 _MOST_THREADS = 1024
@@ -28,10 +28,15 @@ class Run:
     """Policy file whose weights training starts from; only for shac."""
     seed: int = 0
     """Seed of everything that is drawn."""
+    seeds: str | None = None
+    """Several seeds in place of one, as 0:5 (0 to 4) or 0,3,7: a queue of one-core runs, each in a folder in --out. The same
+    command continues a queue that was stopped."""
+    workers: int = 1
+    """How many runs of --seeds go on at once, each on one core."""
     threads: int | None = None
     """Threads of torch; default, torch's own choice. Another number changes the last digits."""
     out: Path | None = None
-    """Folder of the run; default runs/train/TASK-LEARNER."""
+    """Folder of the run, or of all runs of --seeds; default runs/train/TASK-LEARNER."""
     resume: bool = False
     """Continue the run in this folder, if there is one."""
 
@@ -48,6 +53,8 @@ def train(
     out: Path | None = None,
     resume: bool = False,
     command: str | None = None,
+    seeds: str | None = None,
+    workers: int = 1,
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
@@ -62,6 +69,8 @@ def train(
         out: folder of the run; default runs/train/TASK-LEARNER.
         resume: continue the run in this folder, if there is one.
         command: the command that was typed, for the record; default, one with all settings.
+        seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
+        workers: how many runs of `seeds` go on at once.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
@@ -72,6 +81,11 @@ def train(
         raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, not {workers}")
+    if seeds is not None:
+        _train_seeds(learner, Run(task, demos, start, threads=threads, out=out), settings, seeds, workers)
+        return
 
     import torch
 
@@ -89,7 +103,7 @@ def train(
     check_settings(settings)
     out = Path("runs") / "train" / f"{task}-{learner}" if out is None else out
     if command is None:
-        command = command_with(learner, Run(task, demos, start, seed, threads, out), settings)
+        command = command_with(learner, Run(task, demos, start, seed, threads=threads, out=out), settings)
     # the record also says how the demonstrations, or the policy to start from, were made
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
@@ -118,6 +132,36 @@ def train(
         f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
         f"{row.regret_mean:.2%} mean, {row.regret_median:.2%} median\npolicy: {out / 'policy.json'}"
     )
+
+
+def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int) -> None:
+    """Trains on several seeds, and prints what each reached."""
+    from ballbot_train.learning import seeds as queue
+
+    seeds = queue.parse_seeds(named)
+    settings = LEARNERS[learner].settings(run.task) if settings is None else settings
+    check_settings(settings)
+    out = Path("runs") / "train" / f"{run.task}-{learner}" if run.out is None else run.out
+
+    def command_of(seed: int) -> str:
+        return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
+
+    expected = {"learner": learner, "task": run.task, "settings": asdict(settings)}
+    with progress_bar() as progress:
+        bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
+        trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar))
+    header = ["seed", "", "success", "failures", "mean regret", "minutes"]
+    rows = [_row(str(each.seed), vars(each)) for each in trained]
+    middle, worst = queue.middle_and_worst(trained)
+    print_table(
+        f"{learner} on {run.task}, certified episodes", header, [*rows, _row("median", middle), _row("worst", worst)]
+    )
+    console.print(f"learning curves: ballbot curves {shlex.quote(str(out))}")
+
+
+def _row(name: str, values: Mapping[str, Any]) -> list[str]:
+    shares = f"{values['success']:.1%}", f"{values['failures']:g}", f"{values['regret_mean']:.2%}"
+    return [name, "", *shares, f"{values['minutes']:.1f}"]
 
 
 def command_line(arguments: Sequence[str]) -> None:
@@ -164,7 +208,7 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
     for name, value in _shallow(run).items():
-        if value is not None and name != "resume":
+        if value is not None and name not in ("resume", "seeds", "workers"):
             words += [f"--{name}", str(value)]
     for name, value in asdict(settings).items():
         words += _option(name.replace("_", "-"), value)

@@ -9,6 +9,7 @@ COLORS = {
     "bc": "#8d6e63",
     "dagger": "#34495e",
     "ppo": "#2e8b57",
+    "rsl_ppo": "#a04000",
     "sac": "#17a2b8",
     "shac": "#8e44ad",
 }
@@ -19,6 +20,7 @@ LABELS = {
     "bc": "behaviour cloning",
     "dagger": "DAgger",
     "ppo": "PPO",
+    "rsl_ppo": "PPO by rsl_rl",
     "sac": "SAC",
     "shac": "SHAC",
 }
