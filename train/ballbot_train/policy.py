@@ -101,7 +101,8 @@ class PolicyNetwork(torch.nn.Module):
 class PolicyController(ActionController):
     """A policy as a Controller of forces, and with Stable-Baselines3's `predict` of actions."""
 
-    def __init__(self, task: Task, params: BallbotParams, network: PolicyNetwork):
+    def __init__(self, task: Task, params: BallbotParams, network: torch.nn.Module):
+        """Args: network: a `PolicyNetwork`, or another from observations (..., no) to actions (..., 2)."""
         super().__init__(task, params, lambda observation, begins: self.predict(observation)[0])
         self._network = network.eval()
 

@@ -68,7 +68,8 @@ class LearningCurve:
         known = [(run.columns[axis], run.columns[metric]) for run in self.runs]
         known = [(x[keep], y[keep]) for x, y in known if (keep := np.isfinite(x) & np.isfinite(y)).sum() > 1]
         if len(known) < len(self.runs):
-            return (np.zeros(0),) * 4
+            none = np.zeros(0)
+            return none, none, none, none
         grid = np.linspace(max(x[0] for x, _ in known), min(x[-1] for x, _ in known), _POINTS)
         values = np.array([np.interp(grid, x, y) for x, y in known])
         return grid, interquartile_mean(values), *bootstrap_band(values)
