@@ -146,6 +146,12 @@ def test_a_queue_trains_each_seed_in_a_folder_of_its_own_and_does_only_what_is_m
     assert "worst │ │ 90.0% │ 2" in printed
 
 
+def test_a_seed_that_fails_everywhere_is_the_worst():
+    trained = [seeds.Trained(seed, 0.5, 3, regret, 1.0) for seed, regret in enumerate((0.2, float("nan"), 0.1))]
+    middle, worst = seeds.middle_and_worst(trained)
+    assert (middle["regret_mean"], worst["regret_mean"]) == (0.2, float("inf"))
+
+
 def test_a_queue_is_not_mixed_with_runs_of_other_settings(processes, tmp_path):
     train("bc", seeds="0:1", out=tmp_path)
     with pytest.raises(ValueError, match="holds a run of settings"):

@@ -4,6 +4,7 @@ Each seed has a run folder of its own, OUT/seed-K, and prints into OUT/seed-K.lo
 started again: finished runs stay, and interrupted ones resume.
 """
 
+import math
 import os
 import shlex
 import statistics
@@ -110,9 +111,10 @@ def run(
 
 
 def middle_and_worst(trained: Sequence[Trained]) -> tuple[dict[str, float], dict[str, float]]:
-    """Median and worst of the seeds, of each quantity by its name in `Trained`."""
+    """Median and worst of the seeds, of each quantity by its name in `Trained`. A regret of no episode counts as infinite."""
     names = ("success", "failures", "regret_mean", "minutes")
     columns = {name: [float(getattr(run, name)) for run in trained] for name in names}
+    columns = {name: [math.inf if math.isnan(value) else value for value in values] for name, values in columns.items()}
     worst = {name: (min if name == "success" else max)(values) for name, values in columns.items()}
     return {name: statistics.median(values) for name, values in columns.items()}, worst
 
