@@ -319,7 +319,7 @@ def chromium(tmp_path_factory):
         browser.quit()
 
 
-def shown(browser, words, seconds=60.0):
+def shown(browser, words, seconds=120.0):
     """Waits until the page's text has these words."""
     wait_for(lambda: words in browser.execute_script("return document.body.innerText"), seconds)
 
@@ -331,7 +331,8 @@ def severe(browser):
 @pytest.mark.slow
 def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromium, tmp_path):
     one, two = chromium(), chromium()
-    address, port = opened.viewer.address, opened.viewer.port
+    port = opened.viewer.port
+    address = f"{opened.viewer.address}/?fixedDpr=0.1"  # large pixels, because the processor draws them
     one.get(address)
     shown(one, "LQR")
     wait_for(lambda: len(opened.viewer.server.get_clients()) == 1)
@@ -363,7 +364,7 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     try:
         assert again.viewer.port == port
         wait_for(lambda: len(again.viewer.server.get_clients()) == 2, 120)
-        shown(one, "of 8 s", 60)
+        shown(one, "of 8 s")
     finally:
         again.close()
         opened.__init__(tmp_path)  # for the fixture to close

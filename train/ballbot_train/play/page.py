@@ -438,8 +438,8 @@ class PlayPage:
         self.playground.at_end = choice
 
     def _time_action(self, button: str) -> Callable[[], None]:
-        actions = dict(zip(_TIME_BUTTONS, (self._toggle, self._one_step, self.playground.restart), strict=True))
-        return actions.get(button, lambda: None)
+        play, step, _ = _TIME_BUTTONS
+        return {play: self._toggle, step: self._one_step}.get(button, self.playground.restart)
 
     def _start_action(self, button: str) -> Callable[[], None]:
         certified = button == _START_BUTTONS[0]
