@@ -174,14 +174,14 @@ class PlayPage:
         self._show_roles()
 
     def _show_roles(self) -> None:
+        open_pages = self.viewer.server.get_clients()
         for client_id, (text, button) in list(self._roles.items()):
-            try:
-                button.visible = self.driver not in (client_id, None)
-                watched = f" {len(self._roles) - 1} watch." if len(self._roles) > 1 else ""
-                text.content = f"**You drive.**{watched}" if self.driver == client_id else "**You watch.**"
-                text.visible = len(self._roles) > 1
-            except RuntimeError:  # it has just closed its page
+            if client_id not in open_pages:
                 continue
+            button.visible = self.driver not in (client_id, None)
+            watched = f" {len(self._roles) - 1} watch." if len(self._roles) > 1 else ""
+            text.content = f"**You drive.**{watched}" if self.driver == client_id else "**You watch.**"
+            text.visible = len(self._roles) > 1
 
     def _may(self, client_id: int | None) -> bool:
         """Whether this browser drives. The first one that asks takes a free seat."""
