@@ -223,6 +223,9 @@ class PlayPage:
         playground = self.playground
         if self._task_shown != (playground.task_name, playground.robot):
             self._build_task()
+        options = tuple(map(self._option, self._choices()))
+        if self._controller.options != options:
+            self._controller.options = options
         for control, read in self._bound:
             value = read()
             if control.value != value:
@@ -246,6 +249,8 @@ class PlayPage:
                 )
             self._controller = gui.add_dropdown("Controller", ("",))
             self._bind(self._controller, self._choose, lambda: self._option(playground.controller))
+            file = gui.add_text("Policy file", "", hint="path of a policy's .json on the machine of the simulation")
+            self._bind(file, self._choose_file, self._shown_file)
             self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
             self._build_time()
             self._build_push()
@@ -409,6 +414,15 @@ class PlayPage:
 
     def _choose(self, option: str) -> None:
         self.playground.set_controller(self._name(option))
+
+    def _choose_file(self, path: str) -> None:
+        if path:
+            self.playground.set_controller(path)
+
+    def _shown_file(self) -> str:
+        """The policy file of the main robot, if it has one."""
+        name = self.playground.controller
+        return "" if name in self.playground.controllers else name
 
     def _set_ghost(self, name: str, wanted: bool) -> None:
         others = [ghost for ghost in self.playground.ghosts if ghost != name]
