@@ -6,6 +6,7 @@ render_mode="human" shows itself here where no window can open.
 
 import contextlib
 import io
+import logging
 import math
 import sys
 import threading
@@ -61,6 +62,8 @@ class Viewer:
             ImportError: viser is missing.
         """
         viser = import_viser()
+        # Whoever sends garbage, or leaves while the server stops, would get a traceback onto the user's terminal.
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints an address that may not be the one to open
             self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         self.follow = follow

@@ -18,6 +18,7 @@ from ballbot_gym.viewer import Viewer
 from ballbot_train.play.gate import Gate
 from ballbot_train.play.page import PlayPage, _film
 from ballbot_train.play.playground import Playground
+from ballbot_train.policy_files import SHIPPED
 
 viser = pytest.importorskip("viser")
 
@@ -92,6 +93,18 @@ def test_controls_change_the_playground(opened):
     assert opened.page.clock.speed == 2.0
     assert playground.weights["effort_weight"] == pytest.approx(10 * playground.base.effort_weight)
     assert playground.controller == "you"
+
+
+def test_a_policy_file_becomes_a_controller_that_can_be_chosen(opened):
+    path = str(SHIPPED / "stabilize-shac.json")
+    opened.change("Policy file", path)
+    wait_for(lambda: opened.playground.main.name == path, 60)
+    assert opened.control("Controller").value == "stabilize-shac"
+    opened.change("Controller", "LQR")
+    wait_for(lambda: opened.control("Policy file").value == "")
+    opened.change("Policy file", "nowhere.json")
+    wait_for(lambda: opened.control("Policy file").value == "")
+    assert "unknown controller 'nowhere.json'" in opened.playground.notice
 
 
 def test_another_task_brings_its_own_controllers_and_weights(opened):
@@ -281,6 +294,23 @@ def test_the_token_becomes_a_cookie_that_opens_the_gate(gate):
     assert gate.token in gate.address
 
 
+def test_the_page_and_its_live_connection_pass_the_gate(opened):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    gate = Gate("127.0.0.1", 0, opened.viewer.port)
+    try:
+        assert b"<html" in asked(gate, "/", Cookie=f"ballbot={gate.token}")[1]
+        live = f"ws://127.0.0.1:{gate.port}", [f"viser-v{viser.__version__}"]
+        with pytest.raises(InvalidStatus, match="401"):
+            connect(live[0], subprotocols=live[1])
+        cookie = {"Cookie": f"ballbot={gate.token}"}
+        with connect(live[0], subprotocols=live[1], additional_headers=cookie, max_size=None) as client:
+            assert client.recv(timeout=10)
+    finally:
+        gate.close()
+
+
 def test_what_is_no_request_is_dropped(gate):
     for sent in (b"\x16\x03\x01 tls?", b"GET\r\n\r\n", b"x" * 70_000):
         with socket.create_connection(("127.0.0.1", gate.port), timeout=5) as plain:
@@ -319,7 +349,7 @@ def chromium(tmp_path_factory):
         browser.quit()
 
 
-def shown(browser, words, seconds=60.0):
+def shown(browser, words, seconds=120.0):
     """Waits until the page's text has these words."""
     wait_for(lambda: words in browser.execute_script("return document.body.innerText"), seconds)
 
@@ -331,7 +361,8 @@ def severe(browser):
 @pytest.mark.slow
 def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromium, tmp_path):
     one, two = chromium(), chromium()
-    address, port = opened.viewer.address, opened.viewer.port
+    port = opened.viewer.port
+    address = f"{opened.viewer.address}/?fixedDpr=0.1"  # large pixels, because the processor draws them
     one.get(address)
     shown(one, "LQR")
     wait_for(lambda: len(opened.viewer.server.get_clients()) == 1)
@@ -363,7 +394,7 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     try:
         assert again.viewer.port == port
         wait_for(lambda: len(again.viewer.server.get_clients()) == 2, 120)
-        shown(one, "of 8 s", 60)
+        shown(one, "of 8 s")
     finally:
         again.close()
         opened.__init__(tmp_path)  # for the fixture to close

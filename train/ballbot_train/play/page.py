@@ -174,14 +174,14 @@ class PlayPage:
         self._show_roles()
 
     def _show_roles(self) -> None:
+        open_pages = self.viewer.server.get_clients()
         for client_id, (text, button) in list(self._roles.items()):
-            try:
-                button.visible = self.driver not in (client_id, None)
-                watched = f" {len(self._roles) - 1} watch." if len(self._roles) > 1 else ""
-                text.content = f"**You drive.**{watched}" if self.driver == client_id else "**You watch.**"
-                text.visible = len(self._roles) > 1
-            except RuntimeError:  # it has just closed its page
+            if client_id not in open_pages:
                 continue
+            button.visible = self.driver not in (client_id, None)
+            watched = f" {len(self._roles) - 1} watch." if len(self._roles) > 1 else ""
+            text.content = f"**You drive.**{watched}" if self.driver == client_id else "**You watch.**"
+            text.visible = len(self._roles) > 1
 
     def _may(self, client_id: int | None) -> bool:
         """Whether this browser drives. The first one that asks takes a free seat."""
@@ -223,6 +223,9 @@ class PlayPage:
         playground = self.playground
         if self._task_shown != (playground.task_name, playground.robot):
             self._build_task()
+        options = tuple(map(self._option, self._choices()))
+        if self._controller.options != options:
+            self._controller.options = options
         for control, read in self._bound:
             value = read()
             if control.value != value:
@@ -246,6 +249,8 @@ class PlayPage:
                 )
             self._controller = gui.add_dropdown("Controller", ("",))
             self._bind(self._controller, self._choose, lambda: self._option(playground.controller))
+            file = gui.add_text("Policy file", "", hint="path of a policy's .json on the machine of the simulation")
+            self._bind(file, self._choose_file, self._shown_file)
             self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
             self._build_time()
             self._build_push()
@@ -410,6 +415,15 @@ class PlayPage:
     def _choose(self, option: str) -> None:
         self.playground.set_controller(self._name(option))
 
+    def _choose_file(self, path: str) -> None:
+        if path:
+            self.playground.set_controller(path)
+
+    def _shown_file(self) -> str:
+        """The policy file of the main robot, if it has one."""
+        name = self.playground.controller
+        return "" if name in self.playground.controllers else name
+
     def _set_ghost(self, name: str, wanted: bool) -> None:
         others = [ghost for ghost in self.playground.ghosts if ghost != name]
         if wanted and len(others) >= _OTHERS:
@@ -438,8 +452,8 @@ class PlayPage:
         self.playground.at_end = choice
 
     def _time_action(self, button: str) -> Callable[[], None]:
-        actions = dict(zip(_TIME_BUTTONS, (self._toggle, self._one_step, self.playground.restart), strict=True))
-        return actions.get(button, lambda: None)
+        play, step, _ = _TIME_BUTTONS
+        return {play: self._toggle, step: self._one_step}.get(button, self.playground.restart)
 
     def _start_action(self, button: str) -> Callable[[], None]:
         certified = button == _START_BUTTONS[0]

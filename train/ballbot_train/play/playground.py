@@ -462,7 +462,7 @@ class Playground:
             waiting = [
                 labels.label(name) for key, name in self._wanted.items() if self._runners[key].controller is None
             ]
-            return f"preparing {', '.join(waiting)} …"
+            return f"preparing {', '.join(waiting)} … the first time in a task, solvers are compiled"
         if self.ended and self.scores:
             return self.scores[-1].text
         return f"{labels.label(self.main.name)}, {self.seconds:.1f} s of {self.task.duration:g} s"
