@@ -8,6 +8,7 @@ and compiled batches agree to rounding. So does a compiled batch of one env, whi
 """
 
 import logging
+import reprlib
 import shutil
 import types
 from collections.abc import Callable, Sequence
@@ -22,7 +23,7 @@ except ImportError as error:
     raise ImportError('batches of environments need torch: pip install "ballbot-gym[train]"') from error
 
 from ballbot_gym import counter_rng, dynamics
-from ballbot_gym.env import make_task
+from ballbot_gym.env import LARGEST, make_task
 from ballbot_gym.params import BallbotParams, checked_params
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.tasks import Task
@@ -220,11 +221,15 @@ class BallbotBatch:
             seed: an int seeds env i with seed + i; a sequence seeds env i with seed[i]. An env without a seed starts its
                 next episode; the first time it is seeded at random.
             mask: (B,) bool, the envs to reset; default, all. The first time all are reset.
-            x: (8, B) initial states; default, drawn. They are not checked.
-            c: (nc, B) constants; default, drawn. They are not checked.
+            x: (8, B) initial states; default, drawn.
+            c: (nc, B) constants; default, drawn.
 
         Returns:
             (B, no) observations of all envs.
+
+        Raises:
+            ValueError: seeds, mask, states or constants of the wrong shape, not finite or out of their range; or a given
+                state that violates a limit of the task.
         """
         self.state = self.initial_state(seed, mask, x, c)
         return self.observe(self.state)
@@ -237,6 +242,12 @@ class BallbotBatch:
         c: torch.Tensor | None = None,
     ) -> BatchState:
         """The state in which `reset` with these arguments would start; changes nothing."""
+        self._check_mask(mask)
+        self._check_given(x, 8, "x")
+        if c is not None:
+            self._check_given(c, len(self.task.constant_names), "c")
+            for distinct in np.unique(c.detach().cpu().double().numpy(), axis=1).T:
+                self.task.check_constants(distinct, self.params)
         old = self.state
         if old is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -249,7 +260,29 @@ class BallbotBatch:
             given = torch.tensor([-1 if s is None else s for s in seeds_of(seed, self.num_envs)], device=self.device)
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c)
+        if x is not None:
+            violated = first_below_zero(self.task.limits(new.x, new.c))
+            bad = (mask & (violated >= 0)).nonzero()[:, 0].tolist()
+            if bad:
+                raise ValueError(
+                    f"start states of envs {bad[:8]} violate limits of {self.task.id}: that of env {bad[0]} the limit of "
+                    f"{self.task.limit_names[int(violated[bad[0]])]}"
+                )
         return self._stacked(new if old is None else _select(mask, new, _rows(old)))
+
+    def _check_mask(self, mask: Any) -> None:
+        if mask is None:
+            return
+        if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_envs,):
+            raise ValueError(f"mask must be a tensor of {self.num_envs} bools, not {_described(mask)}")
+
+    def _check_given(self, given: Any, rows: int, what: str) -> None:
+        if given is None:
+            return
+        if not isinstance(given, torch.Tensor) or given.shape != (rows, self.num_envs):
+            raise ValueError(f"{what} must be a tensor of shape ({rows}, {self.num_envs}), not {_described(given)}")
+        if not (given.detach().abs() <= LARGEST).all():  # NaN neither
+            raise ValueError(f"{what} must be finite numbers within ±{LARGEST:g}")
 
     def observe(self, state: BatchState) -> torch.Tensor:
         """(B, no) observations of a state, with the sensors' noise. A pure function."""
@@ -513,6 +546,13 @@ def tilt_of(x: tuple) -> torch.Tensor:
     return dynamics.tilt(tuple(part.detach() for part in x))
 
 
+def _described(value: Any) -> str:
+    """What a value is, for a message."""
+    return (
+        f"one of shape {tuple(value.shape)}, {value.dtype}" if isinstance(value, torch.Tensor) else reprlib.repr(value)
+    )
+
+
 def check_num_envs(num_envs: Any) -> int:
     """num_envs, or a ValueError."""
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
@@ -522,11 +562,19 @@ def check_num_envs(num_envs: Any) -> int:
 
 def seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
     """One seed per env."""
-    seeds: list[int | None] = []
-    seeds += [int(seed) + i for i in range(num_envs)] if isinstance(seed, int | np.integer) else seed
+    if isinstance(seed, int | np.integer):
+        seeds: list[Any] = [int(seed) + i for i in range(num_envs)]
+    elif isinstance(seed, str | bytes) or not hasattr(seed, "__iter__"):
+        raise TypeError(f"seed must be a whole number, or one or None for each env, not {seed!r}")
+    else:
+        seeds = list(seed)
     if len(seeds) != num_envs:
         raise ValueError(f"seed has {len(seeds)} entries for {num_envs} envs")
     for value in seeds:
-        if value is not None and not 0 <= value < 2**63:
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise TypeError(f"seeds must be whole numbers, not {value!r}")
+        if not 0 <= value < 2**63:
             raise ValueError(f"seeds must be in [0, 2^63), not {value}")
-    return seeds
+    return [None if value is None else int(value) for value in seeds]

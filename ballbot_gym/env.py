@@ -13,11 +13,15 @@ from gymnasium.envs.registration import EnvSpec
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams, checked_params
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
-from ballbot_gym.scene import Scene
+from ballbot_gym.scene import CAMERA_YAW, Scene, no_display
 from ballbot_gym.simulator import PHYSICS, State, default_physics
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.viewer import PageScene
 
-_LARGEST = 1e6  # of any number that reset takes
+LARGEST = 1e6
+"""Of any number that `reset` takes."""
+_VIEW = math.radians(-CAMERA_YAW)
+_KEY_FORCE = 0.2  # of the force limit, while a key is held
 
 
 class EnvState(NamedTuple):
@@ -96,7 +100,7 @@ class BallbotEnv(gymnasium.Env):
             task: a name in `TASKS`, or a Task.
             physics: "bullet", the URDF in PyBullet, or "rk4", the closed-form model; default, "bullet" where PyBullet is
                 installed, else "rk4" with a warning.
-            render_mode: None, "rgb_array" or "human".
+            render_mode: None, "rgb_array" or "human": PyBullet's window, or a page in the browser where there is no display.
             params: the robot; default, the paper's.
             physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
             randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
@@ -109,7 +113,7 @@ class BallbotEnv(gymnasium.Env):
             ImportError: physics="bullet" without a usable PyBullet.
         """
         self._spec: EnvSpec | None = None
-        self._scene: Scene | None = None
+        self._scene: Scene | PageScene | None = None
         self._state: State = ()  # until the first reset
         physics = default_physics() if physics is None else physics
         if not isinstance(physics, str) or physics not in PHYSICS:
@@ -211,9 +215,18 @@ class BallbotEnv(gymnasium.Env):
     def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
         """Draws any state x (8,) with this episode's markers, for instance one of a recorded trajectory."""
         if self._scene is None:
-            self._scene = Scene(self.params, human=self.render_mode == "human")
+            self._scene = self._make_scene()
             self._scene.set_markers(self.task.markers(self._constants_array))
         return self._scene.draw(tuple(map(float, x)))
+
+    def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:
+        """Keys for `gymnasium.utils.play.play(env, noop=np.zeros(2))`: w, a, s, d push the ball as seen on the screen."""
+        ahead = np.array([math.sin(_VIEW), math.cos(_VIEW)])
+        aside = np.array([-ahead[1], ahead[0]])
+        ways = {"w": ahead, "a": aside, "s": -ahead, "d": -aside}
+        pairs = {(one, other): ways[one] + ways[other] for one in "ws" for other in "ad"}
+        ways_by_keys = {(key,): way for key, way in ways.items()} | pairs
+        return {keys: np.array(_KEY_FORCE * way, np.float32) for keys, way in ways_by_keys.items()}
 
     def get_state(self) -> EnvState:
         """The state of the env in its episode, from which `set_state` goes on bit-identically, for instance in tree search.
@@ -273,6 +286,19 @@ class BallbotEnv(gymnasium.Env):
         if self._scene is not None:
             self._scene.close()
             self._scene = None
+
+    def _make_scene(self) -> "Scene | PageScene":
+        """A picture, a window, or a page in the browser where no window can open."""
+        human = self.render_mode == "human"
+        if human and no_display():
+            try:
+                return PageScene(self.params, self.task.control_dt)
+            except ImportError as error:
+                raise RuntimeError(
+                    f'render_mode="human" opens a window, and DISPLAY is not set; it shows a page instead where viser is '
+                    f'installed: {error}. "rgb_array" needs neither'
+                ) from error
+        return Scene(self.params, human=human)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -457,6 +483,6 @@ def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:
         vector = np.zeros(())
     if vector.shape != (size,) or not np.isfinite(vector).all():
         raise ValueError(f"{what} must be {size} finite numbers, not {value!r}")
-    if (np.abs(vector) > _LARGEST).any():
-        raise ValueError(f"{what} must be numbers within ±{_LARGEST:g}, not {value!r}")
+    if (np.abs(vector) > LARGEST).any():
+        raise ValueError(f"{what} must be numbers within ±{LARGEST:g}, not {value!r}")
     return vector

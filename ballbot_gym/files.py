@@ -8,12 +8,14 @@ import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 READ_LIMIT = 256 * 2**20
 """Bytes that a file may hold, unpacked, unless a reader says otherwise."""
+
+_PIECE = 2**20  # bytes
 
 
 class FileError(ValueError):
@@ -32,7 +34,7 @@ def read(path: str | Path, limit: int = READ_LIMIT) -> bytes:
         if not os.path.isfile(path):  # a pipe or a device could be read for ever
             raise FileError(f"{path} is no regular file")
         with open(path, "rb") as file:
-            content = file.read(limit + 1)
+            content = _read_at_most(file, limit + 1)
     except (OSError, ValueError) as error:
         if isinstance(error, FileError):
             raise
@@ -40,6 +42,15 @@ def read(path: str | Path, limit: int = READ_LIMIT) -> bytes:
     if len(content) > limit:
         raise FileError(f"{path} is larger than {limit / 2**20:.0f} MiB, the most that is read")
     return content
+
+
+def _read_at_most(file: BinaryIO, size: int) -> bytes:
+    """The first bytes of a file, in pieces: read(size) takes memory for `size` bytes, however few there are."""
+    pieces = []
+    while size > 0 and (piece := file.read(min(size, _PIECE))):
+        pieces.append(piece)
+        size -= len(piece)
+    return b"".join(pieces)
 
 
 def read_json(path: str | Path, limit: int = READ_LIMIT) -> Any:

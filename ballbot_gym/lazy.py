@@ -5,6 +5,7 @@ Where a library is missing, the error names the extra that brings it.
 
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 _EXTRAS = {"ballbot_gym": "train", "ballbot_baselines": "baselines", "ballbot_train": "train"}
@@ -24,10 +25,22 @@ def load(entry: str) -> Any:
         package = module.partition(".")[0]
         if (error.name or "").partition(".")[0] in _EXTRAS or package not in _EXTRAS:
             raise
-        raise ModuleNotFoundError(
-            f'{name} needs {error.name}, which is not installed: pip install "ballbot-gym[{_EXTRAS[package]}]"',
-            name=error.name,
-        ) from error
+        raise missing(entry.replace(":", "."), error.name) from error
+
+
+def need(package: str, *libraries: str) -> None:
+    """Raises a ModuleNotFoundError that names the extra of a package, if a library is not installed. Imports nothing."""
+    for name in libraries:
+        if find_spec(name) is None:
+            raise missing(package, name)
+
+
+def missing(package: str, library: str | None) -> ModuleNotFoundError:
+    """The error that says which extra brings a library that a package of ours needs."""
+    extra = _EXTRAS[package.partition(".")[0]]
+    return ModuleNotFoundError(
+        f'{package} needs {library}, which is not installed: pip install "ballbot-gym[{extra}]"', name=library
+    )
 
 
 def called(entry: str) -> Callable[..., Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.simulator import PHYSICS, default_physics
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -174,10 +174,13 @@ def simulate(
     x0: np.ndarray,
     duration: float,
     control_dt: float = 0.02,
-    physics: str = "bullet",
+    physics: str | None = None,
 ) -> Trajectory:
-    """Runs a controller without a task, from state x0 (8,) for `duration` s. Forces are clipped to the robot's limit."""
-    simulator = PHYSICS[physics](params, control_dt)
+    """Runs a controller without a task, from state x0 (8,) for `duration` s. Forces are clipped to the robot's limit.
+
+    `physics` is by default "bullet" where PyBullet is installed, else "rk4" with a warning.
+    """
+    simulator = PHYSICS[default_physics() if physics is None else physics](params, control_dt)
     x = np.asarray(x0, np.float64)
     simulator.reset(tuple(x.tolist()))
     controller.reset(0.0, x, np.zeros(0))

@@ -15,7 +15,15 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.simulator import State, connect, import_pybullet, load_robot
 from ballbot_gym.tasks.marker import Marker
 
-_CAMERA = (4.0, -55.0, -22.0)  # distance, m, yaw and pitch, deg: from behind a robot that moves along x
+CAMERA_YAW = -55.0
+"""Direction in which pictures look, degrees from the y axis, positive to the left: from behind a robot that moves along x."""
+
+_CAMERA = (4.0, CAMERA_YAW, -22.0)  # distance, m, yaw and pitch, deg
+
+
+def no_display() -> bool:
+    """Whether no window can open, because Linux has no X here."""
+    return sys.platform.startswith("linux") and not os.environ.get("DISPLAY")
 
 
 class Scene:
@@ -32,7 +40,7 @@ class Scene:
             RuntimeError: human without a display.
         """
         bullet = import_pybullet()
-        if human and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        if human and no_display():
             raise RuntimeError('render_mode="human" needs a display, and DISPLAY is not set; use "rgb_array"')
         self._client = connect(bullet, bullet.GUI if human else bullet.DIRECT)
         self._release = weakref.finalize(self, bullet.disconnect, self._client)

@@ -144,6 +144,9 @@ def default_physics() -> str:
     return "rk4"
 
 
+PHYSICS_NAMES = {"bullet": "PyBullet", "rk4": "the closed-form model"}
+"""What people call each physics."""
+
 _noticed: list[bool] = []
 
 _HOW_TO_GET_IT = 'Get it with "pip install pybullet" (wheels exist up to Python 3.11).'

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import reprlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ballbot_gym import dynamics
-from ballbot_gym.env import REWARD_PARTS, check_constant_names, make_task, observation_space, spec_of
+from ballbot_gym.env import LARGEST, REWARD_PARTS, check_constant_names, make_task, observation_space, spec_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.scene import Scene
@@ -533,7 +534,9 @@ def _finite(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     except (TypeError, ValueError):
         array = np.full(shape, math.nan)
     if not np.isfinite(array).all():
-        raise ValueError(f"{what} must be finite numbers that broadcast to {shape}, not {value!r}")
+        raise ValueError(f"{what} must be finite numbers that broadcast to {shape}, not {reprlib.repr(value)}")
+    if (np.abs(array) > LARGEST).any():
+        raise ValueError(f"{what} must be numbers within ±{LARGEST:g}, not {reprlib.repr(value)}")
     return array
 
 

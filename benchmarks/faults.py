@@ -3,21 +3,23 @@ and dead workers. What it makes in the end must equal what an undisturbed run ma
 
     python benchmarks/faults.py --kills 50 --seed 0
 
-Exit status 1 says that something was lost, or that a command ended in a traceback. Only the settings are tiny.
+Exit status 1 says that something was lost, or that a command ended in a traceback. Only the settings are tiny. Commands that
+are to be killed are forked from this process, which has imported their libraries, so that kills meet work and not imports.
 """
 
 import argparse
 import csv
+import fcntl
 import os
 import random
 import resource
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +27,16 @@ from typing import Any
 
 import numpy as np
 
+from ballbot_gym.lazy import load
+from ballbot_train import cli
+from ballbot_train.commands import COMMANDS as COMMAND_ENTRIES
+from ballbot_train.learning.learners import LEARNERS
+
 _TIMES = {"plan_seconds", "step_seconds"}  # columns that no two runs share
 _LIMIT = 900.0  # s, after which a command hangs
 _FULL = (0, 200, 3000)  # bytes that a file can hold on a disk that is full
+_KILLED = (0.02, 0.5)  # when a command is killed, as a share of the time that it takes undisturbed
+_PIPE_BYTES = 2**20
 _NO_FOLDERS = ("/proc/ballbot/out-v0", "/dev/null/out-v0")
 
 Made = dict[str, Any]
@@ -68,11 +77,15 @@ def _dataset(out: Path) -> Made:
     return dict(vars(load_demos(out, make_task("turn"))))
 
 
+def _fresh(out: Path) -> Made:
+    return {"fresh.csv": (out / "fresh.csv").read_text()} | _episodes(out / "certified")
+
+
 def _policy(out: Path) -> Made:
     return {"weights": (out / "policy.safetensors").read_bytes()}
 
 
-_NET = "--task turn --resume --hidden 8 --evaluations 2 --seed 1"
+_NET = "--task turn --resume --hidden 8 --evaluations 1 --seed 1"
 _RL = "--rl-iterations 6 --num-envs 4 --num-steps 8 --batch-size 16"
 
 
@@ -92,7 +105,8 @@ COMMANDS = {
         "robustness --tasks turn --controllers lqr --stresses delay mass --episodes 6 --physics rk4", _episodes
     ),
     "basins": _command("basins --controllers lqr --points 5 --physics rk4", _basins),
-    "certify": _command("certify --tasks turn --episodes 12", _sets),
+    "certify": _command("certify --tasks turn --episodes 6", _sets),
+    "evaluate": _command("evaluate shac --fresh 20 --optima 4 --bins 2 --episodes 4 --physics rk4", _fresh),
     "demos": _command("demos --task turn --expert lqr --episodes 12 --physics rk4", _dataset),
     "bc": _train("bc", "--total-iterations 6 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(
@@ -101,16 +115,62 @@ COMMANDS = {
         "--tracked-rollouts-per-plan 1 --gradient-steps 20",
     ),
     "ppo": _train("ppo", _RL),
+    "ppo from demonstrations": _train(
+        "ppo", f"{_RL} --demos {{demos}} --clone-iterations 2 --clone-gradient-steps 20 --critic-warmup-iterations 1"
+    ),
+    "rsl_ppo": _train(
+        "rsl_ppo", "--total-iterations 6 --num-envs 16 --num-steps 8 --num-mini-batches 2 --critic-hidden 8"
+    ),
     "sac": _train("sac", _RL),
     "shac": _train("shac", "--total-iterations 8 --num-envs 4 --horizon 3 --no-compile"),
 }
+
+
+class Process:
+    """A command that runs in a session of its own. What it says goes into a pipe, which holds all of it."""
+
+    def __init__(self, pid: int, pipe: int):
+        self.pid, self._pipe = pid, pipe
+        self.status: int | None = None
+
+    def wait(self, seconds: float) -> int | None:
+        """Its exit status, or None if it still runs after so many seconds."""
+        end = time.monotonic() + seconds
+        while self.running() and time.monotonic() < end:
+            time.sleep(0.02)
+        return self.status
+
+    def running(self) -> bool:
+        if self.status is None:
+            ended, status = os.waitpid(self.pid, os.WNOHANG)
+            self.status = os.waitstatus_to_exitcode(status) if ended else None
+        return self.status is None
+
+    def kill(self, group: bool) -> None:
+        """Kills it, or it and its workers."""
+        (os.killpg if group else os.kill)(self.pid, signal.SIGKILL)
+        os.waitpid(self.pid, 0)
+        self.status = -signal.SIGKILL
+
+    def said(self) -> str:
+        """What it said; call it once, at the end."""
+        os.set_blocking(self._pipe, False)
+        text = b""
+        try:
+            while part := os.read(self._pipe, _PIPE_BYTES):
+                text += part
+        except BlockingIOError:  # a worker that outlives it holds the other end
+            pass
+        os.close(self._pipe)
+        return text.decode(errors="replace")
 
 
 class Trial:
     """One command under faults."""
 
     def __init__(self, name: str, folder: Path, demos: Path, kills: int, rng: random.Random):
-        self.name, self.folder, self.kills, self.rng = name, folder, kills, rng
+        self.name, self.folder, self.wanted_kills, self.rng = name, folder, kills, rng
+        self.kills = self.compared = 0
         self.command = COMMANDS[name]
         self.words = [word.replace("{demos}", str(demos)) for word in self.command.words]
         if self.command.workers:
@@ -118,89 +178,101 @@ class Trial:
         self.failures: list[str] = []
         self.out = folder / "out-v0"
 
-    def start(self, out: Path | None = None, file_bytes: int | None = None) -> subprocess.Popen[str]:
-        """Starts the command, perhaps on a disk where a file can hold so many bytes only."""
+    def start(self, out: Path | None = None, file_bytes: int | None = None, fork: bool = True) -> Process:
+        """Starts the command, perhaps on a disk where a file can hold so many bytes only.
 
-        def limit() -> None:
+        Args:
+            out: its folder.
+            file_bytes: of the largest file.
+            fork: go on in the copy of this process, which has imported the libraries; else a new interpreter starts.
+        """
+        words = [*self.words, "--out", str(out or self.out)]
+        pipe, end = os.pipe()
+        fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        sys.stdout.flush()
+        pid = os.fork()
+        if pid:
+            os.close(end)
+            return Process(pid, pipe)
+        status: int | str | None = 70
+        try:
+            os.setsid()
+            os.chdir(self.folder)
+            os.dup2(end, 1)
+            os.dup2(end, 2)
             if file_bytes is not None:
                 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
                 resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
+            if not fork:
+                os.execv(sys.executable, [sys.executable, "-m", "ballbot_train.cli", *words])
+            sys.argv = ["ballbot", *words]
+            cli.main()
+        except SystemExit as ended:
+            status = ended.code
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            os._exit(status if isinstance(status, int) else 1)
 
-        return subprocess.Popen(
-            [sys.executable, "-m", "ballbot_train.cli", *self.words, "--out", str(out or self.out)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-            preexec_fn=limit,
-            env={**os.environ, "BALLBOT_CHECKPOINT_SECONDS": "0"},
-            cwd=self.folder,
-        )
-
-    def end(self, process: subprocess.Popen[str]) -> tuple[int, str]:
-        """Waits for the command; one that hangs is killed and is a failure."""
-        try:
-            printed, _ = process.communicate(timeout=_LIMIT)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            printed, _ = process.communicate()
-            self.failures.append(f"it hangs: {printed[-300:]}")
-        return process.returncode, printed
-
-    def expect(self, what: str, process: subprocess.Popen[str], status: int, message: str = "") -> None:
+    def expect(self, what: str, process: Process, status: int, message: str = "") -> None:
         """Waits for the command, which must end with a status and say something, without a traceback."""
-        code, printed = self.end(process)
-        if code != status or message not in printed or "Traceback" in printed:
-            self.failures.append(f"{what}: status {code}, and it said: {printed[-1500:]}")
+        if process.wait(_LIMIT) is None:
+            process.kill(group=True)
+            self.failures.append(f"{what}: it hangs")
+        said = process.said()
+        if process.status != status or message not in said or "Traceback" in said:
+            self.failures.append(f"{what}: status {process.status}, and it said: {said[-1500:]}")
 
     def compare(self, what: str) -> None:
-        """What the folder holds must be what the undisturbed run made."""
+        """What the folder holds must be what the undisturbed run made. Deletes it."""
         try:
             made = self.command.read(self.out)
             same = made.keys() == self.wanted.keys() and all(
                 np.array_equal(value, self.wanted[key]) for key, value in made.items()
             )
+            self.compared += 1
+            if not same:
+                self.failures.append(f"{what}: its result differs from that of an undisturbed run")
         except Exception as error:
             self.failures.append(f"{what}: its result cannot be read: {error!r}")
-            return
-        if not same:
-            self.failures.append(f"{what}: its result differs from that of an undisturbed run")
+        self.clear()
+
+    def clear(self) -> None:
+        """Deletes what the command made."""
+        for made in (self.out, self.folder / "optima"):
+            shutil.rmtree(made, ignore_errors=True)
 
     def finish(self, what: str) -> None:
         """Runs to the end, and compares."""
         self.expect(what, self.start(), 0)
         self.compare(what)
-        shutil.rmtree(self.out, ignore_errors=True)
 
     def undisturbed(self) -> None:
+        """Runs to the end, and keeps what was made."""
         start = time.monotonic()
-        self.expect("undisturbed", self.start(), 0)
+        self.expect("undisturbed", self.start(fork=False), 0)
         self.seconds = time.monotonic() - start
         if not self.failures:
             self.wanted = self.command.read(self.out)
-        shutil.rmtree(self.out, ignore_errors=True)
+        self.clear()
 
     def killed(self) -> None:
         """Kills at random moments: the command alone, or it and its workers. Where it ends before, it starts anew."""
-        done = 0
-        while done < self.kills:
-            process = self.start()
-            try:
-                process.wait(self.rng.uniform(0.2, 1.0) * self.seconds)
-            except subprocess.TimeoutExpired:
-                (process.kill if done % 2 else lambda group=process.pid: os.killpg(group, signal.SIGKILL))()
-                process.wait()
-                done += 1
-                continue
-            finally:
-                if process.poll() is not None and process.stdout is not None:
-                    process.stdout.close()
-            if process.returncode != 0:
-                self.failures.append(f"kills: after {done} of them it ended with status {process.returncode}")
+        seconds = 0.0  # that it takes undisturbed
+        while self.kills < self.wanted_kills:
+            start, process = time.monotonic(), self.start()
+            if process.wait(self.rng.uniform(*_KILLED) * seconds if seconds else _LIMIT) is None:
+                process.kill(group=self.kills % 2 == 1)
+                self.kills += 1
+            seconds = seconds or time.monotonic() - start
+            said = process.said()
+            if process.status == 0:
+                self.compare(f"after {self.kills} kills")
+            elif process.status != -signal.SIGKILL:
+                self.failures.append(f"after {self.kills} kills: status {process.status}, and it said: {said[-1500:]}")
                 return
-            self.compare(f"after {done} kills")
-            shutil.rmtree(self.out)
-        self.finish(f"after {done} kills")
+        self.finish(f"after {self.kills} kills")
 
     def full_disk(self) -> None:
         for size in _FULL:
@@ -213,20 +285,18 @@ class Trial:
 
     def two_runs(self) -> None:
         first = self.start()
-        locks = (self.out / ".lock", self.out.with_name(f".{self.out.name}.unfinished") / ".lock")
-        while first.poll() is None and not any(lock.exists() for lock in locks):
+        while first.running() and not any(self.folder.rglob(".lock")):
             time.sleep(0.02)
         second = self.start()
-        if first.poll() is None:
+        if first.running():
             self.expect("a second run at once", second, 1, "another run is using")
         self.expect("the first of two runs", first, 0)
         self.compare("the first of two runs")
-        shutil.rmtree(self.out, ignore_errors=True)
 
     def dead_worker(self) -> None:
         """Kills one worker, whose item is tried again."""
         process, end = self.start(), time.monotonic() + self.seconds
-        while process.poll() is None and time.monotonic() < end:
+        while process.running() and time.monotonic() < end:
             time.sleep(0.05)
             workers = _children(process.pid)
             if workers and time.monotonic() > end - 0.5 * self.seconds:
@@ -234,7 +304,6 @@ class Trial:
                 break
         self.expect("a dead worker", process, 0)
         self.compare("a dead worker")
-        shutil.rmtree(self.out, ignore_errors=True)
 
     def run(self) -> list[str]:
         """All faults, one after the other; returns what went wrong."""
@@ -243,7 +312,11 @@ class Trial:
         faults += [self.dead_worker] * self.command.workers
         for fault in [] if self.failures else faults:  # without an undisturbed result there is nothing to compare
             fault()
-        print(f"{self.name}: {self.seconds:.0f} s, {self.kills} kills, {len(self.failures)} failures", flush=True)
+        print(
+            f"{self.name}: {self.kills} kills; {self.compared} results compared with that of an undisturbed run, which took "
+            f"{self.seconds:.0f} s; {len(self.failures)} failures",
+            flush=True,
+        )
         for failure in self.failures:
             print(f"  {failure}", flush=True)
         return self.failures
@@ -262,6 +335,14 @@ def _children(pid: int) -> list[int]:
     return found
 
 
+def _import_libraries() -> None:
+    """Imports what the commands import, for `Trial.fork`."""
+    for entry in COMMAND_ENTRIES.values():
+        load(entry)
+    for learner in LEARNERS.values():
+        learner.settings("stabilize")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Kills long commands, and compares what they make in the end.")
     parser.add_argument("--kills", type=int, default=50, help="of each command")
@@ -269,14 +350,15 @@ def main() -> None:
     parser.add_argument("--commands", nargs="*", choices=list(COMMANDS), default=list(COMMANDS))
     options = parser.parse_args()
     os.environ.pop("BALLBOT_IN_PROCESS", None)
+    os.environ |= {"BALLBOT_CHECKPOINT_SECONDS": "0", "OMP_NUM_THREADS": "1"}
+    _import_libraries()
     failed = []
     with tempfile.TemporaryDirectory() as folder:
         demos = Path(folder) / "demos" / "tiny-v0"
-        if "bc" in options.commands:
-            words = [*COMMANDS["demos"].words, "--out", str(demos)]
-            subprocess.run([sys.executable, "-m", "ballbot_train.cli", *words], check=True, stdout=subprocess.DEVNULL)
+        if any("{demos}" in COMMANDS[name].words for name in options.commands):
+            Trial("demos", Path(folder), demos, 0, random.Random()).start(demos).wait(_LIMIT)
         for name in options.commands:
-            own = Path(folder) / name
+            own = Path(folder) / name.replace(" ", "-")
             own.mkdir()
             if Trial(name, own, demos, options.kills, random.Random(f"{options.seed} {name}")).run():
                 failed.append(name)

@@ -19,7 +19,7 @@ ALL_FILES = sorted(set(FILES) | {path for folder in ("tests", "benchmarks") for 
 
 
 # The rooms from the bottom to the top. A file imports from its own room and from those below it only.
-ROOMS = ("ballbot_gym", "ballbot_baselines", "ground floor", "evaluation", "learning", "report", "commands")
+ROOMS = ("ballbot_gym", "ballbot_baselines", "ground floor", "evaluation", "learning", "report", "play", "commands")
 
 
 def modules(path, only_top_level=False):
@@ -93,8 +93,13 @@ def test_only_simulator_and_scene_know_pybullet():
     assert relative(knowing) == ["ballbot_gym/scene.py", "ballbot_gym/simulator.py"]
 
 
+def test_only_the_viewer_knows_viser():
+    knowing = [path for path in FILES if imports(path) & {"viser"}]
+    assert relative(knowing) == ["ballbot_gym/viewer.py"]
+
+
 def test_environments_import_no_solver_and_no_learner_at_their_top():
-    heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "scipy", "matplotlib"}
+    heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "scipy", "matplotlib", "viser"}
     batched = {"batch.py", "counter_rng.py", "vector.py"}  # these are written in torch and imported when first used
     gym = [path for path in FILES if package(path) == "ballbot_gym" and path.name not in batched]
     assert relative(path for path in gym if imports(path, only_top_level=True) & heavy) == []

@@ -86,7 +86,7 @@ def test_entries_survive_json_and_make_the_set_that_the_optima_make(params):
     np.testing.assert_array_equal(made.costs, [optimum.cost for optimum in optima])
     np.testing.assert_array_equal(made.violations, [optimum.violation for optimum in optima])
     np.testing.assert_array_equal(made.durations, [optimum.trajectory.duration for optimum in optima])
-    assert list(made.statuses) == [f"{optimum.solver}: {optimum.status}" for optimum in optima]
+    assert list(made.statuses) == [f"{optimum.solver}: {optimum.solver_status}" for optimum in optima]
     for trajectory, optimum in zip(made.trajectories, optima, strict=True):
         for name in ("t", "x", "u"):
             np.testing.assert_array_equal(getattr(trajectory, name), getattr(optimum.trajectory, name))

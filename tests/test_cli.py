@@ -131,7 +131,7 @@ def test_a_wrong_argument_ends_with_one_line_that_says_so(arguments, message, tm
     [
         ("benchmark", {"controllers": ("pid",)}, "unknown controller pid"),
         ("benchmark", {"controllers": ("mine.json",)}, "mine.json is not a policy"),
-        ("benchmark", {"controllers": ("mine.zip",)}, "mine.zip is a saved Stable-Baselines3 model"),
+        ("benchmark", {"controllers": ("mine.zip",)}, "mine.zip: no such file"),
         ("benchmark", {"controllers": ("lqr", "lqr")}, "controller lqr is given more than once"),
         ("benchmark", {"tasks": ()}, "give at least one task: stabilize"),
         ("benchmark", {"tasks": ("turn", "turn")}, "task turn is given more than once"),

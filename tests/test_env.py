@@ -474,12 +474,42 @@ def test_camera_follows_the_ball(params):
     np.testing.assert_allclose(orange[0], orange[1], atol=2)  # pixels
 
 
-def test_window_without_a_display_is_refused(monkeypatch, make_env):
+def test_without_a_display_and_without_viser_the_window_is_refused(monkeypatch, make_env):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setitem(sys.modules, "viser", None)
     env = make_env(render_mode="human")
-    with pytest.raises(RuntimeError, match="needs a display, and DISPLAY is not set"):
+    with pytest.raises(RuntimeError, match=r"DISPLAY is not set.*ballbot-gym\[play\]"):
         env.reset(seed=0)
+
+
+def test_keys_push_in_the_directions_of_the_picture(make_env):
+    keys = make_env(physics="rk4").get_keys_to_action()
+    space = make_env(physics="rk4").action_space
+    assert all(action in space for action in keys.values())
+    np.testing.assert_allclose(keys["w",], -keys["s",])
+    np.testing.assert_allclose(keys["w", "a"], keys["w",] + keys["a",], rtol=1e-6)
+    ahead, left = keys["w",], keys["a",]
+    assert ahead[0] * left[1] - ahead[1] * left[0] > 0  # left is left of ahead
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_gymnasium_plays_every_task(name, monkeypatch):
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    from gymnasium.utils.play import play
+
+    env = gymnasium.make(TASKS[name].id, render_mode="rgb_array", physics="rk4")
+    forces = []
+
+    def quit_after_three_steps(*step):
+        forces.append(step[-1]["force"])
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN if len(forces) == 1 else pygame.QUIT, key=ord("w")))
+
+    play(env, callback=quit_after_three_steps, noop=np.zeros(2, np.float32), seed=0, fps=1000)
+    np.testing.assert_array_equal(forces[0], [0, 0])
+    assert np.hypot(*forces[1]) == pytest.approx(0.2 * env.unwrapped.params.force_limit, rel=1e-6)
+    env.close()
 
 
 def test_render_without_a_mode_warns(make_env):

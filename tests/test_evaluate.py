@@ -230,13 +230,6 @@ def test_chosen_episodes_are_those_that_are_run():
     assert rows[0].cost_mean != evaluate.evaluate("lqr", "stabilize", [4], "rk4").cost_mean
 
 
-def test_a_saved_stable_baselines_model_is_answered_with_how_to_give_it():
-    with pytest.raises(ValueError, match=r"load it and give the model: evaluate\(stable_baselines3.PPO.load"):
-        evaluate.evaluate("model.zip", "stabilize", 1, "rk4")
-    with pytest.raises(ValueError, match="saved Stable-Baselines3 model"):
-        benchmark.controllers_of(["stabilize"], ["model.zip"])
-
-
 @pytest.mark.parametrize("content", ["[" * 100_000, '{"about": {}, "episodes": [{"task": 3}]}', "\xff", '{"about": 3}'])
 def test_damaged_results_are_refused(content, tmp_path):
     (tmp_path / "leaderboard.json").write_text(content, encoding="latin-1")

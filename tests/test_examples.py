@@ -20,6 +20,16 @@ def test_a_policy_in_ten_lines_is_compared_with_lqr_and_trajectory_optimization(
         assert name in printed
 
 
+def test_plain_ppo_reports_what_it_has_learnt(capsys, tmp_path):
+    path = tmp_path / "model.zip"
+    options = {"n_steps": 16, "batch_size": 32, "n_epochs": 1, "learning_rate": 1e-3, "falling": True}
+    load("train_ppo").main(steps=64, envs=2, every=32, relu=True, net_arch=(4,), save=str(path), **options)
+    printed = capsys.readouterr().out
+    assert "5 settings: learning_rate, n_steps, batch_size, n_epochs, policy_kwargs" in printed
+    assert printed.count("success") == 2
+    assert path.exists()
+
+
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_every_example_says_what_it_is(path):
     assert load(path.stem).__doc__

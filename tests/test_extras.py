@@ -1,5 +1,6 @@
 """What is not installed is named, with the extra that brings it."""
 
+import json
 import subprocess
 import sys
 
@@ -28,10 +29,42 @@ def run(code, *blocked):
         ("from ballbot_train import load_policy", "safetensors", "train"),
         ("from ballbot_train.cli import main", "rich", "train"),
         ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
+        ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
     ],
 )
 def test_missing_library_names_its_extra(code, library, extra):
     assert f'pip install "ballbot-gym[{extra}]"' in run(code, library)
+
+
+EXTRAS = (
+    *("casadi", "scipy", "matplotlib", "torch", "stable_baselines3", "rsl_rl", "minari", "tyro", "rich", "filelock"),
+    *("tensorboard", "safetensors", "jinja2", "plotly", "imageio", "PIL", "h5py", "tensordict"),
+)
+"""What the extras bring."""
+
+
+def test_every_module_that_cannot_be_imported_names_its_extra():
+    code = """
+import importlib.util
+from pathlib import Path
+
+for package in ("ballbot_gym", "ballbot_baselines", "ballbot_train"):
+    folder = Path(importlib.util.find_spec(package).submodule_search_locations[0])
+    for path in sorted(folder.rglob("*.py")):
+        parts = (package, *path.relative_to(folder).with_suffix("").parts)
+        name = ".".join(part for part in parts if part != "__init__")
+        try:
+            importlib.import_module(name)
+            print("light", name)
+        except (ImportError, SystemExit) as error:
+            print("named" if "ballbot-gym[" in str(error) else "UNNAMED", name, error)
+"""
+    lines = run(code, *EXTRAS).splitlines()
+    assert [line for line in lines if not line.startswith(("light ", "named "))] == []
+    for name in ("ballbot_baselines.ocp", "ballbot_gym.batch", "ballbot_train.learning.learners.ppo"):
+        assert any(line.startswith(f"named {name} ") for line in lines)
+    for name in ("ballbot_gym.env", "ballbot_train"):
+        assert f"light {name}" in lines
 
 
 def test_without_pybullet_the_default_is_rk4_with_one_notice_and_bullet_says_how_to_get_it():
@@ -51,3 +84,16 @@ def test_without_pybullet_the_default_is_rk4_with_one_notice_and_bullet_says_how
 def test_with_pybullet_the_default_is_bullet():
     pytest.importorskip("pybullet")
     assert "bullet" in run("import ballbot_gym; print(ballbot_gym.BallbotEnv().physics)")
+
+
+def test_commands_run_without_pybullet_and_say_once_which_physics_they_use(tmp_path):
+    typed = f"robustness --tasks turn --controllers lqr --stresses com --episodes 1 --workers 1 --out {tmp_path}"
+    wrote = run(
+        "import os\nos.environ['BALLBOT_IN_PROCESS'] = '1'\n"
+        f"from ballbot_train.cli import main\nsys.argv = ['ballbot', *{typed.split()!r}]\nmain()\n",
+        "pybullet",
+    )
+    assert "physics=rk4" in wrote
+    assert wrote.count('PyBullet is not installed: physics="rk4" is used') == 1
+    assert "Warning" not in wrote
+    assert json.loads((tmp_path / "robustness.json").read_text())["about"]["physics"] == "rk4"

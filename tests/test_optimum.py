@@ -87,7 +87,8 @@ def test_plan_lasts_the_episode_or_reaches_the_goal_at_its_end(task, seed, optim
 
 def test_optimum_says_how_it_was_found(task, seed, optimum_of):
     optimum = optimum_of(task, seed)
-    assert optimum.status == "Solve_Succeeded"
+    assert optimum.status == "optimal"
+    assert optimum.solver_status == "Solve_Succeeded"
     assert optimum.violation < FEASIBLE
     assert optimum.solver in ("fatrop", "ipopt")
     assert optimum.iterations > 0

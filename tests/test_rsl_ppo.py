@@ -9,6 +9,7 @@ from tensordict import TensorDict
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
+from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.learners import LEARNERS, rsl_ppo
 
 TINY = {
@@ -58,15 +59,33 @@ def test_it_goes_on_from_its_state_as_if_never_stopped(task):
 
 def test_the_critic_alone_fits_a_quadratic_form_with_its_linear_path():
     observation = torch.randn(200, 8)
-    seen = TensorDict({"policy": observation}, batch_size=[200])
-    critic = rsl_ppo.Critic(seen, (8,), None, products=True, value=4.0)
+    inputs = CriticInputs(8)(observation)
+    seen = TensorDict({"policy": observation, "critic": inputs}, batch_size=[200])
+    critic = rsl_ppo.Critic(seen, (8,), value=4.0)
     torch.testing.assert_close(critic(seen), torch.full((200, 1), 4.0), atol=0.5, rtol=0)
-    inputs = critic.get_latent(seen)
     form = torch.randn(8, 8)
     wanted = ((observation @ form) * observation).sum(1)
     solved = torch.linalg.lstsq(inputs, wanted[:, None]).solution
     torch.testing.assert_close((inputs @ solved)[:, 0], wanted, rtol=1e-3, atol=1e-3)
     assert inputs.shape[1] == 8 + 36
+
+
+def test_every_pass_sees_every_sample_once_in_the_same_mini_batches():
+    storage = rsl_ppo.Storage("rl", 5, 4, TensorDict({"policy": torch.zeros(5, 1)}, batch_size=[5]), (1,))
+    storage.observations["policy"][:] = torch.arange(20.0).reshape(4, 5, 1)
+    storage.returns[:] = storage.observations["policy"] + 100
+    storage.distribution_params = (storage.observations["policy"] + 200,)
+    batches = [
+        (batch.observations["policy"], batch.returns, batch.old_distribution_params[0])
+        for batch in storage.mini_batch_generator(2, 3)
+    ]
+    assert len(batches) == 6
+    for seen, returns, parameters in batches:
+        assert torch.equal(returns, seen + 100)
+        assert torch.equal(parameters, seen + 200)
+    for first, second in (batches[:2], batches[2:4], batches[4:]):
+        assert torch.equal(torch.cat([first[0], second[0]]).sort(0).values[:, 0], torch.arange(20.0))
+    assert torch.equal(batches[0][0], batches[2][0])
 
 
 def test_the_deviation_and_the_step_size_fall_as_they_are_set():

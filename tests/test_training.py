@@ -216,7 +216,7 @@ def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_t
     short_run, tmp_path, monkeypatch
 ):
     costs = iter((30.0, 20.0, 25.0))
-    monkeypatch.setattr(training, "validate", lambda *policy: training.Validation(next(costs), 1.0, 0))
+    monkeypatch.setattr(training, "validate", lambda *policy: training.Validation(next(costs), 1.0, 0, 1.0))
     ratios = iter((1.5, 1.4, 1.1))
     monkeypatch.setattr(training, "score", lambda *policy: training.Score(next(ratios), 0.1, 0.1, 1.0, 0))
     short_run()

@@ -137,6 +137,10 @@ class Task(ABC):
         x = self.draw_state(tuple(rng.random(self.state_draws).tolist()), c, params)
         return np.array(x, np.float64), np.array(c, np.float64)
 
+    def goal_distance(self, x: Vector, c: Vector) -> Any:
+        """About how far a state is from the goal, m, for learners that shape rewards; None where a task defines none."""
+        return None
+
     def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
         """What makes an episode easy or hard, by name and unit, of its initial state (8,) and constants (nc,).
 

@@ -16,6 +16,8 @@ from ballbot_gym.tasks.marker import Marker
 _START, _GATE = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # m, the paper's turn
 _LINEAR_SECONDS_PER_SPEED = 0.6  # s per m/s: with less LQR falls, with more it is slow (0.5 to 1.0 tried)
 
+_SHAPING_SECONDS = 0.3  # s: how much a velocity error counts in the distance to the goal
+
 
 @dataclass(frozen=True)
 class Turn(Task):
@@ -140,6 +142,13 @@ class Turn(Task):
             (1 - dynamics.cos_tilt(x)) / (1 - math.cos(math.radians(10))) - 1,
             squared(gamma_dot, theta_dot) - 1,
         )
+
+    def goal_distance(self, x: Vector, c: Vector) -> Any:
+        """√(distance² + (0.3 s · velocity error)² + leans²) to passing the gate upright, m; 1 rad of lean counts as 1 m."""
+        px, py, gamma, theta, vx, vy, *_ = ops.components(x)
+        (speed,) = ops.components(c)
+        off = _SHAPING_SECONDS * (vx - speed), _SHAPING_SECONDS * vy
+        return ops.sqrt(squared(px - _GATE[0], py - _GATE[1], *off, gamma, theta))
 
     def reference(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> Reference:
         """The straight motion at (v, 0) that passes the gate after a time proportional to v."""

@@ -7,13 +7,15 @@ CasADi and SciPy are imported when a controller is made or `find_optimum` is fir
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ballbot_gym.lazy import called, load
+from ballbot_gym.lazy import called, load, need
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
     from ballbot_baselines.optimum import find_optimum
+
+need(__name__, "casadi", "scipy")
 
 CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
     "lqr": called("ballbot_baselines.lqr:LqrController"),

@@ -38,9 +38,15 @@ def entries(task_name: str, indices: Iterable[int]) -> Iterator[Entry]:
     task, params = make_task(task_name), default_params()
     for index in indices:
         try:
-            yield _entry(index, find_optimum(task, params, *episode(task, params, index)))
+            optimum = find_optimum(task, params, *episode(task, params, index))
         except PlanError as error:
             yield {"episode": index, "error": str(error)}
+            continue
+        if optimum.is_optimal:
+            yield _entry(index, optimum)
+        else:
+            reason = f"only a feasible episode of cost {optimum.cost:.6g} was found ({optimum.solver_status})"
+            yield {"episode": index, "error": reason}
 
 
 def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) -> EvaluationSet:
@@ -82,7 +88,7 @@ def _entry(index: int, optimum: Optimum) -> Entry:
         "cost": optimum.cost,
         "violation": optimum.violation,
         "solver": optimum.solver,
-        "status": optimum.status,
+        "status": optimum.solver_status,
         "t": trajectory.t.tolist(),
         "x": trajectory.x.tolist(),
         "u": trajectory.u.tolist(),

@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver, no_final_path
+from ballbot_baselines.ocp import ACCEPTABLE, Bounds, Ocp, OcpSolution, OcpSolver, no_final_path
 from ballbot_baselines.optimum import FEASIBLE
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
@@ -175,7 +175,8 @@ def solve(
         states, inputs = optimizer.toward_consistency(states, inputs, _with_given_times(bounds, states, at))
     result = optimizer.solve(states, inputs, bounds)
     seconds = time.perf_counter() - started
-    if not (result.success and result.violation < FEASIBLE):
+    converged = result.success or result.status == ACCEPTABLE
+    if not (converged and result.violation < FEASIBLE):
         raise PlanError(
             f"{problem.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
             f"violated by {result.violation:.1e}. Try another guess or more time."

@@ -300,6 +300,7 @@ class NmpcController:
     """Model predictive control about the episode's plan. One iteration per control step by default (real-time iteration).
 
     `plan` is the episode's plan, `counts` what happened so far; `reset` raises a PlanError where there is no plan.
+    `predicted` (nodes + 1, 8) are the states of the last solution; None before the first `act` and after the plan's end.
 
     A step whose program fails, or whose solution is late, applies the last plan under TVLQR: the last solution, shifted,
     plus the episode plan's gain times the distance from it.
@@ -348,6 +349,7 @@ class NmpcController:
         self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
         self._qp = _horizon_qp(task, params, nodes)
         self.plan: Optimum | None = None
+        self.predicted: np.ndarray | None = None
         self.counts = Counts()
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
@@ -359,7 +361,7 @@ class NmpcController:
     def follow(self, plan: Optimum) -> None:
         """Takes a plan of the episode, and starts the horizon on it."""
         task, c, trajectory = self._task, self._c, plan.trajectory
-        self.plan, self._trajectory = plan, trajectory
+        self.plan, self._trajectory, self.predicted = plan, trajectory, None
         self._tracker = TvlqrController.for_task(task, self._params, trajectory, c)
         self._tracker.reset(self._start, trajectory.x[0], c)
         self._length = len(trajectory.u)
@@ -382,9 +384,11 @@ class NmpcController:
             elapsed = 0
         if elapsed >= self._length:
             u = self._tracker.act(t, x)  # the plan's end is held
+            self.predicted = None
         else:
             self._advance(elapsed)
             solved = self._solve(x, began)
+            self.predicted = self._x_plan + self._dx
             u = self._params.force_limit * self._qp.a[0] if solved else self._fall_back(x)
         u = np.clip(u, -self._params.force_limit, self._params.force_limit)
         self._commanded = [*self._commanded, u][1:] if self._delay else []

@@ -10,6 +10,7 @@ the next knot as input. `nlp.py` builds the nonlinear program and its derivative
 once (`compiled.py`). So time and memory grow linearly with N.
 """
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,11 @@ from ballbot_baselines.nlp import Stage, StagedNlp
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
+
+SUCCEEDED = "Solve_Succeeded"
+"""The status of a solver that met its tolerance."""
+ACCEPTABLE = "Solved_To_Acceptable_Level"
+"""The status of ipopt where it stopped early, at its acceptable tolerance."""
 
 _DAMPING = (
     1e-8  # of the Newton step toward consistency, for constraints that repeat each other or have no free variables
@@ -90,9 +96,10 @@ class Bounds:
 class OcpSolution:
     """What a solver returned. Look at `success` before anything else.
 
-    `states` is (N+1, ns) and `inputs` is (N, nw). `violation` is the largest amount by which a constraint or bound is
-    missed, in the constraint's unit. `seconds` is the wall time of this solve. `costates` (N, ns) are the multipliers of the
-    dynamics: row k is the slope, with respect to s_{k+1}, of the optimal cost from stage k+1 on.
+    `success` means that the solver met its tolerance; ipopt's "Solved_To_Acceptable_Level" does not. `states` is (N+1, ns)
+    and `inputs` is (N, nw). `violation` is the largest amount by which a constraint or bound is missed, in the constraint's
+    unit. `seconds` is the wall time of this solve. `costates` (N, ns) are the multipliers of the dynamics: row k is the
+    slope, with respect to s_{k+1}, of the optimal cost from stage k+1 on.
     """
 
     success: bool
@@ -107,6 +114,16 @@ class OcpSolution:
     costates: np.ndarray
 
 
+class _Spent(threading.local):
+    """Wall time, s, that this thread has spent so far on making solvers, and in them."""
+
+    setup: float = 0.0
+    solving: float = 0.0
+
+
+spent = _Spent()
+
+
 class OcpSolver:
     """An `Ocp` over N intervals, ready to be solved from many starts.
 
@@ -117,6 +134,7 @@ class OcpSolver:
         self, ocp: Ocp, intervals: int, solver: str = "fatrop", tolerance: float = 1e-8, max_iterations: int = 200
     ):
         """Args: solver is "fatrop" (structured, fast) or "ipopt" (more robust far from a solution)."""
+        began = time.perf_counter()
         self.ocp, self.intervals, self.solver = ocp, intervals, solver
         s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", ocp.states), ("w", ocp.inputs), ("p", ocp.params)))
         equal, final_equal = ocp.equalities(s, w, p), ocp.final_equalities(s, p)
@@ -156,6 +174,7 @@ class OcpSolver:
             options["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
+        spent.setup += time.perf_counter() - began
 
     def solve(
         self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
@@ -184,7 +203,9 @@ class OcpSolver:
             ubg=self._g_upper,
         )
         seconds = time.perf_counter() - start
+        spent.solving += seconds
         stats = self._nlpsol.stats()
+        status = _status(self.solver, stats)
         z = np.array(result["x"]).ravel()
         g = np.array(self._g(z, p)).ravel()
         violation = max(
@@ -193,8 +214,8 @@ class OcpSolver:
         )
         states, inputs = self._divide(z)
         return OcpSolution(
-            success=bool(stats["success"] and np.isfinite(z).all()),
-            status=_status(self.solver, stats),
+            success=bool(stats["success"] and status == SUCCEEDED and np.isfinite(z).all()),
+            status=status,
             cost=float(result["f"]),
             states=states,
             inputs=inputs,
@@ -269,4 +290,4 @@ def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
 def _status(solver: str, stats: dict) -> str:
     if solver == "ipopt":
         return str(stats["return_status"])
-    return "Solve_Succeeded" if stats["success"] else f"fatrop stopped ({stats['unified_return_status']})"
+    return SUCCEEDED if stats["success"] else f"fatrop stopped ({stats['unified_return_status']})"

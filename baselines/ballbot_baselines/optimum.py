@@ -4,20 +4,22 @@
     subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n.
 
 So an episode under physics="rk4" that follows the optimal trajectory returns minus this cost. The problem is solved by
-multiple shooting from each of the task's guessed paths, and the best solution is kept. That solution is feasible and locally
-optimal. It is the global optimum if one of the guesses leads there.
+multiple shooting from each of the task's guessed paths, and the best solution is kept. If no path leads to a solution, the
+search starts from simulated recoveries (`righting.py`). The solution is feasible and locally optimal. It is the global
+optimum if one of the guesses leads there.
 """
 
 import math
 import time
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Literal
 
 import casadi
 import numpy as np
 
-from ballbot_baselines import guess
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_baselines import guess, righting
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver, spent
 from ballbot_gym import dynamics
 from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
@@ -28,7 +30,12 @@ from ballbot_gym.trajectory import Trajectory
 FEASIBLE = 1e-6
 """Largest constraint violation of an optimum, in SI units."""
 
+FROM_RIGHTING = -1
+"""The `guess` of an optimum that was found from a simulated recovery."""
+
 _FREE_TIME_INTERVALS = 60
+_MOST_ITERATIONS = 200
+_QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
 _COARSE = 2  # control steps per interval when several guesses are compared
 _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
@@ -38,19 +45,30 @@ _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest fi
 class Optimum:
     """The best episode found: its cost, trajectory (forces held), and what the solver said of it.
 
-    `guess` is the index of the guessed path that led to it. `seconds` is the wall time of the whole search. `costates` (n, 8)
-    are the slopes of the remaining cost with respect to the states x_1 … x_n.
+    `status` is "optimal" if the solver converged, and else "feasible": such an episode obeys every constraint, and a cheaper
+    one may be near. `solver_status` is the solver's own word. `guess` is the index of the guessed path that led to it, or
+    `FROM_RIGHTING`. `seconds` is the wall time of the whole search, `solver_seconds` the part in solvers, and
+    `setup_seconds` the part that differentiated and compiled. `costates` (n, 8) are the slopes of the remaining cost with
+    respect to the states x_1 … x_n; they are 0 for a simulated episode.
     """
 
     cost: float
     trajectory: Trajectory
-    status: str
+    status: Literal["optimal", "feasible"]
+    solver_status: str
     violation: float
     iterations: int
     solver: str
     guess: int
     seconds: float
+    solver_seconds: float
+    setup_seconds: float
     costates: np.ndarray
+
+    @property
+    def is_optimal(self) -> bool:
+        """Whether the solver converged."""
+        return self.status == "optimal"
 
 
 @dataclass(frozen=True)
@@ -98,15 +116,22 @@ def find_optimum(
         guesses: how many of the task's guessed paths to try at most.
         paths: ground paths to start from instead of the task's.
 
+    Returns:
+        The cheapest optimum found. If no try converged, the cheapest feasible episode found; look at `status`.
+
     Raises:
-        PlanError: no try converged to a feasible episode.
+        PlanError: no try came to a feasible episode.
     """
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     paths = task.guess_paths(x0, c, params)[:guesses] if paths is None else paths
-    started = time.perf_counter()
+    started, before = time.perf_counter(), (spent.solving, spent.setup)
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
     tried = solve(task, params, x0, c, backoff, paths)
-    best = min((t for t in tried if is_feasible(t[1])), key=lambda t: t[1].cost, default=None)
+    if not _any_optimal(tried):
+        tried += _solve_from_righting(task, params, x0, c, backoff)
+    if not _any_optimal(tried) and not task.first_exit:
+        tried += _solve_patiently(task, params, x0, c, backoff, paths)
+    best = min((t for t in tried if is_within_limits(t[1])), key=_rank, default=None)
     if best is None:
         tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for _, s in tried)
         raise PlanError(f"{task.id}: no feasible episode from x = {x0.tolist()}, c = {c.tolist()} ({tries})")
@@ -116,19 +141,36 @@ def find_optimum(
         trajectory=Trajectory(
             task.control_dt * np.arange(len(solution.states)), solution.states, params.force_limit * solution.inputs
         ),
-        status=solution.status,
+        status="optimal" if is_feasible(solution) else "feasible",
+        solver_status=solution.status,
         violation=solution.violation,
         iterations=solution.iterations,
         solver=solution.solver,
         guess=index,
         seconds=time.perf_counter() - started,
+        solver_seconds=spent.solving - before[0],
+        setup_seconds=spent.setup - before[1],
         costates=solution.costates,
     )
 
 
 def is_feasible(solution: OcpSolution) -> bool:
     """Converged, and within `FEASIBLE` of every constraint."""
-    return solution.success and solution.violation < FEASIBLE
+    return solution.success and is_within_limits(solution)
+
+
+def is_within_limits(solution: OcpSolution) -> bool:
+    """Within `FEASIBLE` of every constraint, converged or not."""
+    return bool(solution.violation < FEASIBLE and np.isfinite(solution.cost))
+
+
+def _any_optimal(tried: list[tuple[int, OcpSolution]]) -> bool:
+    return any(is_feasible(solution) for _, solution in tried)
+
+
+def _rank(tried: tuple[int, OcpSolution]) -> tuple[bool, float]:
+    """Optima come before feasible episodes, and cheap ones before dear ones."""
+    return not tried[1].success, tried[1].cost
 
 
 def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
@@ -180,8 +222,16 @@ def _goal_room(task: Task, x: casadi.SX, p: casadi.SX, nc: int) -> casadi.SX:
 
 
 @lru_cache(maxsize=256)
-def _solver(task: Task, params: BallbotParams, steps: int, solver: str, coarseness: int = 1) -> OcpSolver:
-    return OcpSolver(shooting_ocp(task, params, coarseness), steps, solver)
+def _solver(
+    task: Task,
+    params: BallbotParams,
+    steps: int,
+    solver: str,
+    coarseness: int = 1,
+    iterations: int = _MOST_ITERATIONS,
+) -> OcpSolver:
+    ocp = shooting_ocp(task, params, coarseness)
+    return OcpSolver(ocp, steps, solver, max_iterations=iterations)
 
 
 @lru_cache(maxsize=8)
@@ -202,12 +252,14 @@ def _solve_from(
     """Solves with fatrop from guessed states (n+1, 8) and actions (n, 2). If fatrop fails, ipopt tries the same guess."""
     solutions = []
     for name in ("fatrop", "ipopt"):
-        solver = _solver(task, params, len(a), name)
-        bounds = _bounds(solver.ocp, len(a), x[0], backoff)
-        solutions.append(solver.solve(x, a, bounds, [*c, backoff.margin, backoff.goal]))
+        solutions.append(_solve_with(_solver(task, params, len(a), name), x, a, c, backoff))
         if is_feasible(solutions[-1]):
             break
     return solutions
+
+
+def _solve_with(solver: OcpSolver, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff) -> OcpSolution:
+    return solver.solve(x, a, _bounds(solver.ocp, len(a), x[0], backoff), [*c, backoff.margin, backoff.goal])
 
 
 def _solve_fixed_time(
@@ -218,11 +270,76 @@ def _solve_fixed_time(
     With several paths, each is first solved with forces held for two control steps. That takes half the time and suffices to
     compare the paths. Only the paths that may be the best are then solved in full.
     """
-    starts = [guess.along_path(params, path, task.control_dt, start=x0) for path in paths]
-    starts = [(i, x, u / params.force_limit) for i, (x, u) in enumerate(starts)]
-    if len(paths) > 1 and task.steps % _COARSE == 0:
+    starts = _starts(task, params, x0, paths)
+    if len(paths) == 1:
+        solver = _solver(task, params, task.steps, "fatrop", iterations=_QUICK_ITERATIONS)
+        return [(i, _solve_with(solver, x, a, c, backoff)) for i, x, a in starts]
+    if task.steps % _COARSE == 0:
         starts = _contenders(task, params, x0, c, backoff, starts)
     return [(i, s) for i, x, a in starts for s in _solve_from(task, params, x, a, c, backoff)]
+
+
+def _solve_patiently(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, paths: list[np.ndarray]
+) -> list[tuple[int, OcpSolution]]:
+    """From every path with both solvers and many iterations; only where there is one path, because else it was done."""
+    starts = _starts(task, params, x0, paths) if len(paths) == 1 else []
+    return [(i, s) for i, x, a in starts for s in _solve_from(task, params, x, a, c, backoff)]
+
+
+def _starts(
+    task: Task, params: BallbotParams, x0: np.ndarray, paths: list[np.ndarray]
+) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Index, states (n+1, 8) and actions (n, 2) along each path."""
+    starts = [guess.along_path(params, path, task.control_dt, start=x0) for path in paths]
+    return [(i, x, u / params.force_limit) for i, (x, u) in enumerate(starts)]
+
+
+def _solve_from_righting(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff
+) -> list[tuple[int, OcpSolution]]:
+    """Solutions from simulated recoveries, to either side of the fall; and those recoveries that are episodes themselves.
+
+    The recovery within the plane of the fall is tried last, because it may lead to a saddle point.
+    """
+    found = []
+    for member in righting.righted(task, params, x0, c, (1 - backoff.force) * params.force_limit):
+        found += [(FROM_RIGHTING, s) for s in _simulated(task, params, member, c, backoff)]
+        if member.side == 0 and _any_optimal(found):
+            break
+        for x, u in righting.guesses(task, params, member, c):
+            a = u / params.force_limit
+            if task.first_exit:
+                relaxed = _relax_time(task, params, x, a, c, backoff)
+                solved = _whole_steps(task, params, c, backoff, relaxed) if is_feasible(relaxed) else [relaxed]
+            else:
+                solved = [_solve_with(_solver(task, params, len(a), "fatrop"), x, a, c, backoff)]
+            found += [(FROM_RIGHTING, s) for s in solved]
+    return found
+
+
+def _simulated(
+    task: Task, params: BallbotParams, member: righting.Member, c: np.ndarray, backoff: Backoff
+) -> list[OcpSolution]:
+    """A simulated recovery as a solution, if it lasts the whole episode."""
+    if task.first_exit or len(member.u) < task.steps:
+        return []
+    room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(member.x[-1], c)]
+    room += [np.asarray(margin) - backoff.margin for margin in task.margins(member.x, c)]
+    return [
+        OcpSolution(
+            success=False,
+            status="simulated feedback",
+            cost=member.cost,
+            states=member.x,
+            inputs=member.u / params.force_limit,
+            violation=max(0.0, -min(float(np.min(part)) for part in room)),
+            iterations=0,
+            seconds=0.0,
+            solver="simulation",
+            costates=np.zeros((len(member.u), 8)),
+        )
+    ]
 
 
 def _contenders(
@@ -277,15 +394,32 @@ def _solve_first_exit(
 def _solve_free_time(
     task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, path: np.ndarray
 ) -> OcpSolution:
-    n, dt = _FREE_TIME_INTERVALS, task.control_dt
-    h = (len(path) - 1) * dt / n
+    n = _FREE_TIME_INTERVALS
+    h = (len(path) - 1) * task.control_dt / n
     x, u = guess.along_path(params, guess.resampled(path, n), h, start=x0)
+    return _in_free_time(task, params, x, u / params.force_limit, h, c, backoff)
+
+
+def _relax_time(
+    task: Task, params: BallbotParams, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff
+) -> OcpSolution:
+    """The solution with a free interval length from states and actions at control steps."""
+    n = _FREE_TIME_INTERVALS
+    actions = guess.resampled(np.vstack([a, a[-1:]]), n)[:-1]
+    h = len(a) * task.control_dt / n
+    return _in_free_time(task, params, guess.resampled(x, n), actions, h, c, backoff)
+
+
+def _in_free_time(
+    task: Task, params: BallbotParams, x: np.ndarray, a: np.ndarray, h: float, c: np.ndarray, backoff: Backoff
+) -> OcpSolution:
+    n = len(a)
     for name in ("fatrop", "ipopt"):
         solver = _free_time_solver(task, params, name)
-        bounds = _bounds(solver.ocp, n, x0, backoff)
-        bounds.state_lower[:, 8], bounds.state_upper[:, 8] = dt / 4, task.duration / n
+        bounds = _bounds(solver.ocp, n, x[0], backoff)
+        bounds.state_lower[:, 8], bounds.state_upper[:, 8] = task.control_dt / 4, task.duration / n
         states = np.column_stack([x, np.full(n + 1, h)])
-        solution = solver.solve(states, u / params.force_limit, bounds, [*c, backoff.margin, backoff.goal])
+        solution = solver.solve(states, a, bounds, [*c, backoff.margin, backoff.goal])
         if is_feasible(solution):
             break
     return solution

@@ -24,7 +24,10 @@ _FORCE_WEIGHTS = EFFORT_WEIGHT * np.eye(2)
 
 @dataclass(frozen=True)
 class TrackedPlan:
-    """A plan and its execution under TVLQR in PyBullet. `error` is the largest distance between the two paths, m."""
+    """A plan and its execution under TVLQR, in PyBullet where it is installed.
+
+    `error` is the largest distance between the two paths, m.
+    """
 
     plan: Plan
     executed: Trajectory

@@ -7,14 +7,18 @@ others but the lean γ are zero. The largest recoverable lean is then the soluti
     subject to  x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k) ≥ 0,   goal(x_n) ≤ 0 at the end of the episode
 
 Turning the world by 180° turns the largest lean into the smallest, so both sides of the boundary come from one search.
+
+The force limit is a square, with √2 times the force along its diagonal. So the largest leans are recovered by leaning to the
+side as well, and the search starts from such a recovery (`righting.py`).
 """
 
+import math
 from dataclasses import replace
 
 import casadi
 import numpy as np
 
-from ballbot_baselines import guess
+from ballbot_baselines import guess, righting
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_baselines.optimum import shooting_ocp
 from ballbot_gym.params import BallbotParams
@@ -26,6 +30,7 @@ _REGULARIZATION = 0.02
 _TOLERANCE = 1e-6
 _FEASIBLE = 1e-4  # SI units: at the boundary the robot hovers where rounding grows by e^7.8 a second
 _ITERATIONS = 300
+_STEEP = math.radians(55)  # the lean of the recovery that the search starts from
 _PATIENCE = 3  # the search stops after this many values in a row without a recoverable lean
 
 
@@ -40,22 +45,24 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
 
     Returns:
         (n,) rad; NaN where no recoverable lean was found. The search goes outward from the value nearest 0. It starts from
-        the neighbouring value's solution, and if that fails from standing.
+        the neighbouring value's solution and from a recovery to the side, and if both fail from standing.
     """
     solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
     leans = np.full(len(values), np.nan)
     middle = int(np.argmin(np.abs(values)))
-    standing = _standing(task, params)
+    standing, sideways = _standing(task, params), _sideways(task, params)
     for order in (range(middle, len(values)), range(middle, -1, -1)):
         start, failures = standing, 0
         for i in order:
-            for x, a in (start, standing):
-                solution = _solve(solver, x, a, component, float(values[i]))
-                if found := solution.violation <= _FEASIBLE:
-                    leans[i] = solution.states[0, _LEAN]
-                    start = solution.states, solution.inputs
-                    break
-            failures = 0 if found else failures + 1
+            found = [_solve(solver, *guessed, component, float(values[i])) for guessed in (start, sideways)]
+            if not any(solution.violation <= _FEASIBLE for solution in found):
+                found = [_solve(solver, *standing, component, float(values[i]))]
+            recovered = [solution for solution in found if solution.violation <= _FEASIBLE]
+            if recovered:
+                best = max(recovered, key=lambda solution: solution.states[0, _LEAN])
+                leans[i] = best.states[0, _LEAN]
+                start = best.states, best.inputs
+            failures = 0 if recovered else failures + 1
             if failures == _PATIENCE:
                 break
     return leans
@@ -73,6 +80,16 @@ def _standing(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray
     path = np.zeros((task.steps + 1, 2))
     x, u = guess.along_path(params, path, task.control_dt)
     return np.column_stack([x, np.zeros(len(x))]), u
+
+
+def _sideways(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+    """A simulated recovery from a large lean that first leans to one side; standing, if there is none."""
+    x0 = np.zeros(8)
+    x0[_LEAN] = _STEEP
+    for member in righting.righted(task, params, x0, np.zeros(0), params.force_limit):
+        if member.side and len(member.u) == task.steps:
+            return np.column_stack([member.x, np.full(len(member.x), _STEEP)]), member.u / params.force_limit
+    return _standing(task, params)
 
 
 def _largest_lean_ocp(task: Task, params: BallbotParams) -> Ocp:

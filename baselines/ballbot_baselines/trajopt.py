@@ -15,7 +15,8 @@ force."""
 class TrajoptController:
     """Plans the optimum from the state at reset, with a back-off from the limits, and tracks it with TVLQR.
 
-    `plan` is the last plan. `reset` raises a PlanError if it finds no plan.
+    A plan that is feasible and not optimal is tracked too. `plan` is the last plan. `reset` raises a PlanError if it finds no
+    plan.
     """
 
     def __init__(self, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):

@@ -2,14 +2,31 @@
 
 import sys
 import threading
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import Any
+from typing import Any, Literal
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
+from ballbot_gym.lazy import missing
+from ballbot_gym.simulator import default_physics
+
+try:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.table import Table
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
+
+Physics = Literal["bullet", "rk4"]
+"""What options called --physics take."""
 
 # A file or pipe has no width of its own: give it one that holds the widest table.
 # Names and paths are data: a "[b]" or ":x:" in them is printed as it is.
@@ -44,6 +61,18 @@ class LineProgress(Progress):
                 if not task.finished:
                     elapsed = timedelta(seconds=int(task.elapsed or 0))
                     self.console.print(f"{elapsed} {task.description}: {task.completed:.0f} of {task.total or 0:.0f}")
+
+
+def physics_or_default(physics: Physics | None) -> Physics:
+    """The physics that was typed; else "bullet" where PyBullet is installed, or "rk4" with a line that says so."""
+    if physics is not None:
+        return physics
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        chosen = default_physics()
+    for warning in caught:
+        console.print(str(warning.message), soft_wrap=True)
+    return "bullet" if chosen == "bullet" else "rk4"
 
 
 def progress_bar() -> Progress:

@@ -17,9 +17,13 @@ from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
 
-import filelock
-
 from ballbot_gym import files
+from ballbot_gym.lazy import missing
+
+try:
+    import filelock
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 Entry = dict[str, Any]
 """What is kept of one finished item: anything that JSON holds, NaN included."""
@@ -49,6 +53,11 @@ class Job:
     """Done in this order; each is what JSON holds."""
     group: str = ""
     """What its progress counts for."""
+
+
+def unfinished(out: Path) -> Path:
+    """The folder within a run's folder that only serves to continue the run; `release` deletes it."""
+    return out / _FOLDER
 
 
 def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Mapping[str, Any] | None = None) -> None:
@@ -108,7 +117,7 @@ def _read_marker(path: Path) -> dict[str, Any]:
 
 def release(out: Path, marker: str = MARKER) -> None:
     """Ends a run whose results are written: deletes what only served to continue it, and unlocks the folder."""
-    shutil.rmtree(out / _FOLDER, ignore_errors=True)
+    shutil.rmtree(unfinished(out), ignore_errors=True)
     (out / marker).unlink(missing_ok=True)
     unlock(out)
 
@@ -176,7 +185,7 @@ def run(jobs: Sequence[Job], out: Path, workers: int, on_progress: Callable[[str
     """
     if workers < 1:
         raise ValueError(f"workers must be at least 1, not {workers}")
-    paths = [out / _FOLDER / f"{job.name}.jsonl" for job in jobs]
+    paths = [unfinished(out) / f"{job.name}.jsonl" for job in jobs]
     with _locked(out):
         done = [_read(path, len(job.items)) for path, job in zip(paths, jobs, strict=True)]
         for job, entries in zip(jobs, done, strict=True):

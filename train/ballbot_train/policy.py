@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.torch
-import torch
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
+from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
@@ -31,6 +29,13 @@ from ballbot_train.policy_files import (
     read_description,
     shipped_policies,
 )
+
+try:
+    import safetensors
+    import safetensors.torch
+    import torch
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 __all__ = [
     "OBSERVATION_VERSION",

@@ -7,6 +7,10 @@ import ast
 from importlib.util import find_spec
 from pathlib import Path
 
+from ballbot_gym.lazy import need
+
+need(__name__, "rich", "tyro", "minari")
+
 COMMANDS: dict[str, str] = {
     "benchmark": "ballbot_train.commands.benchmark:benchmark",
     "evaluate": "ballbot_train.commands.evaluate:evaluate",
@@ -17,10 +21,12 @@ COMMANDS: dict[str, str] = {
     "optimize": "ballbot_train.commands.optimize:optimize",
     "replay": "ballbot_train.commands.replay:replay",
     "page": "ballbot_train.commands.page:page",
+    "play": "ballbot_train.commands.play:play",
     "certify": "ballbot_train.commands.certify:certify",
     "demos": "ballbot_train.commands.demos:demos",
     "export": "ballbot_train.commands.export:export",
     "train": "ballbot_train.commands.train:train",
+    "tune": "ballbot_train.commands.tune:tune",
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 

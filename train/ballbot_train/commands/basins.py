@@ -2,10 +2,9 @@
 
 import os
 from pathlib import Path
-from typing import Literal
 
 from ballbot_train import jobs
-from ballbot_train.console import console, print_table, progress_bars
+from ballbot_train.console import Physics, console, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import basins as maps
 from ballbot_train.evaluation.benchmark import controllers_of, open_run
 from ballbot_train.report import figures
@@ -15,7 +14,7 @@ def basins(
     controllers: tuple[str, ...] = (),
     points: int = 21,
     quick: bool = False,
-    physics: Literal["bullet", "rk4"] = "bullet",
+    physics: Physics | None = None,
     out: Path = Path("runs/basins"),
     workers: int = os.cpu_count() or 1,
 ) -> None:
@@ -25,7 +24,7 @@ def basins(
         controllers: as of `ballbot benchmark`.
         points: along each axis of a map; odd.
         quick: only 9 points.
-        physics: "bullet" or "rk4".
+        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
         workers: processes.
     """
@@ -33,6 +32,7 @@ def basins(
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")
     chosen = controllers_of([maps.TASK], controllers)
+    physics = physics_or_default(physics)
     names = chosen[maps.TASK]
     facts = open_run(out, chosen, workers, physics, points=points)
     with progress_bars({maps.BOUNDARY: len(maps.AXES)}) as bars:

@@ -4,18 +4,17 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 from ballbot_gym import certified, files
 from ballbot_gym.env import make_task
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import console, markdown, print_table, progress_bars
+from ballbot_train.console import Physics, console, markdown, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import basins
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
-from ballbot_train.provenance import load, load_facts
+from ballbot_train.provenance import LoadRecord
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
 from ballbot_train.report.replay import certified_replay
@@ -27,7 +26,7 @@ def benchmark(
     controllers: tuple[str, ...] = (),
     episodes: int = certified.EPISODES,
     quick: bool = False,
-    physics: Literal["bullet", "rk4"] = "bullet",
+    physics: Physics | None = None,
     seed: int = 0,
     runs: Path = Path("runs"),
     out: Path = Path("runs/benchmark"),
@@ -41,7 +40,7 @@ def benchmark(
             with the package. A policy is run on the task it was made for.
         episodes: how many of each task's certified episodes.
         quick: only 8 episodes of each task.
-        physics: "bullet" or "rk4".
+        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         seed: of the bootstrap intervals, and of whatever an episode draws.
         runs: folder where other commands left their results: the recovered share of `basins` joins the leaderboard, and
             basins, robustness, training and the paper's figures join the report.
@@ -49,12 +48,13 @@ def benchmark(
         workers: processes; 1 gives the cleanest times per control step.
     """
     chosen = controllers_of(tasks, controllers)
+    physics = physics_or_default(physics)
     episodes = checked_episodes(episodes, quick, few=8)
-    load_before = load()
     facts = open_run(out, chosen, workers, physics, seed, episodes=episodes)
+    loads = LoadRecord(out, workers)
     with progress_bars({task: episodes * len(group) for task, group in chosen.items()}) as bars:
-        done = run_benchmark(chosen, episodes, physics, out, workers, bars.advance, seed)
-    facts |= load_facts(load_before, workers)
+        done = run_benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance), seed)
+    facts |= loads.facts()
     busy = bool(facts["busy"])
     recovered, damaged = basins.recovered_fractions(runs / "basins")
     if damaged:

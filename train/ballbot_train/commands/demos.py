@@ -3,7 +3,6 @@
 import os
 import shlex
 from pathlib import Path
-from typing import Literal
 
 import minari
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_names, console, progress_bar
+from ballbot_train.console import Physics, check_names, console, physics_or_default, progress_bar
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
 
@@ -19,7 +18,7 @@ def demos(
     task: str = "stabilize",
     expert: str = "trajopt",
     episodes: int = 200,
-    physics: Literal["bullet", "rk4"] = "bullet",
+    physics: Physics | None = None,
     noise: float = 0.05,
     pushes: float = 0.5,
     backoff: Backoff = EXECUTED,
@@ -33,7 +32,7 @@ def demos(
         task: name of a task.
         expert: name of a controller, such as trajopt (a plan, tracked by TVLQR), nmpc or lqr.
         episodes: number of episodes, each with a seed of its own.
-        physics: "bullet" or "rk4".
+        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         noise: each episode draws the standard deviation of its noise from [0, this], in units of the force limit.
         pushes: mean number per second of control steps in which a random force replaces the expert's.
         backoff: what the expert's plans keep from their limits: margins in their units, shares of the goal's tolerance
@@ -43,6 +42,7 @@ def demos(
         workers: number of processes.
     """
     check_names("task", [task], TASKS)
+    physics = physics_or_default(physics)
     config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed)
     out = Path("runs") / "demos" / f"{task}-{expert}-v0" if out is None else out
     with progress_bar() as progress:

@@ -5,18 +5,25 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
-from ballbot_train.console import check_least, console, print_table, progress_bars
+from ballbot_train.console import (
+    Physics,
+    check_least,
+    console,
+    physics_or_default,
+    print_table,
+    progress_bars,
+)
 from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
 from ballbot_train.evaluation.controllers import make_controller, task_name
-from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
-from ballbot_train.provenance import provenance
+from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.provenance import LoadRecord, provenance
 
 _FRESH = 10_000
 _WORST = 10
@@ -33,15 +40,17 @@ def evaluate(
     bins: int | None = None,
     optima: int = 0,
     episodes: int = 0,
-    physics: Literal["bullet", "rk4"] = "bullet",
+    physics: Physics | None = None,
     out: Path | None = None,
     workers: int = os.cpu_count() or 1,
 ) -> None:
     """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
 
     Args:
-        policy: a policy file, or the name of a policy that comes with the package; with --episodes also an expert.
-        task: name of its task; default the one that its file names, or else stabilize.
+        policy: a policy file, a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt), or the name of a policy that comes
+            with the package; with --episodes also an expert. Statistics of VecNormalize are read from
+            MODEL.vecnormalize.npz beside the model, which `ballbot_train.save_vecnormalize` writes.
+        task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
         fresh: how many fresh episodes, in the batched closed-form model; default 10000, or none where --episodes is given.
             They are never the certified ones.
         seed: of the fresh episodes.
@@ -49,7 +58,7 @@ def evaluate(
         optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
             folder `optima` beside --out, for later calls and other policies.
         episodes: how many of the certified episodes to run in PyBullet.
-        physics: of the certified episodes, "bullet" or "rk4".
+        physics: of the certified episodes, "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         out: folder of the results; default runs/evaluate/TASK-POLICY. An interrupted run continues here.
         workers: processes, for optima and certified episodes.
     """
@@ -74,7 +83,7 @@ def evaluate(
     if fresh:
         _fresh(policy, task, fresh, seed, bins, optima, out, workers)
     if episodes:
-        _certified(chosen, episodes, physics, out / "certified", workers)
+        _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers)
 
 
 def _fresh(
@@ -171,10 +180,15 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
 
 def _certified(chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: int) -> None:
     facts = open_run(out, chosen, workers, physics, 0, episodes=episodes)
+    loads = LoadRecord(out, workers)
     with progress_bars(dict.fromkeys(chosen, episodes)) as bars:
-        results = benchmark(chosen, episodes, physics, out, workers, bars.advance)
+        results = benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance))
+    facts |= loads.facts()
     rows = leaderboard(results)
     write_leaderboard(rows, results, facts, out)
     jobs.release(out)
-    print_table(f"{episodes} certified episodes, physics={physics}", HEADER, [cells(row) for row in rows])
+    table = [cells(row, bool(facts["busy"])) for row in rows]
+    print_table(f"{episodes} certified episodes, physics={physics}", HEADER, table)
+    if facts["busy"]:
+        console.print(BUSY_NOTE)
     console.print(f"all episodes: {out / 'episodes.csv'}")

@@ -11,6 +11,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import check_least, check_names, console, print_table
+from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
 
 _MOST_STEPS = 5000  # control steps of an episode; longer ones take hours and gigabytes
@@ -53,7 +54,9 @@ def optimize(
     env = BallbotEnv(problem, physics="rk4", params=params)
     options = {"constants": constants} | ({} if state is None else {"state": state})
     _, info = env.reset(seed=seed, options=options)
+    load_before = load()
     optimum = find_optimum(env.task, params, info["state"], info["constants"])
+    busy = bool(load_facts(load_before, workers=1)["busy"])
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
     circles = figures.marker_circles(env.task.markers(info["constants"]))
@@ -64,9 +67,18 @@ def optimize(
         ["duration, s", f"{trajectory.duration:.2f}"],
         ["peak tilt, deg", f"{math.degrees(trajectory.tilt.max()):.2f}"],
         ["peak force, N", f"{np.abs(trajectory.u).max():.1f}"],
-        ["status", f"{optimum.solver}: {optimum.status}, {optimum.iterations} iterations"],
+        ["status", f"{optimum.status}; {optimum.solver}: {optimum.solver_status}, {optimum.iterations} iterations"],
         ["constraint violation", f"{optimum.violation:.1e}"],
-        ["solver time, s", f"{optimum.seconds:.3f}"],
+        *(
+            [name, f"{'~' if busy else ''}{seconds:.3f}"]
+            for name, seconds in (
+                ("solver time, s", optimum.solver_seconds),
+                ("set-up and compilation, s", optimum.setup_seconds),
+                ("whole search, s", optimum.seconds),
+            )
+        ),
     ]
     print_table(env.task.id, ["", ""], rows)
+    if busy:
+        console.print("~ The machine was busy, so these times are longer than they need be.")
     console.print(f"trajectory: {path}\nfigure: {picture}")

@@ -9,7 +9,8 @@ from ballbot_baselines.collocation import Plan
 from ballbot_baselines.paper import PAPER_PROBLEMS, PaperProblem
 from ballbot_baselines.paper_experiments import TRACKING_DT, compare_stabilization, track_plan
 from ballbot_gym.params import default_params
-from ballbot_train.console import check_names, console, print_table
+from ballbot_gym.simulator import PHYSICS_NAMES
+from ballbot_train.console import check_names, console, physics_or_default, print_table
 from ballbot_train.report import figures
 
 
@@ -21,7 +22,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         only: names of some of the problems; default all.
     """
     check_names("problem", list(only), PAPER_PROBLEMS)
-    params = default_params()
+    params, simulator = default_params(), PHYSICS_NAMES[physics_or_default(None)]
     rows = []
     for name in only or PAPER_PROBLEMS:
         entry = PAPER_PROBLEMS[name]
@@ -30,7 +31,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         plan.trajectory.save(out / f"{name}.npz")
         curves = [
             figures.Curve("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", "--"),
-            figures.Curve("PyBullet under TVLQR", tracked.executed, figures.COLORS["trajopt"]),
+            figures.Curve(f"{simulator} under TVLQR", tracked.executed, figures.COLORS["trajopt"]),
         ]
         figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", curves, _paper_circles(entry, plan))
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}.png")
@@ -62,11 +63,11 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
     print_table("The paper's problems: 40 intervals, Hermite–Simpson", header, rows)
     stabilizations = [name for name in only or PAPER_PROBLEMS if name.startswith("stabilize")]
     if stabilizations:
-        _compare_stabilizations(stabilizations, out)
+        _compare_stabilizations(stabilizations, out, simulator)
     console.print(f"figures: {out}")
 
 
-def _compare_stabilizations(names: list[str], out: Path) -> None:
+def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None:
     """Table and figures of LQR against trajectory optimization."""
     rows = []
     for name in names:
@@ -86,7 +87,7 @@ def _compare_stabilizations(names: list[str], out: Path) -> None:
         )
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}-lqr-and-trajopt.png")
     header = ["figure", "controller", "feedback", "cost", "peak lean, deg", "settle time, s", "fell"]
-    print_table("Stabilization in PyBullet, both with Stabilize's weights", header, rows)
+    print_table(f"Stabilization in {simulator}, both with Stabilize's weights", header, rows)
 
 
 def _paper_circles(entry: PaperProblem, plan: Plan) -> list[figures.Circle]:

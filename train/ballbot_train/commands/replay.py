@@ -2,11 +2,10 @@
 
 import math
 from pathlib import Path
-from typing import Literal
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_names, console, progress_bar
+from ballbot_train.console import Physics, check_names, console, physics_or_default, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
 from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_companions, with_ghosts
 
@@ -19,7 +18,7 @@ def replay(
     /,
     controllers: tuple[str, ...] = ("trajopt",),
     episode: int = 0,
-    physics: Literal["bullet", "rk4"] = "bullet",
+    physics: Physics | None = None,
     format: Format = "png",
     seconds: float | None = None,
     frames: int = 5,
@@ -37,7 +36,7 @@ def replay(
         source: name of a task, or trajectory files (.npz).
         controllers: names of controllers or policy files; several are shown side by side.
         episode: index of the certified episode.
-        physics: "bullet" or "rk4".
+        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         format: png, a strip of pictures; mp4, gif or webp, a film with tilts, forces and paths.
         seconds: time of the last picture, s; default the end of the episode.
         frames: number of pictures in a strip, at equal times.
@@ -54,6 +53,7 @@ def replay(
     _check(0 < speed < math.inf, f"speed must be positive, not {speed}")
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
+    physics = physics_or_default(physics)
     shown, name = _read(source, controllers, episode, physics, ghosts, ghost_at, ghost_by)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"

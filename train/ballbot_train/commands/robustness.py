@@ -3,15 +3,19 @@
 import math
 import os
 from pathlib import Path
-from typing import Literal
 
 from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import check_some, console, markdown, print_table, progress_bars
+from ballbot_train.console import Physics, check_some, console, markdown, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.provenance import LoadRecord
 from ballbot_train.report import figures
+
+_BUSY_NOTE = (
+    "~ The machine was busy, so plan_ms_median and step_us_median in robustness.csv are longer than they need be."
+)
 
 
 def robustness(
@@ -20,7 +24,7 @@ def robustness(
     stresses: tuple[str, ...] = tuple(stressed.STRESSES),
     episodes: int = 20,
     quick: bool = False,
-    physics: Literal["bullet", "rk4"] = "bullet",
+    physics: Physics | None = None,
     seed: int = 0,
     out: Path = Path("runs/robustness"),
     workers: int = os.cpu_count() or 1,
@@ -33,17 +37,20 @@ def robustness(
         stresses: names of disturbances.
         episodes: how many of each task's certified episodes.
         quick: only 3 episodes of each task.
-        physics: "bullet" or "rk4".
+        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         seed: of pushes, noise and the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
         workers: processes.
     """
     chosen = controllers_of(tasks, controllers)
+    physics = physics_or_default(physics)
     check_some("stress", stresses, stressed.STRESSES)
     episodes = checked_episodes(episodes, quick, few=3)
     facts = open_run(out, chosen, workers, physics, seed, episodes=episodes)
+    loads = LoadRecord(out, workers)
     with progress_bars(stressed.episodes_to_run(chosen, stresses, episodes)) as bars:
-        results = stressed.run(chosen, stresses, episodes, physics, out, workers, bars.advance, seed)
+        results = stressed.run(chosen, stresses, episodes, physics, out, workers, loads.watched(bars.advance), seed)
+    facts |= loads.facts()
     rows = stressed.rows_of(results, seed)
     stressed.write(rows, results, facts, out)
     for task in chosen:
@@ -55,9 +62,11 @@ def robustness(
         for controller in group
     ]
     header = ["task", "disturbance", "controller", "severity", "success, %", "falls, %", "regret, %"]
-    files.write(out / "robustness.md", markdown(header, table))
+    files.write(out / "robustness.md", markdown(header, table) + (f"\n{_BUSY_NOTE}\n" if facts["busy"] else ""))
     jobs.release(out)
     print_table(f"{episodes} certified episodes per task and severity, physics={physics}", header, table)
+    if facts["busy"]:
+        console.print(f"{_BUSY_NOTE} Load {facts['load_start']} to {facts['load_end']} on {os.cpu_count()} cores.")
     console.print(f"curves: {out / 'figures'}")
 
 

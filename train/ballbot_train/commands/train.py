@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_names, console
+from ballbot_train.console import check_names, console, physics_or_default
 from ballbot_train.learning.learners import LEARNERS, check_settings
 
 _MOST_THREADS = 1024
@@ -77,6 +77,7 @@ def train(
 
     from ballbot_gym.env import make_task
     from ballbot_gym.params import default_params
+    from ballbot_gym.simulator import PHYSICS_NAMES
     from ballbot_train.learning import training
     from ballbot_train.learning.demonstrations import command_of
     from ballbot_train.policy import load_network, read_description
@@ -111,9 +112,10 @@ def train(
         if not isinstance(made, training.Finetunable):
             raise ValueError(f"{learner} cannot start from a policy")
         made.start_from(load_network(start, problem))
+    physics = physics_or_default(None)
     row = training.train(made, problem, config, out, resume)
     console.print(
-        f"in PyBullet: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
+        f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
         f"{row.regret_mean:.2%} mean, {row.regret_median:.2%} median\npolicy: {out / 'policy.json'}"
     )
 

@@ -16,7 +16,7 @@ from ballbot_train.console import check_least, check_names, check_some
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation.evaluate import iterate_episodes
 from ballbot_train.evaluation.results import Result
-from ballbot_train.policy_files import paths_of, read_description, shipped_policies, weights_digest
+from ballbot_train.policy_files import paths_of, shipped_policies
 from ballbot_train.provenance import provenance
 
 _CHUNK = 5  # episodes of a job
@@ -36,25 +36,32 @@ def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str,
     if not names:
         return known
     # two spellings of one path are one policy
-    identities = [str(paths_of(name)[1].resolve()) if registry.is_file(name) else name for name in names]
+    identities = [_identity(name) for name in names]
     repeated = [name for i, name in enumerate(names) if identities[i] in identities[:i]]
     if repeated:
         raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
-    made_for = {name: read_description(name)["spec"]["task"] for name in names if registry.is_file(name)}
+    from_files = {name: registry.made_for(name) for name in names if registry.is_file(name)}
     chosen = {
         task: [
             name
             for name in names
-            if (made_for[name] == make_task(task).problem() if name in made_for else name in known[task])
+            if (registry.is_made_for(name, make_task(task)) if name in from_files else name in known[task])
         ]
         for task in tasks
     }
     unused = [name for name in names if not any(name in group for group in chosen.values())]
     if unused:
-        if unused[0] in made_for:
-            raise ValueError(f"{unused[0]} was made for {made_for[unused[0]]}, which is none of {', '.join(tasks)}")
+        if unused[0] in from_files:
+            raise ValueError(f"{unused[0]} was made for {from_files[unused[0]]}, which is none of {', '.join(tasks)}")
         check_names("controller", unused, dict.fromkeys(name for group in known.values() for name in group))
     return {task: group for task, group in chosen.items() if group}
+
+
+def _identity(name: str) -> str:
+    """The path of a policy's file, whichever of its files is named; of anything else the name."""
+    if not registry.is_file(name):
+        return name
+    return str((Path(name) if registry.is_saved_model(name) else paths_of(name)[1]).resolve())
 
 
 def policy_digests(controllers: Mapping[str, Sequence[str]]) -> dict[str, str]:
@@ -64,7 +71,7 @@ def policy_digests(controllers: Mapping[str, Sequence[str]]) -> dict[str, str]:
         shipped = shipped_policies(make_task(task))
         for name in group:
             if name not in CONTROLLERS:
-                digests[f"{task}/{name}"] = weights_digest(shipped.get(name, name))
+                digests[f"{task}/{name}"] = registry.digest_of(str(shipped.get(name, name)))
     return digests
 
 

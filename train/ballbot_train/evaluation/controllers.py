@@ -1,4 +1,4 @@
-"""Controllers by name: experts of `CONTROLLERS`, policies that come with the package, and policy files."""
+"""Controllers by name: experts of `CONTROLLERS`, policies that come with the package, policy files and saved models."""
 
 from pathlib import Path
 
@@ -8,7 +8,9 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
-from ballbot_train.policy_files import read_description, shipped_policies
+from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
+
+_SAVED_MODELS = (".zip", ".pt", ".pth")
 
 
 def names(task: Task) -> list[str]:
@@ -17,17 +19,48 @@ def names(task: Task) -> list[str]:
 
 
 def is_file(name: str) -> bool:
-    """Whether a controller's name is the path of a policy file.
+    """Whether a controller's name is the path of a policy file or of a saved model."""
+    return name not in CONTROLLERS and bool(Path(name).suffix)
+
+
+def is_saved_model(name: str) -> bool:
+    """Whether a controller's name is the path of a model that Stable-Baselines3 or rsl_rl saved."""
+    return Path(name).suffix in _SAVED_MODELS
+
+
+def is_made_for(name: str, task: Task) -> bool:
+    """Whether the policy of a file is one for a task. A saved model says no more than the size of its observations.
 
     Raises:
-        ValueError: it is the path of a saved Stable-Baselines3 model.
+        PolicyError: the file is missing or damaged.
     """
-    if Path(name).suffix == ".zip":
-        raise ValueError(
-            f"{name} is a saved Stable-Baselines3 model, which does not say by which algorithm; load it and give the model: "
-            f'evaluate(stable_baselines3.PPO.load("{name}"), ...)'
-        )
-    return name not in CONTROLLERS and bool(Path(name).suffix)
+    if is_saved_model(name):
+        from ballbot_train.saved_models import observations_of  # it imports torch
+
+        return observations_of(name) == len(task.observation_scale)
+    return read_description(name)["spec"]["task"] == task.problem()
+
+
+def made_for(name: str) -> str:
+    """What the policy of a file was made for, in words.
+
+    Raises:
+        PolicyError: the file is missing or damaged.
+    """
+    if is_saved_model(name):
+        from ballbot_train.saved_models import observations_of
+
+        return f"a task with {observations_of(name)} observations"
+    return read_description(name)["spec"]["task"]
+
+
+def digest_of(name: str) -> str:
+    """SHA-256 of the weights of a policy's file, as hexadecimal digits."""
+    if is_saved_model(name):
+        from ballbot_train.saved_models import digest
+
+        return digest(name)
+    return weights_digest(name)
 
 
 def task_name(policy: str, task: str | None) -> str:
@@ -42,11 +75,10 @@ def task_name(policy: str, task: str | None) -> str:
         return task
     if not is_file(policy):
         return "stabilize"
-    made_for = read_description(policy)["spec"]["task"]
-    named = next((name for name in TASKS if make_task(name).problem() == made_for), None)
+    named = next((name for name in TASKS if is_made_for(policy, make_task(name))), None)
     if named is None:
         raise ValueError(
-            f"{policy} was made for {made_for}, which is none of {', '.join(TASKS)} with its default fields"
+            f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields"
         )
     return named
 
@@ -64,6 +96,10 @@ def policy_path(name: str, task: Task) -> Path:
         raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
     if not is_file(name):
         raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
+    if is_saved_model(name):
+        raise ValueError(
+            f"{name} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
+        )
     return Path(name)
 
 
@@ -71,7 +107,8 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
     """The controller that a name stands for. torch is imported only for a policy.
 
     Args:
-        name: in `CONTROLLERS`, of a policy that comes with the package ("shac"), or the path of a policy file.
+        name: in `CONTROLLERS`, of a policy that comes with the package ("shac"), or the path of a policy file or of a model
+            that Stable-Baselines3 or rsl_rl saved; see `saved_models`.
         task: what it is to do.
         params: the robot it believes to control.
 
@@ -86,6 +123,11 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         raise ValueError(
             f"unknown controller {name!r}; {task.id} has {', '.join(names(task))}, or give a policy's .json"
         )
-    from ballbot_train.policy import load_policy  # it imports torch
+    if is_saved_model(name):
+        from ballbot_train.policy import PolicyController  # it imports torch
+        from ballbot_train.saved_models import load_actor
+
+        return PolicyController(task, params, load_actor(name, task))
+    from ballbot_train.policy import load_policy
 
     return load_policy(shipped.get(name, name), task, params)

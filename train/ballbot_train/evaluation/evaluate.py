@@ -74,7 +74,7 @@ def evaluate(
     policy: Any,
     task: str | Task = "stabilize",
     episodes: int | Iterable[int] = certified.EPISODES,
-    physics: str = "bullet",
+    physics: str | None = None,
     name: str | None = None,
     randomization: Randomization | None = None,
 ) -> Row:
@@ -85,7 +85,7 @@ def evaluate(
             controller ("lqr", "trajopt", "nmpc") or a policy file.
         task: a name in `TASKS`, or a Task that has a certified set.
         episodes: how many of the certified episodes, from the first, or their indices, each once.
-        physics: "bullet" or "rk4".
+        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed, else "rk4" with a warning.
         name: of the row; default, the policy's own.
         randomization: what disturbs it; default, nothing.
 

@@ -17,21 +17,27 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import make_task
+from ballbot_gym.lazy import missing
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import is_file
+from ballbot_train.evaluation.controllers import is_file, is_saved_model
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.policy import load_network, shipped_policies
+from ballbot_train.saved_models import load_actor
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 EPISODES = 10_000
 """Fresh episodes by default."""
@@ -39,7 +45,7 @@ EPISODES = 10_000
 _MOST_EPISODES = 1_000_000
 _BATCH = 2500  # episodes that run at once
 _CHUNK = 5  # episodes of a job that finds optima
-_PURPOSES = {"evaluation": 0, "validation": 1}
+_PURPOSES = {"evaluation": 0, "validation": 1, "training": 2}
 _DISCRETE = 12  # a quantity with at most so many values gets a bin for each of them
 _PER_BIN = 125  # episodes of a bin on average, by default
 _MOST_BINS = 80
@@ -231,7 +237,7 @@ def draw(
     task: Task,
     episodes: Iterable[int],
     seed: int,
-    purpose: Literal["evaluation", "validation"] = "evaluation",
+    purpose: Literal["evaluation", "validation", "training"] = "evaluation",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Initial states (n, 8) and constants (n, nc) of fresh episodes.
 
@@ -251,8 +257,8 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
     """A policy as a function from observations (B, no) to actions (B, 2), for one episode of each of B environments.
 
     Args:
-        policy: a policy file, the name of a shipped policy, a model with Stable-Baselines3's `predict`, or a function of
-            tensors such as a `PolicyNetwork`. It is given float32.
+        policy: a policy file, a saved model, the name of a shipped policy, a model with Stable-Baselines3's `predict`, or a
+            function of tensors such as a `PolicyNetwork`. It is given float32.
         task: what it is to do.
 
     Raises:
@@ -269,7 +275,9 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
             )
         if name not in shipped and not is_file(name):
             raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
-        network = load_network(shipped.get(name, name), task).eval()
+        network = (
+            load_actor(name, task) if is_saved_model(name) else load_network(shipped.get(name, name), task)
+        ).eval()
         return lambda observation: network(observation.float())
     if callable(getattr(policy, "predict", None)):
         predictor, begins = Predictor(policy), itertools.chain([True], itertools.repeat(False))
@@ -368,9 +376,14 @@ def _optima(task_name: str, seed: int, episodes: Sequence[int]) -> Iterator[jobs
     task = make_task(task_name)
     for i, x, c in zip(episodes, *draw(task, episodes, seed), strict=True):
         try:
-            yield {"episode": i, "cost": find_optimum(task, default_params(), x, c).cost}
+            optimum = find_optimum(task, default_params(), x, c)
         except PlanError as error:
             yield {"episode": i, "error": str(error)}
+            continue
+        if optimum.is_optimal:
+            yield {"episode": i, "cost": optimum.cost}
+        else:
+            yield {"episode": i, "error": f"only a feasible episode was found ({optimum.solver_status})"}
 
 
 def write(

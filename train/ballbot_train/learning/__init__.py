@@ -1,1 +1,5 @@
 """Training of policies: demonstrations, learners, training runs, the Stable-Baselines3 adapter."""
+
+from ballbot_gym.lazy import need
+
+need(__name__, "torch", "stable_baselines3", "minari", "rsl_rl", "tensorboard")

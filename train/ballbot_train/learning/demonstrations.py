@@ -334,6 +334,24 @@ def load_demos(path: Path, task: Task) -> Demos:
     return demos
 
 
+def demonstrated_states(path: Path, task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The states (T+1, 8) and constants (nc,) of the successful episodes of a dataset of `ballbot demos`.
+
+    Raises:
+        ValueError: as `load_demos`.
+    """
+    load_demos(path, task)  # it checks the whole dataset
+    data = minari.MinariDataset(Path(path) / "data")
+    env = BallbotEnv(task, physics="rk4")
+    episodes = []
+    for episode, about in zip(data, data.storage.get_episode_metadata(data.episode_indices), strict=True):
+        if about["success"]:
+            _, info = env.reset(seed=int(about["seed"]))  # constants follow from the seed
+            episodes.append((np.asarray(episode.infos["state"], np.float64), info["constants"]))
+    env.close()
+    return episodes
+
+
 def _read(data: Path) -> Demos:
     """The episodes of Minari's folder."""
     episodes = list(minari.MinariDataset(data))
@@ -423,8 +441,8 @@ def _optimum(env: BallbotEnv, x: np.ndarray, c: np.ndarray) -> dict[str, Any]:
     except PlanError as error:
         return {"optimum": math.nan, "solver_status": str(error), "violation": math.nan}
     return {
-        "optimum": optimum.cost,
-        "solver_status": f"{optimum.solver}: {optimum.status}",
+        "optimum": optimum.cost if optimum.is_optimal else math.nan,
+        "solver_status": f"{optimum.solver}: {optimum.solver_status}",
         "violation": optimum.violation,
     }
 

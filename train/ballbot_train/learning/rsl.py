@@ -1,5 +1,6 @@
 """rsl-rl on the batched environments: `OnPolicyRunner(RslVecEnv(BallbotBatch("stabilize", 4096)), config)`."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,12 +12,28 @@ if TYPE_CHECKING:
 
 
 class RslVecEnv:
-    """A `BallbotBatch` with the interface of rsl-rl's `VecEnv`. Observations are the group "policy"."""
+    """A `BallbotBatch` with the interface of rsl-rl's `VecEnv`. Observations are the group "policy".
+
+    With `critic_inputs` there is a second group, "critic". It is computed once per step here, and not in every pass of an
+    update.
+    """
 
     num_actions = 2
 
-    def __init__(self, batch: BallbotBatch, seed: int = 0):
-        """Starts an episode in every env; env i has the seed seed + i."""
+    def __init__(
+        self,
+        batch: BallbotBatch,
+        seed: int = 0,
+        critic_inputs: Callable[[torch.Tensor], torch.Tensor] | None = None,
+    ):
+        """Starts an episode in every env; env i has the seed seed + i.
+
+        Args:
+            batch: the envs.
+            seed: of the first env.
+            critic_inputs: maps observations (B, n) to what the critic sees, such as `critics.CriticInputs`.
+        """
+        self._critic_inputs = critic_inputs
         self.batch, self.num_envs, self.device = batch, batch.num_envs, batch.device
         self.max_episode_length = batch.task.steps
         self.cfg: dict[str, Any] = {"task": batch.task.id, "num_envs": batch.num_envs}
@@ -48,4 +65,7 @@ class RslVecEnv:
     def _grouped(self, observation: torch.Tensor) -> "TensorDict":
         from tensordict import TensorDict  # it comes with rsl-rl
 
-        return TensorDict({"policy": observation.contiguous()}, batch_size=[self.num_envs], device=self.device)
+        groups = {"policy": observation.contiguous()}
+        if self._critic_inputs is not None:
+            groups["critic"] = self._critic_inputs(observation)
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)

@@ -22,8 +22,9 @@ A run is a folder:
 | column of evaluations.csv | holds |
 |---|---|
 | iteration, seconds | of training; seconds without evaluations |
+| env_steps, cpu_seconds | control steps of all envs, where the learner counts them; CPU time without evaluations |
 | cost_ratio, regret_mean, regret_median, success, failures | on the certified episodes, the test set; see `Score` |
-| validation_cost, validation_success, validation_failures | on the validation set; see `Validation` |
+| validation_cost, validation_success, validation_failures, validation_mean_cost | on the validation set; see `Validation` |
 
 The best policy is that of the least validation_cost.
 """
@@ -102,6 +103,16 @@ class Finetunable(Protocol):
         """Takes the weights of a policy; raises a ValueError for a network of another shape."""
 
 
+@runtime_checkable
+class Staged(Protocol):
+    """A learner whose training begins easier than the task."""
+
+    @property
+    def difficulty(self) -> dict[str, float]:
+        """How far its curriculum has come, by name; empty where it has none."""
+        ...
+
+
 @dataclass(frozen=True)
 class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
@@ -145,6 +156,16 @@ class Validation:
     """Share of the episodes that ended in success."""
     failures: int
     """Number of episodes that failed."""
+    mean_cost: float
+    """Mean cost as it is, a failure's price included."""
+
+
+_COLUMNS = (
+    *("iteration", "seconds", "env_steps", "cpu_seconds"),
+    *(field.name for field in fields(Score)),
+    *(f"validation_{field.name}" for field in fields(Validation)),
+)
+"""Of evaluations.csv."""
 
 
 def validate(network: PolicyNetwork, task: Task) -> Validation:
@@ -155,6 +176,7 @@ def validate(network: PolicyNetwork, task: Task) -> Validation:
         cost=float(fresh.priced(run.cost.numpy(), run.success.numpy(), task).mean()),
         success=float(run.success.double().mean()),
         failures=int(run.failure.sum()),
+        mean_cost=float(run.cost.mean()),
     )
 
 
@@ -195,9 +217,11 @@ def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any]) -> evaluate
         if learner.iteration == 0:
             run.score()  # so that there is a policy, and learning curves show the start
         while learner.iteration < learner.iterations:
-            start = time.monotonic()
+            start, cpu_start = time.monotonic(), time.process_time()
             figures = learner.iterate()
             run.seconds += time.monotonic() - start
+            run.cpu_seconds += time.process_time() - cpu_start
+            run.env_steps = figures.get("train/env_steps", math.nan)
             progress.update(bar, completed=learner.iteration)
             for name, value in figures.items():
                 writer.add_scalar(name, value, learner.iteration)
@@ -220,7 +244,8 @@ class _Run:
 
     def __init__(self, learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool):
         self.learner, self.task, self.config, self.out = learner, task, dict(config), out
-        self.seconds, self.best, self.rows = 0.0, math.inf, []
+        self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
+        self.best, self.rows = math.inf, []
         if (out / _CONFIG).exists() and not resume:
             raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
         jobs.claim(out, self.config, _CONFIG, {"about": provenance()})
@@ -239,13 +264,16 @@ class _Run:
             state = torch.load(io.BytesIO(files.read(path, _CHECKPOINT_LIMIT)), weights_only=True)
             self.learner.load_state_dict(state["learner"])
             best = self._restored(state["policy"])
-            self.seconds, self.rows = float(state["seconds"]), list(state["rows"])
+            self.seconds = float(state["seconds"])
+            # those of earlier versions lack some columns
+            self.rows = [{name: row.get(name, math.nan) for name in _COLUMNS} for row in state["rows"]]
+            self.cpu_seconds = float(state.get("cpu_seconds", math.nan))
             if "best_validation" in state:
                 self.best = float(state["best_validation"])
             else:  # of an earlier version, which chose the best policy on the certified episodes
                 self.best = validate(best, self.task).cost
-                unknown = {f"validation_{field.name}": math.nan for field in fields(Validation)}
-                self.rows = [row | unknown for row in self.rows]
+        except MemoryError:
+            raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
             raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error!r})") from error
         save_policy(self.out / "policy", best, self._about())
@@ -261,7 +289,14 @@ class _Run:
         certified_score, validation = asdict(score(network, self.task)), validate(network, self.task)
         named = {f"validation_{name}": value for name, value in asdict(validation).items()}
         self.rows.append(
-            {"iteration": self.learner.iteration, "seconds": round(self.seconds, 1), **certified_score, **named}
+            {
+                "iteration": self.learner.iteration,
+                "seconds": round(self.seconds, 1),
+                "env_steps": self.env_steps,
+                "cpu_seconds": round(self.cpu_seconds, 1),
+                **certified_score,
+                **named,
+            }
         )
         self._write_rows()
         if validation.cost < self.best:
@@ -282,6 +317,7 @@ class _Run:
         state = {
             "learner": self.learner.state_dict(),
             "seconds": self.seconds,
+            "cpu_seconds": self.cpu_seconds,
             "best_validation": self.best,
             "rows": self.rows,
             "policy": load_network(self.out / "policy", self.task).state_dict(),
@@ -317,11 +353,13 @@ class _Run:
         return network
 
     def _about(self) -> dict[str, Any]:
+        reached = self.learner.difficulty if isinstance(self.learner, Staged) else {}
         return {
             "training": self.config,
             "chosen_by": {"episodes": f"{VALIDATION_EPISODES} fresh, for validation", "cost": self.best},
             "iteration": self.learner.iteration,
             "training_seconds": round(self.seconds, 1),
+            **({"curriculum_reached": reached} if reached else {}),
         }
 
     def _write_rows(self) -> None:

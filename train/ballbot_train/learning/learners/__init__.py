@@ -103,9 +103,7 @@ LEARNERS: dict[str, Algorithm] = {
     "bc": Algorithm(f"{_HERE}.bc", "BcConfig", "behaviour cloning of demonstrations", demonstrations=True),
     "dagger": Algorithm(f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True),
     "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True),
-    "rsl_ppo": Algorithm(
-        f"{_HERE}.rsl_ppo", "RslPpoConfig", "PPO by rsl_rl on thousands of envs", demonstrations=False
-    ),
+    "rsl_ppo": Algorithm(f"{_HERE}.rsl_ppo", "RslPpoConfig", "PPO by rsl_rl on thousands of envs", demonstrations=True),
     "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True),
     "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False),
 }

@@ -200,7 +200,8 @@ class Dagger:
         for x, c in drawn:
             if len(plans) < config.episodes_per_iteration:
                 with suppress(PlanError):
-                    plans.append((find_optimum(self._task, self._params, x, c, config.backoff, config.max_guesses), c))
+                    found = find_optimum(self._task, self._params, x, c, config.backoff, config.max_guesses)
+                    plans += [(found, c)] if found.is_optimal else []
         return plans
 
     def _track(
@@ -233,9 +234,10 @@ class Dagger:
         if len(path) > _MIN_STEPS:
             paths = [path if task.first_exit else then_stay(path, task.steps)]
         try:
-            return find_optimum(task, self._params, x, c, self.config.backoff, self.config.max_guesses, paths)
+            found = find_optimum(task, self._params, x, c, self.config.backoff, self.config.max_guesses, paths)
         except PlanError:
             return None
+        return found if found.is_optimal else None
 
     def _explore(
         self, plans: Sequence[tuple[Optimum, np.ndarray]], rng: np.random.Generator

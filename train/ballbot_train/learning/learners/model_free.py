@@ -17,6 +17,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
+from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
 from ballbot_train.learning.demonstrations import Demos
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
@@ -44,6 +45,8 @@ class ModelFreeConfig:
     """Units of the hidden layers of actor and critics."""
     products: bool = True
     """Whether the critics have a linear path, and see the products of all pairs of their inputs; see `learning.critics`."""
+    curriculum: Curriculum = Curriculum()
+    """What training makes easier at first."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
@@ -74,7 +77,19 @@ class ModelFree(ABC):
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
         self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
-        self._env = TrainingEnv(task, params, config.num_envs, config.episode_seconds, config.reward_scale)
+        if demos is not None and config.curriculum.shaping:
+            raise ValueError(
+                "curriculum.shaping cannot be used with demonstrations, because their rewards are not shaped"
+            )
+        self._env = TrainingEnv(
+            task,
+            params,
+            config.num_envs,
+            config.episode_seconds,
+            config.reward_scale,
+            config.curriculum,
+            config.gamma,
+        )
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
@@ -96,6 +111,11 @@ class ModelFree(ABC):
     @abstractmethod
     def _imitation_scale(self) -> float:
         """Factor of the imitation loss, the mean squared difference of the actions, besides its weight."""
+
+    @property
+    def difficulty(self) -> dict[str, float]:
+        """How far the curriculum has come."""
+        return self._env.batch.difficulty
 
     def iterate(self) -> dict[str, float]:
         with self._random:
@@ -153,7 +173,8 @@ class ModelFree(ABC):
         # SB3 takes None as "never" for its own printing
         model.learn(settings.num_envs * settings.num_steps, log_interval=cast(int, None), reset_num_timesteps=False)
         self._actor.requires_grad_(True)
-        return {**model.logger.name_to_value, "train/env_steps": model.num_timesteps}
+        reached = {f"curriculum/{name}": value for name, value in self.difficulty.items()}
+        return {**model.logger.name_to_value, "train/env_steps": model.num_timesteps, **reached}
 
     def _add_imitation(self, *_: object) -> None:
         """Adds the gradient of the imitation loss to that of a step of the actor."""
@@ -169,16 +190,40 @@ class TrainingEnv(VecEnvWrapper):
     value of its last state; so shorter episodes only leave out rest, which teaches little.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, num_envs: int, episode_seconds: float, reward_scale: float):
-        """Args: episode_seconds: duration of an episode, s; reward_scale: factor of every reward."""
-        task = replace(task, duration=episode_seconds)
-        self._vector = BallbotVectorEnv(num_envs, task, params=params, compile=False, engine="torch")
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        num_envs: int,
+        episode_seconds: float,
+        reward_scale: float,
+        curriculum: Curriculum = Curriculum(),
+        gamma: float = 1.0,
+    ):
+        """Makes the envs.
+
+        Args:
+            task: the task.
+            params: the robot.
+            num_envs: how many.
+            episode_seconds: duration of an episode, s.
+            reward_scale: factor of every reward.
+            curriculum: what is easier at first.
+            gamma: the learner's discount factor, for the curriculum's shaping.
+
+        Raises:
+            ValueError: the task has not what the curriculum asks for.
+        """
+        shorter = replace(task, duration=episode_seconds)
+        self._vector = BallbotVectorEnv(num_envs, shorter, params=params, compile=False, engine="torch")
+        self.batch = CurriculumBatch(shorter, num_envs, params, curriculum, gamma, full=task)
+        self._vector.batch = self.batch
         self._scale = np.float32(reward_scale)
         super().__init__(BallbotVecEnv(self._vector))
 
     def reset(self) -> np.ndarray:
         """Starts an episode in every env, with step counts that differ so that the episodes never end together."""
-        observation, batch = cast(np.ndarray, self.venv.reset()), self._vector.batch
+        observation, batch = cast(np.ndarray, self.venv.reset()), self.batch
         assert batch.state is not None
         steps = torch.arange(self.num_envs) * self._vector.task.steps // self.num_envs
         batch.state = batch.state._replace(steps=steps)
@@ -188,14 +233,15 @@ class TrainingEnv(VecEnvWrapper):
         observation, reward, done, infos = self.venv.step_wait()
         return cast(np.ndarray, observation), self._scale * reward, done, infos
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """State of every env: tensors."""
-        assert self._vector.batch.state is not None
-        return self._vector.batch.state._asdict()
+    def state_dict(self) -> dict[str, Any]:
+        """State of every env: tensors and plain values."""
+        assert self.batch.state is not None
+        return {"batch": self.batch.state._asdict(), "curriculum": self.batch.curriculum_state()}
 
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
-        self._vector.batch.state = BatchState(**state)
+        self.batch.state = BatchState(**state["batch"])
+        self.batch.load_curriculum_state(state["curriculum"])
 
 
 class Imitation:

@@ -9,7 +9,7 @@ What makes the tasks learnable, besides rewards that pay for living (see `ballbo
 - The actor sees a task's symmetries: in its frame, or averaged over its mirror images.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,18 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from ballbot_gym.batch import BallbotBatch, BatchState
+from ballbot_gym.batch import BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, spec_for
 from ballbot_train.learning.critics import CriticInputs, start_at, value_of_living
+from ballbot_train.learning.curricula import Curriculum, CurriculumBatch, without_arena
 from ballbot_train.learning.learners.model_free import ScopedRng
 from ballbot_train.learning.rsl import RslVecEnv
 from ballbot_train.policy import PolicyNetwork
 
-_GROUPS = {"actor": ["policy"], "critic": ["policy"]}
+_GROUPS = {"actor": ["policy"], "critic": ["critic"]}
 _RETAINED = 0.9  # of the averaged actor per iteration
 
 
@@ -80,6 +81,14 @@ class RslPpoConfig:
     """Range to which the ratio of new and old probability is clipped, about 1."""
     max_grad_norm: float = 1.0
     """Norm to which the gradients of actor and critic are clipped."""
+    curriculum: Curriculum = Curriculum()
+    """What training makes easier at first."""
+    arena: bool = True
+    """Whether leaving the arena fails in training. Evaluation keeps the arena."""
+    pay: bool = True
+    """Whether living pays in training. If not, the reward is minus the running cost. Evaluation is the same."""
+    failure_price: float = 300.0
+    """What a failure costs at once in training where living does not pay."""
 
 
 TUNED: dict[str, RslPpoConfig] = {
@@ -129,46 +138,87 @@ class _Raw(torch.nn.Module):
 
 
 class Critic(MLPModel):
-    """rsl_rl's model on an observation, in the task's frame if it has one, and on the products of its entries."""
+    """rsl_rl's model with a linear path beside the network, on the group "critic"."""
 
-    def __init__(
-        self, observations: TensorDict, hidden: tuple[int, ...], frame: str | None, products: bool, value: float
-    ):
+    def __init__(self, observations: TensorDict, hidden: tuple[int, ...], value: float):
         """Args: value: of every state at the start."""
-        self._seen = CriticInputs(observations["policy"].shape[-1], products, frame)
         super().__init__(observations, _GROUPS, "critic", 1, hidden, activation="tanh")
-        self.linear = torch.nn.Linear(self._seen.size, 1)
+        self.linear = torch.nn.Linear(observations["critic"].shape[-1], 1)
         start_at(value, self.linear, last_layer(self.mlp))
-
-    def _get_latent_dim(self) -> int:
-        return self._seen.size
-
-    def get_latent(self, obs: TensorDict, masks: Any = None, hidden_state: Any = None) -> torch.Tensor:
-        """(B, inputs) what the network sees."""
-        return self._seen(obs["policy"])
 
     def forward(self, obs: TensorDict, masks: Any = None, hidden_state: Any = None, **_: Any) -> torch.Tensor:
         """(B, 1) values."""
-        seen = self.get_latent(obs)
+        seen = obs["critic"]
         return self.mlp(seen) + self.linear(seen)
+
+
+class Storage(RolloutStorage):
+    """rsl_rl's storage, with mini-batches that are slices of one shuffled copy. Gathering each one anew costs more time."""
+
+    def mini_batch_generator(self, num_mini_batches: int, num_epochs: int = 8) -> Iterator[RolloutStorage.Batch]:
+        """Yields the mini-batches of all passes; every pass has the same ones, as in rsl_rl."""
+        samples = self.num_envs * self.num_transitions_per_env
+        size = samples // num_mini_batches
+        order = torch.randperm(samples, device=self.device)
+
+        def shuffled(values: torch.Tensor) -> torch.Tensor:
+            return values.flatten(0, 1).index_select(0, order)
+
+        observations = {name: shuffled(values) for name, values in self.observations.items()}
+        actions, values, returns = shuffled(self.actions), shuffled(self.values), shuffled(self.returns)
+        log_prob, advantages = shuffled(self.actions_log_prob), shuffled(self.advantages)
+        assert self.distribution_params is not None
+        distribution = tuple(shuffled(parameter) for parameter in self.distribution_params)
+        for _ in range(num_epochs):
+            for start in range(0, size * num_mini_batches, size):
+                part = slice(start, start + size)
+                yield RolloutStorage.Batch(
+                    observations=TensorDict({n: v[part] for n, v in observations.items()}, batch_size=[size]),
+                    actions=actions[part],
+                    values=values[part],
+                    advantages=advantages[part],
+                    returns=returns[part],
+                    old_actions_log_prob=log_prob[part],
+                    old_distribution_params=tuple(parameter[part] for parameter in distribution),
+                )
 
 
 class RslPpo:
     """The learner; see `training.Learner`."""
 
-    def __init__(self, task: Task, params: BallbotParams, config: RslPpoConfig, seed: int = 0):
-        """Raises a ValueError if the task does not have the symmetry that the settings ask for."""
+    def __init__(
+        self, task: Task, params: BallbotParams, config: RslPpoConfig, seed: int = 0, demos: Path | None = None
+    ):
+        """Args: demos: dataset of demonstrations on whose states episodes of the curriculum begin.
+
+        Raises:
+            ValueError: the task does not have what the settings ask for, or the demonstrations are of no use.
+        """
+        if demos is not None and not config.curriculum.starts_on_optima:
+            raise ValueError("rsl_ppo uses demonstrations only with --curriculum.starts-on-optima above 0")
         self.config, self.iteration = config, 0
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         torch.manual_seed(seed)
         self._random = ScopedRng()
         with self._random:
             shorter = replace(task, duration=config.episode_seconds)
-            self._env = RslVecEnv(BallbotBatch(shorter, config.num_envs, compile=False, params=params), seed)
+            self._batch = CurriculumBatch(
+                shorter if config.arena else without_arena(shorter),
+                config.num_envs,
+                params,
+                config.curriculum,
+                config.gamma,
+                demos,
+                full=task,
+                pay=config.pay,
+                failure_price=config.failure_price,
+            )
+            spec = spec_for(task, config.symmetry, config.hidden)
+            inputs = CriticInputs(len(task.observation_scale), config.products, spec.frame)
+            self._env = RslVecEnv(self._batch, seed, inputs)
             self._env.episode_length_buf = torch.randint(shorter.steps, (config.num_envs,))
             self._seen = seen = self._env.get_observations()
-            spec = spec_for(task, config.symmetry, config.hidden)
-            value = value_of_living(task, config.reward_scale, config.gamma)
+            value = value_of_living(task, config.reward_scale, config.gamma) if config.pay else 0.0
             self._actor = Actor(seen, PolicyNetwork(spec), config.std)
             with torch.no_grad():  # so that the first policy does next to nothing
                 last_layer(self._actor.network.mlp).weight.mul_(0.1)
@@ -176,8 +226,8 @@ class RslPpo:
             self._average.load_state_dict(self._actor.network.state_dict())
             self._ppo = PPO(
                 self._actor,
-                Critic(seen, config.critic_hidden, spec.frame, config.products, value),
-                RolloutStorage("rl", config.num_envs, config.num_steps, seen, (2,)),
+                Critic(seen, config.critic_hidden, value),
+                Storage("rl", config.num_envs, config.num_steps, seen, (2,)),
                 num_learning_epochs=config.update_epochs,
                 num_mini_batches=config.num_mini_batches,
                 clip_param=config.clip_range,
@@ -193,6 +243,11 @@ class RslPpo:
     def network(self) -> PolicyNetwork:
         """A running average of the actor over its last ten or so iterations."""
         return self._average
+
+    @property
+    def difficulty(self) -> dict[str, float]:
+        """How far the curriculum has come."""
+        return self._batch.difficulty
 
     def iterate(self) -> dict[str, float]:
         with self._random:
@@ -228,17 +283,19 @@ class RslPpo:
             "train/learning_rate": rate,
             "train/std": std,
             "train/env_steps": self.iteration * config.num_envs * config.num_steps,
+            **{f"curriculum/{name}": value for name, value in self.difficulty.items()},
         }
 
     def state_dict(self) -> dict[str, Any]:
-        assert self._env.batch.state is not None
+        assert self._batch.state is not None
         return {
             "iteration": self.iteration,
             "actor": self._actor.state_dict(),
             "critic": self._ppo.critic.state_dict(),
             "average": self._average.state_dict(),
             "optimizer": self._ppo.optimizer.state_dict(),
-            "batch": list(self._env.batch.state),
+            "batch": list(self._batch.state),
+            "curriculum": self._batch.curriculum_state(),
             "random": self._random.state_dict(),
         }
 
@@ -248,15 +305,16 @@ class RslPpo:
         self._ppo.critic.load_state_dict(state["critic"])
         self._average.load_state_dict(state["average"])
         self._ppo.optimizer.load_state_dict(state["optimizer"])
-        self._env.batch.state = BatchState(*state["batch"])
+        self._batch.state = BatchState(*state["batch"])
+        self._batch.load_curriculum_state(state["curriculum"])
         self._seen = self._env.get_observations()
         self._random.load_state_dict(state["random"])
 
 
 def make(task: Task, params: BallbotParams, config: RslPpoConfig, seed: int, demos: Path | None) -> RslPpo:
-    """Makes the learner; it uses no demonstrations.
+    """Makes the learner.
 
     Raises:
-        ValueError: the task does not have the symmetry that the settings ask for.
+        ValueError: the task does not have what the settings ask for, or the demonstrations are of no use.
     """
-    return RslPpo(task, params, config, seed)
+    return RslPpo(task, params, config, seed, demos)

@@ -1,0 +1,140 @@
+"""A second guess for optimizers: feedback under which the robot rights itself, simulated.
+
+Where a guessed path asks for leans and forces that the robot cannot have, optimizers do not converge. These guesses obey the
+dynamics and the force limit, because they are simulated. A cascade steers the ball to a point by its lean, and the lean by
+the force, which is clipped. A family of gains runs at once.
+
+The force limit is a square: along its diagonal there is √2 times the force of an axis. So a robot that falls along an axis
+recovers more cheaply, and from farther, if it also leans to the side. The episode that stays in the vertical plane of such a
+start is a saddle point: optimizers find it only slowly, and it is no optimum. Therefore most of the family first lean to
+one side of the fall.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballbot_baselines import guess
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+_LEAN_BANDWIDTHS = (7.0, 10.0, 14.0)  # rad/s, of the lean's loop
+_TIME_CONSTANTS = (1.0, 1.3, 1.8)  # s, of the ball's loop
+_SIDEWAYS = (0.1, 0.3, 0.6)  # rad: lean to the side at first
+_FADES = (0.3, 0.8)  # s, in which that lean fades
+_LARGEST_LEAN = 0.95  # rad, that the ball's loop asks for
+_UPRIGHT, _STEADY = 0.15, 1.0  # rad and rad/s: leans and lean rates of a robot that has righted itself
+
+
+@dataclass(frozen=True)
+class Member:
+    """One of the family's simulated episodes: states (n+1, 8), forces (n, 2), N, and what it costs.
+
+    `side` is the side of the fall to which it leans first, −1, 0 or 1. `righted` is the step after which it is upright.
+    """
+
+    side: int
+    x: np.ndarray
+    u: np.ndarray
+    cost: float
+    righted: int
+
+
+def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, force: float) -> list[Member]:
+    """The cheapest member for each side of the fall that rights the robot without violating a margin, if there is one.
+
+    Args:
+        task: gives cost, margins and the point to go to.
+        params: the robot.
+        x0: (8,) initial state.
+        c: (nc,) constants.
+        force: largest force per axis, N.
+    """
+    family = [(0.0, 0.3), *((sign * lean, fade) for lean in _SIDEWAYS for fade in _FADES for sign in (-1, 1))]
+    members = [
+        (bandwidth, seconds, lean, fade)
+        for bandwidth, seconds, (lean, fade) in itertools.product(_LEAN_BANDWIDTHS, _TIME_CONSTANTS, family)
+    ]
+    gains = np.array(members).T
+    with np.errstate(all="ignore"):  # members that fall may overflow, and are left out
+        x, u = _simulate(params, x0, gains, _target(task, x0, c, params), task.steps, task.control_dt, force)
+        margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in _margins(task, x, c)], axis=0)
+        safe = np.logical_and.accumulate(margins >= 0, axis=0)
+        costs = np.asarray(task.cost(x[:-1], u, c))
+        upright = (np.abs(x[..., 2:4]).max(-1) < _UPRIGHT) & (np.abs(x[..., 6:8]).max(-1) < _STEADY) & safe
+    found = []
+    for side in (1, -1, 0):
+        mine = np.flatnonzero((np.sign(gains[2]) == side) & upright.any(0))
+        # Members that stay safe to the end come first: they are whole episodes.
+        totals = [(not safe[-1, i], costs[:, i].sum() * task.control_dt, i) for i in mine]
+        if totals:
+            _, cost, i = min(totals)
+            last = len(u) if safe[-1, i] else int(np.argmax(upright[:, i]))
+            found.append(
+                Member(side, x[: last + 1, i], u[:last, i], float(cost), righted=int(np.argmax(upright[:, i])))
+            )
+    return found
+
+
+def guesses(task: Task, params: BallbotParams, member: Member, c: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """States (n+1, 8) and forces (n, 2) to start from.
+
+    They are the member itself where it is a whole episode to the task's point of rest. Else they are its righting, followed
+    by the first of the task's guessed paths from there.
+    """
+    if len(member.u) == task.steps and _has_point(task, member.x[0], c, params):
+        return [(member.x, member.u)]
+    k = member.righted
+    path = task.guess_paths(member.x[k], c, params)[0][: task.steps + 1 - k]
+    if len(path) < 2:
+        return []
+    x, u = guess.along_path(params, path, task.control_dt, start=member.x[k])
+    return [(np.concatenate([member.x[:k], x]), np.concatenate([member.u[:k], u]))]
+
+
+def _simulate(
+    params: BallbotParams,
+    x0: np.ndarray,
+    gains: np.ndarray,
+    target: np.ndarray,
+    steps: int,
+    dt: float,
+    force: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (steps+1, n, 8) and forces (steps, n, 2) of all members."""
+    bandwidth, seconds, lean, fade = (part[:, None] for part in gains)
+    falling = x0[2:4] + 0.2 * x0[6:8]  # rad: where the body leans, or is about to
+    size = np.hypot(*falling)
+    along = falling / size if size > 1e-9 else np.array([1.0, 0.0])
+    aside = lean * np.array([-along[1], along[0]])
+    h, mass = params.first_moment, params.total_mass
+    inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
+    x = np.tile(np.asarray(x0, np.float64), (gains.shape[1], 1))
+    states, forces = [x], []
+    for k in range(steps):
+        position, leans, speed, rate = x[:, :2] - target, x[:, 2:4], x[:, 4:6], x[:, 6:8]
+        wanted = np.arctan(-(2 / seconds * speed + position / seconds**2) / params.gravity)
+        wanted = np.clip(wanted, -_LARGEST_LEAN, _LARGEST_LEAN) + aside * np.exp(-k * dt / fade)
+        acceleration = -(bandwidth**2) * (leans - wanted) - 2 * bandwidth * rate
+        # of a body in a vertical plane: inertia · lean acceleration = h g sin(lean) − (h/M) F cos(lean)
+        u = (h * params.gravity * np.sin(leans) - inertia * acceleration) * mass / (h * np.cos(leans))
+        u = np.clip(u, -force, force)
+        forces.append(u)
+        x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
+        states.append(x)
+    return np.array(states), np.array(forces)
+
+
+def _has_point(task: Task, x0: np.ndarray, c: np.ndarray, params: BallbotParams) -> bool:
+    return not task.first_exit and len(task.reference(x0, c, params).x) == 1
+
+
+def _target(task: Task, x0: np.ndarray, c: np.ndarray, params: BallbotParams) -> np.ndarray:
+    """(2,) where to steer the ball: the task's point of rest, if it has one; else where the ball is."""
+    return task.reference(x0, c, params).x[-1, :2] if _has_point(task, x0, c, params) else np.array(x0[:2])
+
+
+def _margins(task: Task, x: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(np.asarray(margin) for margin in task.margins(x, c))

@@ -1,0 +1,131 @@
+"""The playground in real time: how well it keeps it, and whether its memory grows.
+
+    python benchmarks/playground.py --minutes 10
+
+NMPC runs beside a ghost, is pushed every few seconds, and a page that somebody watches is drawn 30 times per second. Run it
+on a quiet machine. Controllers are made, and solvers compiled, before time counts. A plan for the next episode is found every
+8 s in the background, and it counts. Exit status 1 says that the real-time factor is below 0.99, that more than 0.1 % of the
+steps began later than 20 ms after their time, or that memory grew by more than `--growth` MiB.
+"""
+
+import gc
+import math
+import multiprocessing
+import resource
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+
+from ballbot_gym import files
+from ballbot_gym.viewer import Viewer
+from ballbot_train.play.clock import LATE, Timing
+from ballbot_train.play.page import PlayPage
+from ballbot_train.play.playground import Playground
+
+_LEAST_FACTOR = 0.99
+_MOST_LATE = 0.001  # of the steps
+_PUSH_EVERY, _PUSH = 5.0, 8.0  # s, N·s
+_SETTLING = 10.0  # s, before memory is looked at first
+
+
+@dataclass(frozen=True)
+class Result:
+    """What was measured; times in s, memory in MiB."""
+
+    task: str
+    controller: str
+    ghosts: str
+    physics: str
+    seconds: float
+    steps: int
+    real_time_factor: float
+    late_percent: float
+    worst_lateness_ms: float
+    cpu_share: float
+    memory_before: float
+    memory_after: float
+    failures: int
+
+
+def memory() -> float:
+    """Memory that the process takes now, MiB."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+
+def watch(port: int) -> None:
+    """Receives what a browser would, in a process of its own."""
+    import viser
+    from websockets.sync.client import connect
+
+    with connect(f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as client:
+        while True:
+            client.recv()
+
+
+def measure(
+    minutes: float = 10.0,
+    task: str = "stabilize",
+    controller: str = "nmpc",
+    ghosts: tuple[str, ...] = ("lqr",),
+    physics: str = "bullet",
+    growth: float = 20.0,
+    out: Path = Path("runs/playground"),
+) -> None:
+    """Runs the playground and writes playground.csv.
+
+    Args:
+        minutes: how long.
+        task: name of a task.
+        controller: of the robot.
+        ghosts: controllers beside it.
+        physics: "bullet" or "rk4".
+        growth: MiB that memory may grow.
+        out: folder of playground.csv.
+    """
+    playground = Playground(task, controller, ghosts, physics, episode=0)
+    viewer = Viewer(port=0)
+    page = PlayPage(playground, viewer, out)
+    watcher = multiprocessing.get_context("spawn").Process(target=watch, args=(viewer.port,), daemon=True)
+    watcher.start()
+    playground.settle()
+    page.run(_SETTLING)  # solvers, caches and buffers are there from now on
+    page.clock.timing = Timing()
+    before, began, cpu = memory(), time.perf_counter(), time.process_time()
+    end, count = began + 60 * minutes, 0
+    while (left := end - time.perf_counter()) > 0:
+        page.run(min(_PUSH_EVERY, left))
+        count += 1
+        playground.push(_PUSH * math.cos(count), _PUSH * math.sin(count))
+    seconds, timing = time.perf_counter() - began, page.clock.timing
+    result = Result(
+        task=task,
+        controller=controller,
+        ghosts=" ".join(ghosts),
+        physics=physics,
+        seconds=seconds,
+        steps=timing.steps,
+        real_time_factor=timing.real_time_factor,
+        late_percent=100 * timing.late_share,
+        worst_lateness_ms=1e3 * timing.worst,
+        cpu_share=(time.process_time() - cpu) / seconds,
+        memory_before=before,
+        memory_after=memory(),
+        failures=sum(score.failure != "" for score in playground.scores),
+    )
+    watcher.terminate()
+    page.close()
+    viewer.close()
+    playground.close()
+    for name, value in asdict(result).items():
+        print(f"{name:>18}: {value:.4g}" if isinstance(value, float) else f"{name:>18}: {value}")
+    print(f"late is more than {1e3 * LATE:g} ms; table: {files.write_csv(out / 'playground.csv', [asdict(result)])}")
+    grew = result.memory_after - result.memory_before > growth
+    sys.exit(result.real_time_factor < _LEAST_FACTOR or result.late_percent > 100 * _MOST_LATE or grew)
+
+
+if __name__ == "__main__":
+    tyro.cli(measure)

@@ -1,0 +1,446 @@
+"""The playground's simulation, which knows nothing of pages."""
+
+import math
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballbot_baselines import CONTROLLERS, find_optimum
+from ballbot_gym import certified
+from ballbot_gym.env import BallbotEnv
+from ballbot_gym.rollout import rollout
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.play.background import Background
+from ballbot_train.play.clock import LATE, Clock
+from ballbot_train.play.driving import DRIVE_SPEED, Stick
+from ballbot_train.play.playground import LARGEST_PUSH, PLANT, Playground
+from ballbot_train.play.tunable import Tunable, weight_names
+
+STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
+
+
+@pytest.fixture
+def play():
+    opened = []
+
+    def open_playground(*arguments, **keywords):
+        playground = Playground(*arguments, **{"controller": "lqr", "physics": "rk4", "episode": STANDING} | keywords)
+        opened.append(playground)
+        playground.settle()
+        playground.step()
+        return playground
+
+    yield open_playground
+    for playground in opened:
+        playground.close()
+
+
+def go(playground, seconds):
+    for _ in range(round(seconds / playground.task.control_dt)):
+        assert playground.step()
+
+
+# --- the episode ---
+
+
+@pytest.mark.parametrize("episode", [STANDING, FALLING])
+def test_an_episode_without_pushes_costs_what_the_env_says(play, episode):
+    playground = play(episode=episode)
+    env = BallbotEnv("stabilize", physics="rk4")
+    controller = CONTROLLERS["lqr"](env.task, env.params)
+    expected = rollout(env, controller, options=certified.load("stabilize").options(episode))
+    while not playground.scores:
+        playground.step()
+    (score,) = playground.scores
+    assert score.cost == pytest.approx(expected.cost, rel=1e-9)
+    assert (score.failure != "") == expected.failure
+    assert score.seconds == pytest.approx(expected.trajectory.duration)
+
+
+def test_the_optimum_costs_what_is_certified(play):
+    playground = play()
+    assert playground.optimum_cost == pytest.approx(certified.load("stabilize").costs[STANDING], rel=1e-4)
+    early = playground.optimum_cost_so_far
+    go(playground, 1.0)
+    assert 0 < early < playground.optimum_cost_so_far < playground.optimum_cost
+
+
+def test_a_push_makes_the_robot_lean(play):
+    playground = play()
+    go(playground, 7.0)
+    before = playground.main.samples[-1].tilt
+    playground.push(10.0, 0.0)
+    go(playground, 0.2)
+    assert before < math.radians(0.5)
+    assert max(sample.tilt for sample in list(playground.main.samples)[-10:]) > math.radians(5)
+    assert playground.drawing().robots[-1].push is not None
+
+
+def test_ghosts_get_the_same_start_and_the_same_pushes(play):
+    playground = play(controller="you", ghosts=["lqr"])
+    alone = play(controller="lqr")
+    for each in (playground, alone):
+        each.push(3.0, -2.0)
+        go(each, 0.5)
+    ghost, main = playground._runners["lqr"], alone.main
+    np.testing.assert_array_equal(ghost.x, main.x)
+    assert playground.main.x != ghost.x
+
+
+def test_a_ghost_that_is_added_begins_where_the_robot_is(play):
+    playground = play()
+    go(playground, 0.5)
+    here = playground.main.x
+    playground.set_ghosts(["you"])
+    assert playground._runners["you"].x == here
+    playground.settle()
+    go(playground, 0.1)
+    assert playground.ghosts == ("you",)
+
+
+def test_controllers_change_without_a_jump(play):
+    playground = play()
+    go(playground, 0.5)
+    states = [playground.main.x]
+    for name in ("you", "lqr"):
+        playground.set_controller(name)
+        assert playground.step()  # under the old one
+        states.append(playground.main.x)
+        playground.settle()
+        go(playground, 0.02)
+        states.append(playground.main.x)
+        assert playground.main.name == playground.controller == name
+    steps = np.abs(np.diff([state[:2] for state in states], axis=0)).max()
+    assert steps < 0.02 * 8  # m: a control step at less than 8 m/s
+    assert len(playground.trajectory().u) > 25  # one episode all along
+
+
+def test_after_an_episode_the_robot_goes_on_where_it_is(play):
+    playground = play()
+    go(playground, 7.9)
+    before = np.array(playground.main.x)
+    go(playground, 0.2)
+    assert len(playground.scores) == 1
+    assert playground.seconds < 0.2
+    assert np.abs(np.array(playground.main.x) - before)[:2].max() < 0.05
+
+
+def test_after_a_fall_the_same_episode_begins_again(play):
+    playground = play(episode=FALLING)
+    go(playground, 0.5)
+    assert playground.ended
+    assert "fell after 0.4 s" in playground.status()
+    fallen = playground.main.x
+    go(playground, 1.0)
+    assert playground.main.x == fallen
+    for _ in range(40):
+        playground.step()
+    playground.settle()
+    assert playground.step()
+    assert not playground.ended
+    assert playground.episode == FALLING
+
+
+def test_next_begins_the_next_certified_episode(play):
+    playground = play(episode=FALLING)
+    playground.at_end = "next"
+    for _ in range(110):
+        playground.step()
+    assert playground.episode == FALLING + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
+    playground = play(task, controller="nmpc", ghosts=["trajopt"], episode=0)
+    for _ in range(1000):
+        playground.settle()
+        playground.step()
+    assert playground.notice == ""
+    assert all(score.failure == "" for score in playground.scores)
+    assert playground.drawing().paths[-1].name in ("plan", "robot")
+
+
+# --- what the user changes ---
+
+
+def test_lqr_reacts_to_a_weight(play):
+    playground = play()
+    before = playground.main.controller.act(0.0, np.ones(8))
+    playground.set_weight("effort_weight", 5e-3)
+    playground.settle()
+    after = playground.main.controller.act(0.0, np.ones(8))
+    assert np.abs(after).max() < 0.9 * np.abs(before).max()
+    playground.set_weight("effort_weight", playground.base.effort_weight)
+    playground.settle()
+    np.testing.assert_allclose(playground.main.controller.act(0.0, np.ones(8)), before)
+
+
+def test_the_cost_so_far_is_counted_with_the_new_weights(play):
+    playground = play()
+    go(playground, 0.5)
+    before = playground.main.cost
+    for name in weight_names(playground.base):
+        playground.set_weight(name, 2 * getattr(playground.base, name))
+    assert playground.main.cost == pytest.approx(2 * before)
+
+
+def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
+    playground = play()
+    gain = playground.main.controller.act(0.0, np.ones(8))
+    playground.set_plant("mass", 50.0)
+    playground.set_plant("delay", 40.0)
+    assert playground.main._disturbance.params.body_mass == pytest.approx(1.5 * playground.params.body_mass)
+    np.testing.assert_array_equal(playground.main.controller.act(0.0, np.ones(8)), gain)
+    go(playground, 0.02)
+    assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
+
+
+def test_every_hidden_change_can_go_to_both_ends_while_the_robot_moves(play):
+    playground = play(episode=STANDING)
+    for stress, span in PLANT.items():
+        for severity in (span.low, span.high, 0.0):
+            playground.set_plant(stress, severity)
+            go(playground, 0.04)
+    assert playground.notice == ""
+    assert playground._randomization.active is False
+
+
+def test_a_human_drives_the_robot_that_balances_itself(play):
+    playground = play(controller="you")
+    go(playground, 2.0)
+    playground.stick.move(1.0, 0.0)
+    go(playground, 3.0)
+    assert playground.main.x[4] == pytest.approx(DRIVE_SPEED, rel=0.05)
+    assert abs(playground.main.x[5]) < 0.1
+
+
+def test_the_score_of_a_human_is_a_regret(play):
+    playground = play(controller="you (force)", episode=0)
+    while not playground.scores:
+        playground.step()
+    (score,) = playground.scores
+    assert score.failure == "tilt"
+    assert score.regret == pytest.approx(score.cost / playground.optimum_cost - 1)
+
+
+def test_a_stick_reaches_no_farther_than_one():
+    stick = Stick()
+    stick.move(30.0, 40.0)
+    assert stick.value == pytest.approx((0.6, 0.8))
+    stick.move(math.nan, 1.0)
+    assert stick.value == (0.0, 0.0)
+
+
+def test_another_task_keeps_the_controllers_that_it_has(play):
+    playground = play(controller="lqr", ghosts=["you"])
+    playground.set_task("orbit")
+    playground.settle()
+    assert playground.step()
+    assert (playground.task_name, playground.controller, playground.ghosts) == ("orbit", "lqr", ("you",))
+
+
+# --- bad input ---
+
+
+@pytest.mark.parametrize("push", [(math.nan, 0.0), (math.inf, 1.0), (1e300, 1e300), (-1e9, 0.0), (0.0, 0.0)])
+def test_no_push_harms(play, push):
+    playground = play()
+    playground.push(*push)
+    go(playground, 0.1)
+    assert np.isfinite(playground.main.x).all()
+    assert (
+        np.hypot(*playground.main.x[4:6]) < 8 + LARGEST_PUSH
+    )  # m/s: every kilogram that is pushed weighs more than 1 kg
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p.set_task("dance"), "unknown task 'dance'"),
+        (lambda p: p.set_robot("teapot"), "unknown robot 'teapot'"),
+        (lambda p: p.set_controller("nobody"), "unknown controller 'nobody'"),
+        (lambda p: p.set_controller("nowhere/policy.json"), "unknown controller"),
+        (lambda p: p.set_ghosts(["nobody"]), "unknown controller 'nobody'"),
+        (lambda p: p.set_weight("nothing", 1.0), "unknown weight 'nothing'"),
+        (lambda p: p.set_weight("effort_weight", math.nan), "effort_weight must be"),
+        (lambda p: p.set_weight("effort_weight", -1.0), "effort_weight must be"),
+        (lambda p: p.set_plant("mass", math.nan), "mass must be -50 to 100"),
+        (lambda p: p.set_plant("mass", 1e9), "mass must be -50 to 100"),
+        (lambda p: p.set_plant("weather", 1.0), "unknown change 'weather'"),
+        (lambda p: p.start_certified(200), "episode must be 0 to 199, not 200"),
+    ],
+)
+def test_wrong_input_is_refused_and_the_robot_goes_on(play, change, message):
+    playground = play()
+    with pytest.raises(ValueError, match=message):
+        change(playground)
+    go(playground, 0.1)
+    assert playground.notice == ""
+
+
+def test_a_controller_that_fails_gives_no_force_and_is_named(play):
+    playground = play()
+
+    class Broken:
+        def act(self, t, x):
+            return np.array([math.nan, 0.0])
+
+    playground.main.take_controller(Broken(), 0)
+    go(playground, 0.02)
+    assert playground.main.force == (0.0, 0.0)
+    assert "LQR" in playground.notice
+
+
+def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
+    playground = play()
+    monkeypatch.setitem(CONTROLLERS, "trajopt", lambda task, params: (_ for _ in ()).throw(RuntimeError("no way")))
+    playground.set_controller("trajopt")
+    playground.settle()
+    assert playground.controller == playground.main.name == "lqr"  # the old one stays
+    assert "no way" in playground.notice
+    playground._wanted["main"] = "trajopt"
+    playground.restart()
+    playground.settle()
+    assert playground.step()
+    assert playground.main.name == "lqr"
+    assert "LQR does instead" in playground.notice
+
+
+# --- what is kept ---
+
+
+def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
+    playground = play(ghosts=["you"])
+    go(playground, 0.5)
+    path = playground.trajectory().save(tmp_path / "played.npz")
+    np.testing.assert_array_equal(Trajectory.load(path).x[-1], playground.main.x)
+    replay = playground.replay()
+    assert [take.label for take in replay.takes] == ["LQR", "you"]
+    command = playground.optimize_command().split()
+    assert command[:4] == ["ballbot", "optimize", "stabilize", "--state"]
+    assert [float(value) for value in command[4:]] == pytest.approx(playground.main.x, rel=1e-8)
+
+
+def test_the_history_that_is_plotted_stays_short(play):
+    playground = play(ghosts=["you"])
+    go(playground, 9.0)
+    history = playground.history(200)
+    assert len(history.seconds) == 200
+    assert (np.diff(history.seconds) > 0).all()
+    assert all(np.isfinite(line).all() and line.shape == (200, 4) for line in history.lines.values())
+    assert len(playground.main.trace) == 400
+
+
+# --- weights as constants ---
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_tunable_task_costs_what_the_task_with_these_weights_costs(task, params, rng):
+    base = TASKS[task]()
+    name = weight_names(base)[0]
+    heavier = replace(base, **{name: 3 * getattr(base, name)})
+    tunable = Tunable.of(base)
+    x, c = base.sample(rng, params)
+    u = rng.uniform(-100, 100, 2)
+    full = tunable.constants(c, {name: getattr(heavier, name)})
+    assert tunable.cost(x, u, full) == pytest.approx(heavier.cost(x, u, c))
+    assert tunable.cost(tuple(x), tuple(u), tuple(full)) == pytest.approx(heavier.cost(x, u, c))
+    assert tunable.margins(x, full) == pytest.approx(base.margins(x, c))
+    np.testing.assert_array_equal(tunable.observe(x, full), base.observe(x, c))
+    assert tunable.steps == base.steps
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_the_optimum_of_a_tunable_task_is_that_of_the_task(task, params, rng):
+    base = TASKS[task]()
+    tunable = Tunable.of(base)
+    x, c = base.sample(rng, params)
+    assert find_optimum(tunable, params, x, tunable.constants(c, {})).cost == pytest.approx(
+        find_optimum(base, params, x, c).cost, rel=1e-6
+    )
+
+
+# --- time ---
+
+
+class Watch:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_steps_come_at_their_times():
+    watch = Watch()
+    clock = Clock(0.02, now=watch)
+    taken = []
+    for _ in range(500):
+        while clock.take():
+            taken.append(watch.now)
+        watch.now += 0.0013
+    assert len(taken) == math.ceil(500 * 0.0013 / 0.02)
+    assert clock.timing.late == 0
+    assert clock.timing.worst <= 0.0013
+    assert clock.timing.real_time_factor == 1.0
+
+
+def test_a_short_hold_up_is_caught_up_and_a_long_one_is_given_up():
+    watch = Watch()
+    clock = Clock(0.02, now=watch)
+    assert clock.take()
+    watch.now += 0.1
+    assert sum(clock.take() for _ in range(50)) == 5
+    assert clock.timing.late == 4  # those due 0.08, 0.06, 0.04 s ago, and the one due 0.02 s ago to rounding
+    assert clock.timing.real_time_factor == 1.0
+    watch.now += 10.0
+    assert sum(clock.take() for _ in range(50)) == 1
+    assert clock.timing.real_time_factor < 0.05
+    assert LATE == 0.02
+
+
+def test_speed_stretches_time_and_a_pause_owes_no_steps():
+    watch = Watch()
+    clock = Clock(0.02, speed=0.5, now=watch)
+    clock.take()
+    watch.now += 0.03
+    assert not clock.take()
+    assert clock.wait() == pytest.approx(0.01)
+    clock.stop()
+    watch.now += 100.0
+    assert clock.take()
+    assert not clock.take()
+
+
+def test_the_background_does_only_the_last_job_of_a_key():
+    background, started, hold, done = Background(), threading.Event(), threading.Event(), []
+    background.submit("slow", lambda: (started.set(), hold.wait(5)))
+    assert started.wait(5)
+    for i in range(5):
+        background.submit("slider", lambda i=i: done.append(i) or i)
+    background.submit("gone", lambda: done.append("gone"))
+    background.cancel("gone")
+    assert background.pending("slider")
+    hold.set()
+    assert background.wait(5)
+    finished = background.finished()
+    assert finished["slider"] == 4
+    assert done == [4]
+    assert background.finished() == {}
+    background.close()
+
+
+def test_a_job_that_raises_gives_its_error():
+    background = Background()
+    background.submit("bad", lambda: 1 / 0)
+    assert background.wait(5)
+    assert isinstance(background.finished()["bad"], ZeroDivisionError)
+    background.close()
+    background.close()
+    time.sleep(0)

@@ -1,0 +1,189 @@
+"""Saved models of other libraries: they act as their libraries make them act, and nothing in their files is executed."""
+
+import io
+import json
+import pickle
+import zipfile
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from rsl_rl.models import MLPModel
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from tensordict import TensorDict
+
+import ballbot_gym  # noqa: F401
+from ballbot_gym.env import make_task
+from ballbot_train import save_vecnormalize
+from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
+from ballbot_train.evaluation.evaluate import Predictor, evaluate
+from ballbot_train.evaluation.fresh import evaluate_fresh
+from ballbot_train.policy_files import PolicyError
+from ballbot_train.saved_models import load_actor, statistics_of
+
+TASK = make_task("stabilize")
+OBSERVATIONS = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
+
+
+def envs():
+    return DummyVecEnv([lambda: gymnasium.make("BallbotStabilize-v0", physics="rk4")])
+
+
+def acts(path):
+    with torch.no_grad():
+        return load_actor(path, TASK)(torch.as_tensor(OBSERVATIONS)).numpy()
+
+
+def louder(model):
+    """The model with larger outputs, so that squashing and clipping show."""
+    with torch.no_grad():
+        for name, part in model.policy.named_parameters():
+            if "action_net" in name or "mu" in name:
+                part.mul_(100)
+    return model
+
+
+MODELS = {
+    "ppo": lambda: PPO("MlpPolicy", envs(), device="cpu"),
+    "relu": lambda: PPO("MlpPolicy", envs(), policy_kwargs={"net_arch": [7, 5], "activation_fn": torch.nn.ReLU}),
+    "gsde": lambda: PPO("MlpPolicy", envs(), use_sde=True, policy_kwargs={"squash_output": True}, device="cpu"),
+    "sac": lambda: SAC("MlpPolicy", envs(), buffer_size=10, device="cpu"),
+    "sac_gsde": lambda: SAC("MlpPolicy", envs(), buffer_size=10, use_sde=True, policy_kwargs={"clip_mean": 1.0}),
+    "td3": lambda: TD3("MlpPolicy", envs(), buffer_size=10, policy_kwargs={"net_arch": [6]}, device="cpu"),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_saved_model_acts_as_the_model(name, tmp_path):
+    model = louder(MODELS[name]())
+    model.save(tmp_path / "model.zip")
+    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
+    assert np.abs(expected).max() > 0.5
+    np.testing.assert_allclose(acts(tmp_path / "model.zip"), np.clip(expected, -1, 1), atol=1e-5)
+
+
+@pytest.fixture
+def normalized(tmp_path):
+    venv = VecNormalize(envs(), clip_obs=2.0)
+    model = PPO("MlpPolicy", venv, n_steps=8, batch_size=8, n_epochs=1, device="cpu").learn(16)
+    path = tmp_path / "model.zip"
+    louder(model).save(path)
+    return model, path
+
+
+def test_statistics_of_vecnormalize_are_applied(normalized):
+    model, path = normalized
+    save_vecnormalize(model.get_vec_normalize_env(), path)
+    expected = Predictor(model)(OBSERVATIONS, begins=True)
+    np.testing.assert_allclose(acts(path), np.clip(expected, -1, 1), atol=1e-5)
+    before = policy_digests({"stabilize": [str(path)]})
+    statistics_of(path).write_bytes(b"other")
+    assert policy_digests({"stabilize": [str(path)]}) != before
+
+
+def test_statistics_that_normalize_rewards_alone_change_no_observation(normalized):
+    model, path = normalized
+    venv = model.get_vec_normalize_env()
+    venv.norm_obs = False
+    save_vecnormalize(venv, path.with_suffix(""))
+    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
+    np.testing.assert_allclose(acts(path), np.clip(expected, -1, 1), atol=1e-5)
+
+
+def test_a_model_whose_statistics_are_missing_is_refused_with_how_to_write_them(normalized):
+    _, path = normalized
+    with pytest.raises(PolicyError, match=r"was trained with VecNormalize, and .*save_vecnormalize"):
+        acts(path)
+
+
+def checkpoint(path, **options):
+    seen = TensorDict({"policy": torch.as_tensor(OBSERVATIONS)}, batch_size=[50])
+    model = MLPModel(seen, {"actor": ["policy"]}, "actor", 2, (16, 8), **options)
+    model.update_normalization(seen)
+    torch.save({"actor_state_dict": model.state_dict(), "iter": 3, "infos": None}, path)
+    model.eval()
+    return model(seen).detach().clamp(-1, 1).numpy()
+
+
+def test_a_checkpoint_of_rsl_rl_acts_as_its_actor(tmp_path):
+    gaussian = {"class_name": "rsl_rl.modules.distribution:GaussianDistribution", "init_std": 1.0}
+    path = tmp_path / "model_3.pt"
+    expected = checkpoint(path, activation="elu", obs_normalization=True, distribution_cfg=gaussian)
+    with pytest.raises(PolicyError, match=r'does not name its activation; write .*model_3.json with {"activation"'):
+        acts(path)
+    path.with_suffix(".json").write_text('{"activation": "elu"}')
+    np.testing.assert_allclose(acts(path), expected, atol=1e-5)
+
+
+def test_a_saved_model_is_evaluated_by_its_path(tmp_path):
+    path = tmp_path / "model.zip"
+    MODELS["ppo"]().save(path)
+    assert controllers_of(["turn", "stabilize"], [str(path)]) == {"stabilize": [str(path)]}
+    assert evaluate(path, "stabilize", 1, "rk4").episodes == 1
+    assert len(evaluate_fresh(path, "stabilize", 3)) == 3
+    with pytest.raises(ValueError, match="was made for a task with 8 observations, which is none of turn"):
+        controllers_of(["turn"], [str(path)])
+    with pytest.raises(PolicyError, match="takes 8 observations, BallbotTurn-v0 has 9"):
+        load_actor(path, make_task("turn"))
+
+
+class Bomb:
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+def rewritten(path, change):
+    """The model with one member of its archive changed."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def with_data(**changes):
+    def change(members):
+        members["data"] = json.dumps(json.loads(members["data"]) | changes).encode()
+
+    return change
+
+
+def bombed(members):
+    members["policy.pth"] = pickle.dumps({"action_net.weight": Bomb()})
+
+
+def scaled(members):
+    weights = torch.load(io.BytesIO(members["policy.pth"]), weights_only=True)
+    weights["action_net.weight"][0, 0] = float("nan")
+    buffer = io.BytesIO()
+    torch.save(weights, buffer)
+    members["policy.pth"] = buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (bombed, "is no saved model that can be read"),
+        (scaled, "holds NaN or infinity"),
+        (lambda members: members.pop("data"), "it holds no data"),
+        (lambda members: members.update(data=b"{}"), "is no saved model that can be read"),
+        (with_data(policy_class={"__module__": "mine"}), "has a policy of mine, which is not read; give a model with"),
+        (with_data(policy_kwargs={"features_extractor_class": "x"}), "extracts features"),
+        (with_data(policy_kwargs={"activation_fn": "<class 'Mish'>"}), "has the activation <class 'Mish'>; known: elu"),
+    ],
+)
+def test_models_that_are_damaged_or_of_another_kind_are_refused(change, message, tmp_path, capsys):
+    path = tmp_path / "model.zip"
+    PPO("MlpPolicy", envs(), policy_kwargs={"net_arch": [4]}, device="cpu").save(path)
+    rewritten(path, change)
+    with pytest.raises(PolicyError, match=message):
+        acts(path)
+    assert "executed" not in capsys.readouterr().out
+
+
+def test_only_a_vecnormalize_of_plain_observations_is_saved(tmp_path):
+    with pytest.raises(TypeError, match="give a VecNormalize of plain observations"):
+        save_vecnormalize(envs(), tmp_path / "model.zip")

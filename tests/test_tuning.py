@@ -1,0 +1,166 @@
+"""The search of hyperparameters: it finds the better settings, goes on after a kill, and writes what tools read."""
+
+import csv
+import json
+from dataclasses import replace
+
+import pytest
+
+pytest.importorskip("optuna")
+
+from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.tune import tune
+from ballbot_train.learning import tuning
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.training import Score, Validation
+from ballbot_train.learning.tuning import SPACES, Choice, Outcome, Range, Search, settings_of, zoo_yaml
+
+
+@pytest.mark.parametrize("learner", SPACES)
+@pytest.mark.parametrize("task", TASKS)
+def test_the_tuned_settings_lie_in_the_space_that_is_searched(learner, task):
+    settings = LEARNERS[learner].settings(task)
+    for name, domain in SPACES[learner].items():
+        value = getattr(settings, name)
+        inside = domain.low <= value <= domain.high if isinstance(domain, Range) else value in domain.values
+        assert inside, (name, value)
+
+
+def test_a_training_has_the_env_steps_that_are_asked_for():
+    search = Search("ppo", "stabilize", (0,), 500_000, 4)
+    settings = settings_of(search, {"num_steps": 64})
+    assert settings.rl_iterations * settings.num_envs * 64 == pytest.approx(500_000, rel=0.01)
+    assert settings.evaluations == 4
+
+
+class Fake:
+    """A learner that gets better with every iteration, the more so the nearer its learning rate is to 1e-3."""
+
+    def __init__(self, settings, seed):
+        self.iteration, self.iterations = 0, settings.rl_iterations
+        self._off = abs(settings.learning_rate - 1e-3) * 1000 + 0.01 * seed
+
+    def iterate(self):
+        self.iteration += 1
+
+    @property
+    def network(self):
+        return 1 + self._off + 1 / self.iteration
+
+
+@pytest.fixture
+def fakes(monkeypatch):
+    made = []
+
+    def make(self, task, params, settings, seed, demos):
+        made.append(settings)
+        if settings.batch_size == 2048:
+            raise ValueError("not finite")
+        return Fake(settings, seed)
+
+    monkeypatch.setattr(type(LEARNERS["ppo"]), "make", make)
+    monkeypatch.setattr(tuning.training, "validate", lambda network, task: Validation(network, 1.0, 0, network))
+    monkeypatch.setattr(tuning.training, "score", lambda network, task: Score(network, 0.1, 0.1, 1.0, 0))
+    space = {"learning_rate": Range(1e-4, 5e-3), "batch_size": Choice((512, 1024, 2048))}
+    space["hidden"] = Choice(((64, 64), (128, 128)))
+    monkeypatch.setitem(tuning.SPACES, "ppo", space)
+    monkeypatch.setattr(tuning, "_STARTUP_TRIALS", 2)
+    return made
+
+
+SEARCH = Search("ppo", "stabilize", (0, 1), 100_000, 3)
+
+
+def trials(folder):
+    with open(folder / "trials.csv") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_search_starts_with_the_tuned_settings_and_keeps_the_best(fakes, tmp_path):
+    best = tuning.run(SEARCH, 10, tmp_path)
+    rows = trials(tmp_path)
+    assert len(rows) == 10
+    assert float(rows[0]["learning_rate"]) == LEARNERS["ppo"].settings("stabilize").learning_rate
+    finished = [float(row["cost"]) for row in rows if row["state"] == "complete"]
+    assert best["validation_cost"] == pytest.approx(min(finished))
+    assert json.loads((tmp_path / "best.json").read_text()) == json.loads(json.dumps(best))
+    assert len(best["costs"]) == len(best["seeds"]) == 2
+    assert {"complete", "pruned"} <= {row["state"] for row in rows}
+    for row in rows:
+        assert (row["error"] != "") == (row["state"] == "fail")
+        assert row["state"] != "complete" or float(row["cost_spread"]) == pytest.approx(0.01, abs=1e-3)
+    with open(tmp_path / "importances.csv") as file:
+        assert {row["setting"] for row in csv.DictReader(file)} <= set(tuning.SPACES["ppo"])
+
+
+def test_a_killed_search_goes_on_with_the_trial_that_was_running(fakes, tmp_path, monkeypatch):
+    tuning.run(SEARCH, 2, tmp_path)
+
+    def killed(*arguments):
+        fakes.append("killed")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tuning, "outcome_of", killed)
+        with pytest.raises(KeyboardInterrupt):
+            tuning.run(SEARCH, 4, tmp_path)
+    before = len(fakes)
+    tuning.run(SEARCH, 4, tmp_path)
+    assert len(trials(tmp_path)) == 4
+    asked = tuning.open_study(SEARCH, tmp_path).trials
+    interrupted = next(trial for trial in asked if "interrupted" in trial.user_attrs)
+    again = asked[interrupted.number + 1]
+    assert again.params == interrupted.params
+    assert fakes[before].learning_rate == pytest.approx(interrupted.params["learning_rate"])
+
+
+def test_another_search_is_not_mixed_into_a_folder(fakes, tmp_path):
+    tuning.run(SEARCH, 1, tmp_path)
+    with pytest.raises(ValueError, match="env_steps"):
+        tuning.run(replace(SEARCH, env_steps=5), 2, tmp_path)
+
+
+@pytest.mark.parametrize("learner", ["ppo", "sac"])
+def test_the_file_for_rl_zoo3_has_the_four_ids(learner):
+    yaml = pytest.importorskip("yaml")
+    read = yaml.safe_load(zoo_yaml(learner, {task: LEARNERS[learner].settings(task) for task in TASKS}))
+    assert list(read) == [task.id for task in TASKS.values()]
+    for settings in read.values():
+        assert settings["policy"] == "MlpPolicy"
+        assert isinstance(settings["n_timesteps"], int)
+        assert settings["learning_rate"].startswith("lin_")
+        assert settings["policy_kwargs"].startswith("dict(net_arch=[")
+
+
+def test_a_learner_without_a_space_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no search space for bc; there is one for ppo"):
+        tuning.run(replace(SEARCH, learner="bc"), 1, tmp_path)
+
+
+def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, capsys):
+    tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path)
+    printed = capsys.readouterr().out
+    assert "ballbot train ppo --task stabilize" in printed
+    assert (tmp_path / "ppo.yml").exists()
+
+
+def test_real_trainings_have_an_outcome_per_seed(monkeypatch):
+    class Trial:
+        def report(self, value, step):
+            pass
+
+        def should_prune(self):
+            return False
+
+    tiny = {
+        "num_envs": 4,
+        "num_steps": 4,
+        "hidden": (4,),
+        "critic_hidden": (4,),
+        "num_mini_batches": 2,
+        "update_epochs": 1,
+    }
+    search = Search("rsl_ppo", "stabilize", (0, 1), 32, 1)
+    outcome = tuning.outcome_of(search, settings_of(search, tiny), Trial())
+    assert isinstance(outcome, Outcome)
+    assert len(set(outcome.costs)) == 2

@@ -1,0 +1,61 @@
+"""`ballbot play`: a live playground in the browser."""
+
+from pathlib import Path
+from typing import Literal
+
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.viewer import HOST, PORT, Viewer, import_viser
+from ballbot_train.console import check_names, console
+from ballbot_train.play.gate import Gate
+from ballbot_train.play.page import PlayPage
+from ballbot_train.play.playground import Playground
+
+_LOCAL = ("127.0.0.1", "localhost", "::1")
+
+
+def play(
+    task: str = "stabilize",
+    /,
+    controller: str = "nmpc",
+    ghosts: tuple[str, ...] = ("lqr",),
+    episode: int | None = 0,
+    physics: Literal["bullet", "rk4"] | None = None,
+    robot: str = "paper",
+    seed: int = 0,
+    host: str = HOST,
+    port: int = PORT,
+    out: Path = Path("runs/play"),
+) -> None:
+    """Opens a page on which you push the robot, change it, drive it, and compare controllers.
+
+    Args:
+        task: name of a task.
+        controller: of the robot: an expert, a shipped policy, a policy's .json, "you" or "you (force)".
+        ghosts: controllers that get the same start and the same pushes beside it.
+        episode: index of the certified episode it starts with; None for a random start.
+        physics: "bullet" or "rk4"; default, bullet where PyBullet is installed.
+        robot: name of a robot.
+        seed: of random starts, noise and pushes.
+        host: address to bind. Everybody but this machine needs the token that is printed.
+        port: where the page is; the next free one, if it is taken.
+        out: folder of saved files.
+    """
+    check_names("task", [task], TASKS)
+    import_viser()
+    playground = Playground(task, controller, ghosts, physics, episode, seed, robot)
+    local = host in _LOCAL
+    viewer = Viewer(HOST if not local else host, port if local else 0, "ballbot play")
+    gate = None if local else Gate(host, port, viewer.port)
+    page = PlayPage(playground, viewer, out)
+    try:
+        address = viewer.address if gate is None else gate.address
+        console.print(f"open {address}\nCtrl+C ends it", highlight=False)
+        page.run()
+    except KeyboardInterrupt:
+        console.print("ended")
+    finally:
+        page.close()
+        if gate is not None:
+            gate.close()
+        viewer.close()
+        playground.close()

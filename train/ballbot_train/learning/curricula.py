@@ -1,0 +1,338 @@
+"""Curricula: what training may make easier than the task, as named settings that a run's record holds.
+
+A curriculum changes training alone. What is evaluated is always the task itself. All of it is off by default.
+
+- The goal's tolerances begin wider, and narrow by a factor whenever enough training episodes succeed.
+- A field of the task that bounds what is drawn, as Turn's `max_speed`, begins at an easier value, and goes to the task's own
+  by a step whenever enough training episodes succeed.
+- A share of the episodes begins in states along optima, with the time that is left there. These optima are those of training
+  episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them.
+- Rewards are shaped by a potential, minus the distance to the goal. Shaping by a potential moves no optimum (Ng et al.,
+  "Policy invariance under reward transformations", 1999).
+
+`CurriculumBatch` does this for any learner that steps a `BallbotBatch`.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from ballbot_gym.batch import BallbotBatch, BatchStep
+from ballbot_gym.ops import Vector
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import Task
+from ballbot_train.console import console
+from ballbot_train.evaluation import fresh
+
+_ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
+_NO_ARENA = 1e4  # of either: farther than any episode goes
+
+
+@dataclass(frozen=True)
+class Curriculum:
+    """What training makes easier. Evaluation is always the task itself.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
+
+    goal_factor: float = 1.0
+    """The goal's tolerances are so many times wider at the start of training; 1: off."""
+    goal_step: float = 0.97
+    """Factor by which they narrow whenever enough episodes succeed, until they are the task's own."""
+    ramp: str = ""
+    """Field of the task that begins at an easier value, as max_speed of turn; default, none."""
+    ramp_start: float = 0.0
+    """Value of that field at the start of training, in its unit."""
+    ramp_step: float = 0.1
+    """How much nearer the field comes to the task's own value whenever enough episodes succeed, in its unit."""
+    order: Literal["goal", "ramp", "together"] = "goal"
+    """What comes first, narrowing the goal or the steps of `ramp`; or both together."""
+    success: float = 0.7
+    """Share of the training episodes that is enough. Episodes that begin on optima do not count."""
+    episodes: int = 256
+    """Number of ended training episodes after which that share is looked at; then they are counted anew."""
+    starts_on_optima: float = 0.0
+    """Share of the training episodes that begin in a state along an optimum, drawn from all values of the task; 0: off.
+    They are states of optima that the run finds first; of rsl_ppo with --demos, of the successful demonstrations."""
+    optima: int = 64
+    """Number of optima that the run finds for them, of about a second each."""
+    shaping: float = 0.0
+    """Weight w of the potential −w · `goal_distance` by which rewards are shaped, 1/m, before they are scaled; 0: off."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("goal_factor", 1.0, 1e3),
+            ("goal_step", 1e-3, 1 - 1e-6),
+            ("ramp_start", 0.0, 1e6),
+            ("ramp_step", 1e-9, 1e6),
+            ("success", 0.0, 1.0),
+            ("episodes", 1, 10**9),
+            ("starts_on_optima", 0.0, 1.0),
+            ("optima", 1, 10**6),
+            ("shaping", 0.0, 1e6),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:  # NaN is in no range
+                raise ValueError(f"curriculum.{name} must be {low:g} to {high:g}, not {value}")
+
+    @property
+    def active(self) -> bool:
+        """Whether it changes anything."""
+        return self.goal_factor > 1 or self.ramp != "" or self.starts_on_optima > 0 or self.shaping > 0
+
+    def check(self, task: Task) -> None:
+        """Raises a ValueError that says what of this the task does not have."""
+        numbers = [field.name for field in fields(task) if isinstance(field.default, float)]
+        if self.ramp and self.ramp not in numbers:
+            raise ValueError(f"{task.id} has no field {self.ramp!r} for curriculum.ramp; it has {', '.join(numbers)}")
+        if self.ramp:
+            try:
+                replace(task, **{self.ramp: self.ramp_start})
+            except ValueError as error:
+                raise ValueError(f"curriculum.ramp_start {self.ramp_start:g} is out of range: {error}") from error
+        if self.shaping and task.goal_distance((0.0,) * 8, (1.0,) * len(task.constant_names)) is None:
+            raise ValueError(f"{task.id} has no goal_distance for curriculum.shaping; only tasks that define it have")
+
+
+class Starts(NamedTuple):
+    """n states along optima, as tensors."""
+
+    x: torch.Tensor
+    """(8, n) states."""
+    c: torch.Tensor
+    """(nc, n) constants of their episodes."""
+    steps: torch.Tensor
+    """(n,) int64, control steps that have passed of their episodes."""
+
+
+class CurriculumBatch(BallbotBatch):
+    """A batch whose episodes and rewards are those of a curriculum, for training.
+
+    It draws from torch's global generator. `task` is the task at its present difficulty.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        params: BallbotParams,
+        curriculum: Curriculum,
+        gamma: float,
+        demos: Path | None = None,
+        full: Task | None = None,
+        pay: bool = True,
+        failure_price: float = 0.0,
+    ):
+        """Makes the batch.
+
+        Args:
+            task: the task in training, perhaps with shorter episodes.
+            num_envs: B.
+            params: the robot.
+            curriculum: what is easier.
+            gamma: discount factor of the learner, for shaping.
+            demos: dataset of demonstrations on whose states episodes begin; default, optima are found.
+            full: the task itself, of which the demonstrations are and whose optima are found; default, `task`.
+            pay: whether living pays; else the reward is minus the running cost, and a failure costs its price at once.
+            failure_price: of a failure, where living does not pay.
+
+        Raises:
+            ValueError: the task has not what the curriculum asks for, or the demonstrations are of another task.
+        """
+        curriculum.check(task)
+        super().__init__(task, num_envs, compile=False, params=params)
+        self.curriculum = curriculum
+        self._own, self._gamma, self._pay, self._failure_price = task, gamma, pay, failure_price
+        self._goal_factor = curriculum.goal_factor
+        self._ramp = curriculum.ramp_start if curriculum.ramp else 0.0
+        self._ended = self._succeeded = 0
+        self._share = math.nan  # of the last `episodes` that ended
+        self._from_task = torch.ones(num_envs, dtype=torch.bool)  # whose episode began as the task's own do
+        self._demos, self._full = demos, task if full is None else full
+        self._starts: Starts | None = None
+        if demos is not None and curriculum.starts_on_optima:
+            self._starts = demonstrated_starts(demos, self._full, task.steps)
+        self._set_difficulty()
+
+    @property
+    def difficulty(self) -> dict[str, float]:
+        """How far the curriculum has come, by name."""
+        curriculum, reached = self.curriculum, {}
+        if curriculum.goal_factor > 1:
+            reached["goal_factor"] = self._goal_factor
+        if curriculum.ramp:
+            reached[curriculum.ramp] = self._ramp
+        return reached | ({"success": self._share} if reached else {})
+
+    @torch.no_grad()
+    def step(self, actions: torch.Tensor) -> BatchStep:
+        """As of `BallbotBatch`, with the rewards and the next episodes of the curriculum. It carries no gradients."""
+        before, task = self.state, self.task
+        result = super().step(actions)
+        assert before is not None  # else the step above raises
+        reward = result.reward
+        if not self._pay:
+            survive = task.survival_reward * task.control_dt
+            reward = reward - survive - self._failure_price * result.failure
+            if task.first_exit:
+                reward = reward - survive * (task.steps - before.steps - 1) * result.success
+        if self.curriculum.shaping:
+            start = self._potential(before.x, before.c)
+            end = self._potential(result.final_x, before.c)
+            # An episode that terminates ends with a potential of 0, and a truncated one goes on.
+            reward = reward + self._gamma * torch.where(result.terminated, 0.0, end) - start
+        ended = result.terminated | result.truncated
+        self._count(ended & self._from_task, result.success)
+        if self.curriculum.starts_on_optima:
+            result = self._start_on_optima(result, ended)
+        return result._replace(reward=reward)
+
+    def curriculum_state(self) -> dict[str, Any]:
+        """What the batch remembers besides `state`: tensors and plain values."""
+        return {
+            "goal_factor": self._goal_factor,
+            "ramp": self._ramp,
+            "counts": [self._ended, self._succeeded],
+            "share": self._share,
+            "from_task": self._from_task,
+            "starts": None if self._starts is None else list(self._starts),
+        }
+
+    def load_curriculum_state(self, state: Mapping[str, Any]) -> None:
+        """Goes back to a state."""
+        self._goal_factor, self._ramp, self._share = state["goal_factor"], state["ramp"], state["share"]
+        self._ended, self._succeeded = state["counts"]
+        self._from_task = state["from_task"]
+        self._starts = None if state["starts"] is None else Starts(*state["starts"])
+        self._set_difficulty()
+
+    def _potential(self, x: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
+        return -self.curriculum.shaping * self.task.goal_distance(x.unbind(0), c.unbind(0))
+
+    def _count(self, ended: torch.Tensor, success: torch.Tensor) -> None:
+        """Counts the episodes that ended, and makes the task harder if enough of them succeeded."""
+        self._ended += int(ended.sum())
+        self._succeeded += int((ended & success).sum())
+        if self._ended < self.curriculum.episodes:
+            return
+        self._share = self._succeeded / self._ended
+        self._ended = self._succeeded = 0
+        if self._share >= self.curriculum.success:
+            self._harden()
+
+    def _harden(self) -> None:
+        """Takes a step towards the task itself."""
+        curriculum = self.curriculum
+        own = getattr(self._own, curriculum.ramp) if curriculum.ramp else 0.0
+        wide, easy = self._goal_factor > 1, bool(curriculum.ramp) and self._ramp != own
+        if wide and not (curriculum.order == "ramp" and easy):
+            self._goal_factor = max(1.0, self._goal_factor * curriculum.goal_step)
+        if easy and not (curriculum.order == "goal" and wide):
+            away = own - self._ramp
+            self._ramp = (
+                own if abs(away) <= curriculum.ramp_step else self._ramp + math.copysign(curriculum.ramp_step, away)
+            )
+        if wide or easy:
+            self._set_difficulty()
+
+    def _set_difficulty(self) -> None:
+        """Makes `task` what the curriculum has reached."""
+        task = self._own
+        if self.curriculum.ramp:
+            task = replace(task, **{self.curriculum.ramp: self._ramp})
+        self.task = widened(task, self._goal_factor)
+        self._eligible: torch.Tensor | None = None
+
+    def _start_on_optima(self, result: BatchStep, ended: torch.Tensor) -> BatchStep:
+        """Moves a share of the episodes that have just begun into states along optima."""
+        if self._starts is None:
+            self._starts = optimal_starts(self._full, self.params, self.curriculum.optima, self._own.steps)
+        if self._eligible is None:  # states outside of the goal, which may be wide
+            inside = self.task.goal(self._starts.x.unbind(0), self._starts.c.unbind(0))
+            reached = torch.stack([excess <= 0 for excess in inside]).all(0)
+            outside = (~reached).nonzero()[:, 0]
+            self._eligible = outside if len(outside) else torch.arange(len(reached))
+        moved = ended & (torch.rand(self.num_envs) < self.curriculum.starts_on_optima)
+        self._from_task = torch.where(ended, ~moved, self._from_task)
+        if not moved.any():
+            return result
+        assert self.state is not None
+        chosen = self._eligible[torch.randint(len(self._eligible), (int(moved.sum()),))]
+        x, c, steps = self.state.x.clone(), self.state.c.clone(), self.state.steps.clone()
+        x[:, moved] = self._starts.x[:, chosen].to(x.dtype)
+        c[:, moved] = self._starts.c[:, chosen].to(c.dtype)
+        steps[moved] = self._starts.steps[chosen]
+        self.state = self.state._replace(x=x, c=c, steps=steps)
+        seen = self.observe(self.state)
+        return result._replace(observation=torch.where(moved[:, None], seen, result.observation))
+
+
+def widened(task: Task, factor: float) -> Task:
+    """The task with tolerances of its goal that are `factor` times wider.
+
+    Every goal function is a ratio of squares, less 1.
+    """
+    if factor == 1:
+        return task
+    kind = type(task)
+
+    def goal(self: Any, x: Vector, c: Vector) -> tuple[Any, ...]:
+        return tuple((excess + 1) / factor**2 - 1 for excess in kind.goal(self, x, c))
+
+    wide: Any = type(kind.__name__, (kind,), {"goal": goal, "__module__": kind.__module__})
+    return wide(**{field.name: getattr(task, field.name) for field in fields(task)})
+
+
+def without_arena(task: Task) -> Task:
+    """The task with an arena so large that no episode leaves it."""
+    return replace(task, **{field.name: _NO_ARENA for field in fields(task) if field.name in _ARENAS})
+
+
+def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) -> Starts:
+    """The states along the optima of `count` episodes drawn for training, before their ends and before control step `steps`.
+
+    Raises:
+        ValueError: no optimum was found.
+    """
+    from ballbot_baselines.optimum import find_optimum  # it imports CasADi
+
+    console.print(f"finding {count} optima on which training episodes begin")
+    found = []
+    for x, c in zip(*fresh.draw(task, range(count), 0, "training"), strict=True):
+        try:
+            states = find_optimum(task, params, x, c).trajectory.x
+        except PlanError:
+            continue
+        found.append((states[:-1][:steps], c))
+    if not found:
+        raise ValueError(f"{task.id}: no optimum was found on which episodes could begin")
+    return _starts(found)
+
+
+def demonstrated_starts(path: Path, task: Task, steps: int) -> Starts:
+    """The states of the successful demonstrations of a dataset, before their ends and before control step `steps`.
+
+    Raises:
+        ValueError: there is no such dataset, or it is damaged, of another task, or none of its episodes succeeds.
+    """
+    from ballbot_train.learning.demonstrations import demonstrated_states
+
+    shown = [(states[:-1][:steps], c) for states, c in demonstrated_states(path, task)]
+    if not shown:
+        raise ValueError(f"{path}: no demonstration succeeds, so no episode can begin on one")
+    return _starts(shown)
+
+
+def _starts(found: list[tuple[np.ndarray, np.ndarray]]) -> Starts:
+    """Starts of pairs of states (n, 8), one per control step, and constants (nc,)."""
+    x = np.concatenate([states for states, _ in found])
+    c = np.concatenate([np.tile(c, (len(states), 1)) for states, c in found])
+    steps = np.concatenate([np.arange(len(states)) for states, _ in found])
+    return Starts(torch.from_numpy(x.T.copy()), torch.from_numpy(c.T.copy()), torch.from_numpy(steps))

@@ -1,0 +1,403 @@
+"""Hyperparameters by search: Optuna's tree-structured Parzen estimator over a learner's settings, on several seeds each.
+
+A trial trains one learner per seed, all with the same settings and number of env steps. They learn in turns, from one
+evaluation to the next. What is minimized is the cost of the validation episodes, of each seed's best policy so far, averaged
+over the seeds. All policies meet the same validation episodes, so a mean cost is the regret, in units of cost, plus a
+constant. So trials are ordered and pruned by their regret, and the certified episodes decide nothing. What the last policies
+do on those is written down beside it.
+
+This cost is the average of two means. One is the cost as it is, which tells near misses apart. In the other an episode
+without success counts as failing at once; a training chooses its best policy by it.
+
+A search is a folder:
+
+| file | holds |
+|---|---|
+| config.json | learner, task, seeds and budget; the folder belongs to one search |
+| study.db | Optuna's study, in SQLite: every finished trial. `optuna-dashboard sqlite:///…` shows it |
+| trials.csv | a line per trial: its state, its costs over the seeds, its settings |
+| importances.csv | how much each setting matters, by PED-ANOVA, from the finished trials |
+| best.json | all settings of the best trial, what each seed reached, and the command that trains with them |
+| ppo.yml, sac.yml | of those two learners: settings of the four ids in the format of rl-zoo3 |
+
+A search that is killed goes on where it stopped; the trial that was running begins anew.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_train import jobs
+from ballbot_train.learning import training
+from ballbot_train.learning.learners import LEARNERS
+
+try:
+    import optuna
+except ImportError as error:
+    raise ImportError(f'{error}; pip install "ballbot-gym[tune]" installs what ballbot tune needs') from error
+
+_STARTUP_TRIALS = 8  # drawn at random before the estimator proposes, and before any trial is pruned
+_ITERATIONS = ("rl_iterations", "total_iterations")  # names of the setting that bounds a training
+_INTERRUPTED = "interrupted"
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers between two ends, drawn by their logarithm or evenly."""
+
+    low: float
+    high: float
+    log: bool = True
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of a few values."""
+
+    values: tuple[Any, ...]
+
+
+_WIDTHS = Choice(((64, 64), (128, 128), (256, 256)))
+_GAMMAS = Choice((0.98, 0.99, 0.995, 0.998))
+
+SPACES: dict[str, dict[str, Range | Choice]] = {
+    "ppo": {
+        "num_steps": Choice((64, 128, 256, 512)),
+        "batch_size": Choice((256, 512, 1024, 2048)),
+        "update_epochs": Choice((3, 5, 10)),
+        "learning_rate": Range(1e-4, 5e-3),
+        "final_learning_rate_fraction": Range(0.005, 0.5),
+        "gamma": _GAMMAS,
+        "gae_lambda": Range(0.9, 0.99, log=False),
+        "clip_range": Choice((0.1, 0.2, 0.3)),
+        "max_grad_norm": Range(0.2, 5.0),
+        "std": Range(0.1, 0.8),
+        "final_std": Range(0.01, 0.1),
+        "reward_scale": Range(0.005, 0.2),
+        "hidden": _WIDTHS,
+    },
+    "rsl_ppo": {
+        "num_steps": Choice((16, 24, 48)),
+        "num_mini_batches": Choice((4, 8, 16, 32)),
+        "update_epochs": Choice((3, 5, 8)),
+        "learning_rate": Range(2e-4, 1e-2),
+        "final_learning_rate": Range(1e-5, 5e-4),
+        "gamma": _GAMMAS,
+        "gae_lambda": Range(0.9, 0.99, log=False),
+        "clip_range": Choice((0.1, 0.2, 0.3)),
+        "max_grad_norm": Range(0.2, 5.0),
+        "std": Range(0.1, 0.8),
+        "final_std": Range(0.01, 0.1),
+        "reward_scale": Range(0.005, 0.2),
+        "hidden": _WIDTHS,
+        "critic_hidden": _WIDTHS,
+    },
+    "sac": {
+        "gradient_steps": Choice((1, 2, 4, 8, 16)),
+        "batch_size": Choice((128, 256, 512)),
+        "learning_rate": Range(1e-4, 5e-3),
+        "final_learning_rate_fraction": Range(0.005, 0.5),
+        "gamma": _GAMMAS,
+        "tau": Range(0.002, 0.05),
+        "target_entropy": Range(-8.0, -1.0, log=False),
+        "ent_coef": Range(1e-3, 0.2),
+        "std": Range(0.1, 0.8),
+        "reward_scale": Range(0.005, 0.2),
+        "hidden": _WIDTHS,
+    },
+}
+"""What is searched, by name of learner. Every other setting stays as it is tuned for the task."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """What decides the results of a search."""
+
+    learner: str
+    """Name in `SPACES`."""
+    task: str
+    """Name of a task."""
+    seeds: tuple[int, ...]
+    """Of the trainings of a trial."""
+    env_steps: int
+    """Of each training."""
+    evaluations: int
+    """Of each training, at equal distances. Trials are pruned at these."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the trainings of one trial reached; an entry per seed."""
+
+    costs: tuple[float, ...]
+    """Least cost of the validation episodes; see above."""
+    success: tuple[float, ...]
+    """Share of the validation episodes in which the last policy succeeded."""
+    certified_regret: tuple[float, ...]
+    """Mean regret of the last policy on the certified episodes; an episode without success counts as failing at once."""
+
+
+def run(search: Search, trials: int, out: Path, on_trial: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
+    """Searches until so many trials have ended, goes on with what is there, and writes all files.
+
+    Args:
+        search: what is searched.
+        trials: how many, pruned and failed ones included.
+        out: folder of the search.
+        on_trial: called with the number of trials that have ended.
+
+    Returns:
+        The contents of best.json.
+
+    Raises:
+        ValueError: the learner has no space, the folder belongs to another search or is in use, or no trial came to its end.
+    """
+    if search.learner not in SPACES:
+        raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
+    jobs.claim(out, vars(search) | {"seeds": list(search.seeds)}, "config.json")
+    try:
+        study = open_study(search, out)
+        while (ended := len(_ended(study))) < trials:
+            on_trial(ended)
+            _try(study, search)
+            write_tables(study, search, out)
+        on_trial(ended)
+        return write_tables(study, search, out)
+    finally:
+        jobs.unlock(out)
+
+
+def open_study(search: Search, out: Path) -> "optuna.Study":
+    """The study of a folder. Its first trial has the settings that are tuned for the task."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = f"sqlite:///{(out / 'study.db').absolute()}"
+    study = optuna.create_study(storage=storage, study_name="tune", direction="minimize", load_if_exists=True)
+    # The sampler's numbers depend on how many trials there are, so that a search that goes on proposes new ones.
+    study.sampler = optuna.samplers.TPESampler(
+        seed=len(study.trials), n_startup_trials=_STARTUP_TRIALS, multivariate=False
+    )
+    study.pruner = optuna.pruners.MedianPruner(n_startup_trials=_STARTUP_TRIALS, n_warmup_steps=1)
+    if not study.trials:
+        study.enqueue_trial(encoded(SPACES[search.learner], LEARNERS[search.learner].settings(search.task)))
+    for stale in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):  # of a search that was killed
+        study._storage.set_trial_user_attr(stale._trial_id, _INTERRUPTED, True)
+        study.tell(stale.number, state=optuna.trial.TrialState.FAIL)
+        study.enqueue_trial(stale.params)
+    return study
+
+
+def encoded(space: Mapping[str, Range | Choice], settings: Any) -> dict[str, Any]:
+    """The searched settings of a learner as Optuna's parameters."""
+    values = {name: getattr(settings, name) for name in space}
+    return {name: json.dumps(value) if isinstance(space[name], Choice) else value for name, value in values.items()}
+
+
+def _proposed(trial: "optuna.Trial", space: Mapping[str, Range | Choice]) -> dict[str, Any]:
+    """The settings that Optuna proposes. Choices are JSON texts in its storage."""
+    chosen: dict[str, Any] = {}
+    for name, domain in space.items():
+        if isinstance(domain, Range):
+            chosen[name] = trial.suggest_float(name, domain.low, domain.high, log=domain.log)
+        else:
+            text = trial.suggest_categorical(name, [json.dumps(value) for value in domain.values])
+            chosen[name] = _decoded(text)
+    return chosen
+
+
+def _decoded(text: Any) -> Any:
+    value = json.loads(text) if isinstance(text, str) else text
+    return tuple(value) if isinstance(value, list) else value
+
+
+def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
+    """A learner's settings with those that were chosen, and with the search's number of env steps."""
+    settings = replace(LEARNERS[search.learner].settings(search.task), **chosen)
+    iterations = max(1, round(search.env_steps / (settings.num_envs * settings.num_steps)))
+    name = next(field.name for field in fields(settings) if field.name in _ITERATIONS)
+    return replace(settings, evaluations=search.evaluations, **{name: iterations})
+
+
+def _try(study: "optuna.Study", search: Search) -> None:
+    """Runs one trial."""
+    trial, began = study.ask(), time.process_time()
+    try:
+        outcome = outcome_of(search, settings_of(search, _proposed(trial, SPACES[search.learner])), trial)
+    except optuna.TrialPruned:
+        study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+    except (ValueError, FloatingPointError) as error:  # what torch answers to weights that are not finite
+        trial.set_user_attr("error", f"{error!r:.200}")
+        study.tell(trial, state=optuna.trial.TrialState.FAIL)
+    else:
+        for name, value in vars(outcome).items():
+            trial.set_user_attr(name, list(value))
+        trial.set_user_attr("cpu_minutes", (time.process_time() - began) / 60)
+        study.tell(trial, float(np.mean(outcome.costs)))
+
+
+def outcome_of(search: Search, settings: Any, trial: Any) -> Outcome:
+    """Trains with one set of settings on every seed.
+
+    Raises:
+        optuna.TrialPruned: other trials were better by then.
+    """
+    task, params = make_task(search.task), default_params()
+    learners = [LEARNERS[search.learner].make(task, params, settings, seed, None) for seed in search.seeds]
+    best, validations = [math.inf] * len(learners), []
+    for k in range(1, search.evaluations + 1):
+        for learner in learners:
+            while learner.iteration < learner.iterations * k // search.evaluations:
+                learner.iterate()
+        validations = [training.validate(learner.network, task) for learner in learners]
+        costs = [(validation.cost + validation.mean_cost) / 2 for validation in validations]
+        best = [min(pair) for pair in zip(best, costs, strict=True)]
+        trial.report(float(np.mean(best)), k)
+        if k < search.evaluations and trial.should_prune():
+            raise optuna.TrialPruned
+    scores = [training.score(learner.network, task) for learner in learners]
+    return Outcome(
+        costs=tuple(best),
+        success=tuple(validation.success for validation in validations),
+        certified_regret=tuple(score.cost_ratio - 1 for score in scores),
+    )
+
+
+def _ended(study: "optuna.Study") -> list[Any]:
+    """The trials that ended by themselves."""
+    return [trial for trial in study.trials if trial.state.is_finished() and _INTERRUPTED not in trial.user_attrs]
+
+
+def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, Any]:
+    """Writes what a search has found so far.
+
+    Returns:
+        The contents of best.json; empty where no trial has come to its end.
+    """
+    rows = []
+    for trial in _ended(study):
+        costs = trial.user_attrs.get("costs", [])
+        reached = list(trial.intermediate_values.values())
+        rows.append(
+            {
+                "trial": trial.number,
+                "state": trial.state.name.lower(),
+                "cost": trial.value if trial.value is not None else min(reached, default=math.nan),
+                "cost_spread": max(costs) - min(costs) if costs else math.nan,
+                "costs": " ".join(f"{cost:.4f}" for cost in costs),
+                "success": " ".join(f"{share:.3f}" for share in trial.user_attrs.get("success", [])),
+                "certified_regret": " ".join(f"{share:.4f}" for share in trial.user_attrs.get("certified_regret", [])),
+                "cpu_minutes": trial.user_attrs.get("cpu_minutes", math.nan),
+                "error": trial.user_attrs.get("error", ""),
+                **{name: trial.params.get(name, "") for name in SPACES[search.learner]},
+            }
+        )
+    files.write_csv(out / "trials.csv", rows)
+    finished = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
+    files.write_csv(
+        out / "importances.csv",
+        [{"setting": name, "importance": share} for name, share in importances(study).items()],
+        ("setting", "importance"),
+    )
+    if not finished:
+        return {}
+    trial = study.best_trial
+    settings = settings_of(search, {name: _decoded(value) for name, value in trial.params.items()})
+    best = {
+        "learner": search.learner,
+        "task": search.task,
+        "trial": trial.number,
+        "validation_cost": trial.value,
+        "seeds": list(search.seeds),
+        **{name: trial.user_attrs[name] for name in ("costs", "success", "certified_regret")},
+        "settings": {
+            field.name: getattr(settings, field.name) for field in fields(settings) if field.name != "curriculum"
+        },
+    }
+    files.write(out / "best.json", json.dumps(best, indent=1) + "\n")
+    if search.learner in ("ppo", "sac"):
+        files.write(out / f"{search.learner}.yml", zoo_yaml(search.learner, _best_settings(search, settings, out)))
+    return best
+
+
+def importances(study: "optuna.Study") -> dict[str, float]:
+    """How much each setting matters, the most important first; empty before there are enough finished trials."""
+    if len(study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))) < 4:
+        return {}
+    try:
+        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+        return optuna.importance.get_param_importances(study, evaluator=evaluator)
+    except (ValueError, RuntimeError):  # all trials alike
+        return {}
+
+
+def _best_settings(search: Search, found: Any, out: Path) -> dict[str, Any]:
+    """Settings by name of task: those found, those of searches in the folders beside, and the tuned ones of the others."""
+    settings = {task: LEARNERS[search.learner].settings(task) for task in TASKS}
+    for task in TASKS:
+        path = out.parent / f"{task}-{search.learner}" / "best.json"
+        if path.exists():
+            read = files.read_json(path)["settings"]
+            known = {name: tuple(value) if isinstance(value, list) else value for name, value in read.items()}
+            settings[task] = replace(settings[task], **known)
+    return settings | {search.task: found}
+
+
+def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:
+    """Settings of PPO or SAC by name of task as a file of hyperparameters for rl-zoo3."""
+    lines = [
+        f"# Hyperparameters of Stable-Baselines3's {learner.upper()} for rl-zoo3, found by `ballbot tune {learner}`:",
+        "# python -m rl_zoo3.train --algo NAME --env ID --conf-file THIS --gym-packages ballbot_gym "
+        "--env-kwargs physics:\"'rk4'\"",
+        "# Not expressed here, because rl-zoo3 has no setting for them: critics that see products, symmetric actors,",
+        "# the schedule of the standard deviation, scaled rewards and shorter training episodes.",
+    ]
+    for task, chosen in settings.items():
+        lines += ["", f"{TASKS[task].id}:"]
+        lines += [f"  {name}: {value}" for name, value in _ZOO[learner](chosen).items()]
+    return "\n".join(lines) + "\n"
+
+
+def _zoo_common(chosen: Any) -> dict[str, Any]:
+    return {
+        "n_envs": chosen.num_envs,
+        "n_timesteps": chosen.rl_iterations * chosen.num_envs * chosen.num_steps,
+        "policy": "MlpPolicy",
+        "learning_rate": f"lin_{chosen.learning_rate:.3g}",
+        "batch_size": chosen.batch_size,
+        "gamma": chosen.gamma,
+    }
+
+
+def _zoo_ppo(chosen: Any) -> dict[str, Any]:
+    return _zoo_common(chosen) | {
+        "n_steps": chosen.num_steps,
+        "n_epochs": chosen.update_epochs,
+        "gae_lambda": round(chosen.gae_lambda, 4),
+        "clip_range": chosen.clip_range,
+        "max_grad_norm": round(chosen.max_grad_norm, 4),
+        "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, log_std_init={math.log(chosen.std):.3f})"',
+    }
+
+
+def _zoo_sac(chosen: Any) -> dict[str, Any]:
+    return _zoo_common(chosen) | {
+        "buffer_size": 1_000_000,
+        "train_freq": 1,
+        "gradient_steps": chosen.gradient_steps,
+        "tau": round(chosen.tau, 5),
+        "ent_coef": f"auto_{chosen.ent_coef:.3g}",
+        "target_entropy": round(chosen.target_entropy, 3),
+        "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, n_critics={chosen.num_critics}, activation_fn=nn.SiLU)"',
+    }
+
+
+_ZOO = {"ppo": _zoo_ppo, "sac": _zoo_sac}

@@ -1,0 +1,1 @@
+"""The live playground: a ballbot to push, beside ghosts of itself under other controllers."""

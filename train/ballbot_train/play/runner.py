@@ -1,0 +1,170 @@
+"""One ballbot of the playground: a simulator, a controller, what happened so far."""
+
+import math
+import time
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Disturbance, Randomization
+from ballbot_gym.rollout import Controller
+from ballbot_gym.simulator import PHYSICS, State
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.play.tunable import Tunable
+
+TRACE_STEPS = 400
+"""Control steps that the trace on the floor and the plots go back."""
+
+
+class Sample(NamedTuple):
+    """What a step looks like in the plots."""
+
+    seconds: float
+    """Since the playground was opened or restarted."""
+    tilt: float
+    """rad."""
+    force: float
+    """N, its length."""
+    cost: float
+    """Of the episode so far, without the price of a failure."""
+    act: float
+    """s, computing time of the controller."""
+
+
+class Runner:
+    """A ballbot under one controller. Its controller counts time from the step in which it was reset."""
+
+    def __init__(self, name: str, task: Tunable, params: BallbotParams, physics: str):
+        self.name = name
+        self.controller: Controller | None = None
+        self.x: State = (0.0,) * 8
+        self.force = (0.0, 0.0)
+        self.push = (0.0, 0.0)
+        self.cost = 0.0
+        self.violated = ""
+        """The limit that was violated, or ""."""
+        self.arrived = False
+        """Whether the goal of a first-exit task is reached."""
+        self.trace: deque[tuple[float, float]] = deque(maxlen=TRACE_STEPS)
+        self.samples: deque[Sample] = deque(maxlen=TRACE_STEPS)
+        self._task, self._nominal = task, params
+        self._controller_start = 0
+        self._act_seconds = 0.0
+        self._simulator = PHYSICS[physics](params, task.control_dt)
+        self.set_plant(Randomization())
+        self.begin(self.x)
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether its episode is over."""
+        return self.violated != "" or self.arrived
+
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """The episode so far; None before its first step."""
+        if not self._forces:
+            return None
+        times = self._task.control_dt * np.arange(len(self._states))
+        return Trajectory(times, np.array(self._states), np.array(self._forces))
+
+    def begin(self, x: State) -> None:
+        """Starts an episode in state x (8,)."""
+        self.place(x)
+        self.trace.clear()
+        self.samples.clear()
+        self._disturbance.begin(self._drawn)
+        self.restart_cost()
+
+    def restart_cost(self) -> None:
+        """Starts an episode where the robot is."""
+        self.cost = 0.0
+        self._states: list[State] = [self.x]
+        self._forces: list[tuple[float, float]] = []
+
+    def place(self, x: State) -> None:
+        """Puts the robot upright, or however x (8,) says."""
+        self.x, self.force, self.push = x, (0.0, 0.0), (0.0, 0.0)
+        self.violated, self.arrived = "", False
+        self._simulator.reset(x)
+
+    def take_controller(self, controller: Controller | None, step: int) -> None:
+        """Goes on under another controller, that was reset for this step, counted from the opening of the playground."""
+        self.controller, self._controller_start = controller, step
+
+    def seconds_of_controller(self, step: int) -> float:
+        """How long ago the controller was reset, s, at a step."""
+        return (step - self._controller_start) * self._task.control_dt
+
+    def set_plant(self, randomization: Randomization) -> None:
+        """Changes what the controller does not know: the true robot, its actuator and its sensors."""
+        dt = self._task.control_dt
+        self._plant = randomization
+        self._drawn = randomization.draw((0.5,) * Randomization.EPISODE_DRAWS, dt)
+        self._disturbance = Disturbance(randomization, self._nominal, dt)
+        self._disturbance.begin(self._drawn)
+        self._simulator.set_params(randomization.robot(self._nominal, self._drawn[:4]))
+        self._simulator.reset(self.x)
+
+    def act(self, step: int, noise: tuple[float, ...]) -> tuple[float, float]:
+        """The force that the controller commands, N, within the robot's limit; the numbers are those of the sensors' noise.
+
+        Raises:
+            FloatingPointError: a force that is not finite.
+        """
+        assert self.controller is not None
+        seen = self._plant.sensed(self.x, noise) if self._plant.is_noisy else self.x
+        began = time.perf_counter()
+        u = np.asarray(self.controller.act(self.seconds_of_controller(step), np.array(seen)), np.float64)
+        self._act_seconds = time.perf_counter() - began
+        if u.shape != (2,) or not np.isfinite(u).all():
+            raise FloatingPointError(f"{self.name} commands {u} N")
+        limit = self._nominal.force_limit
+        a = u / limit
+        return limit * min(max(float(a[0]), -1.0), 1.0), limit * min(max(float(a[1]), -1.0), 1.0)
+
+    def step(
+        self,
+        step: int,
+        command: tuple[float, float],
+        push: tuple[float, float],
+        c: tuple[float, ...],
+        seconds_left: float,
+    ) -> None:
+        """Holds a command, N, for one control step, in which a push (2,), N, acts too.
+
+        Args:
+            step: counted from the opening of the playground.
+            command: (2,) N.
+            push: (2,) N.
+            c: constants of the tunable task.
+            seconds_left: s, of the episode after this step: what a failure costs.
+        """
+        task, dt = self._task, self._task.control_dt
+        self.force = self._disturbance.actuate(command)
+        self.push = push
+        self.cost += task.cost(self.x, self.force, c) * dt
+        x = self._simulator.step((self.force[0] + push[0], self.force[1] + push[1]))
+        self.violated = task.violated(x, c)
+        if not all(map(math.isfinite, x)):
+            x = self.x
+        self.arrived = task.first_exit and not self.violated and task.is_goal(x, c)
+        self.x = x
+        sample = Sample((step + 1) * dt, dynamics.tilt(x), math.hypot(*self.force), self.cost, self._act_seconds)
+        self.samples.append(sample)
+        self.trace.append((x[0], x[1]))
+        self._states.append(x)
+        self._forces.append(self.force)
+        if self.violated:
+            self.cost += task.survival_reward * seconds_left
+
+    def weigh_again(self, c: tuple[float, ...]) -> None:
+        """Counts the cost so far with other weights."""
+        dt = self._task.control_dt
+        self.cost = sum(self._task.cost(x, u, c) * dt for x, u in zip(self._states, self._forces, strict=False))
+
+    def close(self) -> None:
+        """Releases the simulator; may be called again."""
+        self._simulator.close()

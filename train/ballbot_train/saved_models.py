@@ -1,0 +1,268 @@
+"""Saved models of Stable-Baselines3 and rsl_rl as policies: their weights alone are read, and nothing in them is executed.
+
+| file | from | read are |
+|---|---|---|
+| MODEL.zip | `model.save` of Stable-Baselines3 | `policy.pth`, as tensors; from `data`, plain JSON values |
+| MODEL.vecnormalize.npz | `save_vecnormalize`, where observations were normalized | arrays of numbers |
+| MODEL.pt | `runner.save` of rsl_rl, of an actor that is an MLP | tensors |
+| MODEL.json beside a MODEL.pt | you: `{"activation": "elu"}`, because the checkpoint does not say | JSON |
+
+Of Stable-Baselines3 these are PPO, A2C, SAC, TD3 and DDPG with MlpPolicy, and of sb3_contrib TQC and TRPO.
+
+Pickles, such as `VecNormalize.save` writes, can execute code, and are not read.
+"""
+
+import hashlib
+import io
+import itertools
+import json
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ballbot_gym import files
+from ballbot_gym.tasks import Task
+from ballbot_train.policy_files import PolicyError
+
+_ACTIVATIONS = {
+    "elu": "ELU",
+    "gelu": "GELU",
+    "leakyrelu": "LeakyReLU",
+    "relu": "ReLU",
+    "selu": "SELU",
+    "silu": "SiLU",
+    "tanh": "Tanh",
+}
+_MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # whose policies act as it is written here
+_SUPPORTED = "give a model with MlpPolicy, or load the model yourself and give it to ballbot_train.evaluate"
+
+
+class SavedActor(torch.nn.Module):
+    """Normalizes observations, runs the network, and brings its output into [−1, 1]."""
+
+    def __init__(self, network: torch.nn.Module, output: Mapping[str, float], statistics: Mapping[str, Any] | None):
+        """Args: output: "limit", by which it is clipped, and "tanh", if it is squashed; statistics: as of `_read`."""
+        super().__init__()
+        self.network, self._output, self._statistics = network, output, statistics
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        if self._statistics is not None:
+            mean, scale, limit = (self._statistics[name] for name in ("mean", "scale", "limit"))
+            observation = ((observation.double() - mean) / scale).clamp(-limit, limit).float()
+        action = self.network(observation)
+        if "limit" in self._output:
+            action = action.clamp(-self._output["limit"], self._output["limit"])
+        return torch.tanh(action) if "tanh" in self._output else action.clamp(-1.0, 1.0)
+
+
+def observations_of(path: str | Path) -> int:
+    """The size of the observations that a saved model takes.
+
+    Raises:
+        PolicyError: as `load_actor`.
+    """
+    layers, *_ = _read(path)
+    return layers[0][0].shape[1]
+
+
+def digest(path: str | Path) -> str:
+    """SHA-256 of a saved model and of the statistics beside it, as hexadecimal digits."""
+    beside = [other for other in (statistics_of(path), _description_of(path)) if other.exists()]
+    return hashlib.sha256(b"".join(files.read(part) for part in (path, *beside))).hexdigest()
+
+
+def statistics_of(path: str | Path) -> Path:
+    """The path of the statistics of a saved model's observations."""
+    path = Path(path)
+    return path.with_name(f"{path.stem}.vecnormalize.npz")
+
+
+def save_vecnormalize(normalization: Any, model: str | Path) -> Path:
+    """Writes the statistics of a Stable-Baselines3 `VecNormalize` beside a saved model, for `ballbot evaluate MODEL.zip`.
+
+    Args:
+        normalization: the VecNormalize, for instance of `model.get_vec_normalize_env()`, or of `VecNormalize.load`.
+        model: path of the saved model, MODEL.zip or MODEL.
+
+    Returns:
+        The path of the file, MODEL.vecnormalize.npz.
+
+    Raises:
+        TypeError: it is no VecNormalize of plain observations.
+    """
+    model = Path(model)
+    model = model if model.suffix == ".zip" else model.with_name(f"{model.name}.zip")
+    moments = getattr(normalization, "obs_rms", None)
+    if not hasattr(normalization, "norm_obs") or (normalization.norm_obs and not hasattr(moments, "mean")):
+        raise TypeError(f"give a VecNormalize of plain observations, not {normalization!r}")
+    arrays: dict[str, np.ndarray] = {"normalized": np.array(int(normalization.norm_obs))}
+    if normalization.norm_obs and moments is not None:
+        arrays |= {
+            "mean": np.asarray(moments.mean, np.float64),
+            "variance": np.asarray(moments.var, np.float64),
+            "epsilon": np.array(float(normalization.epsilon)),
+            "limit": np.array(float(normalization.clip_obs)),
+        }
+    return files.write_npz(statistics_of(model), arrays)
+
+
+def load_actor(path: str | Path, task: Task) -> SavedActor:
+    """The deterministic policy of a saved model: from observations (..., no), float32, to actions (..., 2) in [−1, 1].
+
+    Args:
+        path: of the file.
+        task: what it is to do.
+
+    Raises:
+        PolicyError: the file is missing, damaged or of a kind that is not read; or its observations are not the task's.
+    """
+    layers, activation, output, normalization = _read(path)
+    size = layers[0][0].shape[1]
+    if size != len(task.observation_scale):
+        raise PolicyError(f"{path} takes {size} observations, {task.id} has {len(task.observation_scale)}")
+    if normalization is not None and len(normalization["mean"]) != size:
+        raise PolicyError(f"{path} takes {size} observations, its statistics are of {len(normalization['mean'])}")
+    parts: list[torch.nn.Module] = []
+    for weight, bias in layers:
+        linear = torch.nn.Linear(weight.shape[1], weight.shape[0])
+        linear.load_state_dict({"weight": weight, "bias": bias})
+        parts += [linear, getattr(torch.nn, _ACTIVATIONS[activation])()]
+    return SavedActor(torch.nn.Sequential(*parts[:-1]), output, normalization).eval()
+
+
+def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None]:
+    """Layers (weight, bias), activation, what happens to the output, and the statistics of observations, or None."""
+    try:
+        return _read_sb3(Path(path)) if Path(path).suffix == ".zip" else _read_rsl(Path(path))
+    except PolicyError:
+        raise
+    except files.FileError as error:
+        raise PolicyError(str(error)) from error
+    except Exception as error:  # zipfile, JSON and torch have dozens of ways to refuse a damaged file
+        raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {error!r:.300}") from error
+
+
+def _read_sb3(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None]:
+    with zipfile.ZipFile(io.BytesIO(files.read(path))) as archive:
+        for name in ("data", "policy.pth"):
+            if name not in archive.namelist():
+                raise PolicyError(f"{path} is no saved Stable-Baselines3 model: it holds no {name}")
+            if archive.getinfo(name).file_size > files.READ_LIMIT:
+                raise PolicyError(f"{path}: {name} is larger than {files.READ_LIMIT / 2**20:.0f} MiB")
+        data, weights = json.loads(archive.read("data")), _tensors(archive.read("policy.pth"))
+    made_by = str(data["policy_class"].get("__module__", ""))
+    if not made_by.startswith(_MODULES):
+        raise PolicyError(f"{path} has a policy of {made_by or 'an unknown module'}, which is not read; {_SUPPORTED}")
+    options = data.get("policy_kwargs") or {}
+    unknown = [name for name in weights if "features_extractor" in name or "lstm" in name]
+    if unknown or "features_extractor_class" in options:
+        raise PolicyError(f"{path} extracts features ({(unknown or ['features_extractor_class'])[0]}); {_SUPPORTED}")
+    output: dict[str, float] = {}
+    if "action_net.weight" in weights:
+        layers, usual = _layers(weights, "mlp_extractor.policy_net.", "action_net."), "tanh"
+        if options.get("squash_output"):
+            output["tanh"] = 1.0
+    elif any(name.startswith("actor.latent_pi.") for name in weights):
+        deep = "actor.mu.0.weight" in weights  # with state-dependent exploration the mean is clipped
+        layers, usual = _layers(weights, "actor.latent_pi.", "actor.mu.0." if deep else "actor.mu."), "relu"
+        output["tanh"] = 1.0
+        if deep:
+            output["limit"] = float(options.get("clip_mean", 2.0))
+    elif "actor.mu.0.weight" in weights:
+        layers, usual, output["tanh"] = _layers(weights, "actor.mu."), "relu", 1.0
+    else:
+        raise PolicyError(f"{path} has no actor that is read, but {', '.join(list(weights)[:4])}, …; {_SUPPORTED}")
+    _check_layers(path, layers)
+    named = re.search(r"(\w+)'?>?$", str(options.get("activation_fn", usual)))
+    activation = named.group(1).lower() if named else ""
+    if activation not in _ACTIVATIONS:
+        raise PolicyError(f"{path} has the activation {options.get('activation_fn')}; known: {', '.join(_ACTIVATIONS)}")
+    return layers, activation, output, _statistics(path, data)
+
+
+def _statistics(path: Path, data: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Mean, scale and limit of the normalization of observations, or None."""
+    beside = statistics_of(path)
+    if not beside.exists():
+        # Only on-policy algorithms leave this empty where there was no VecNormalize.
+        if "gae_lambda" in data and data.get("_last_original_obs") is not None:
+            raise PolicyError(
+                f"{path} was trained with VecNormalize, and {beside} is missing. Its own file is a pickle, which can execute "
+                f"code and is not read. Write the statistics where you trust it: ballbot_train.save_vecnormalize("
+                f'VecNormalize.load("vecnormalize.pkl", venv), "{path}")'
+            )
+        return None
+    arrays = files.read_npz(beside)
+    if not int(arrays["normalized"]):
+        return None
+    mean, variance = torch.from_numpy(arrays["mean"]), torch.from_numpy(arrays["variance"])
+    scale, limit = torch.sqrt(variance + float(arrays["epsilon"])), float(arrays["limit"])
+    if mean.shape != scale.shape or mean.ndim != 1 or not (mean.isfinite().all() and scale.isfinite().all()):
+        raise PolicyError(f"{beside} is damaged; write it again with ballbot_train.save_vecnormalize")
+    return {"mean": mean.double(), "scale": scale.double(), "limit": limit}
+
+
+def _read_rsl(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None]:
+    saved, described = _tensors(files.read(path)), _description_of(path)
+    if isinstance(saved.get("actor_state_dict"), dict):
+        weights, first, normalizer = saved["actor_state_dict"], "mlp.", "obs_normalizer."
+    elif isinstance(saved.get("model_state_dict"), dict):  # of versions before 4
+        weights, first, normalizer = saved["model_state_dict"], "actor.", "actor_obs_normalizer."
+    else:
+        raise PolicyError(f"{path} is no checkpoint of rsl_rl: it has {', '.join(map(str, list(saved)[:4]))}")
+    if not described.exists():
+        raise PolicyError(
+            f'{path}: a checkpoint of rsl_rl does not name its activation; write {described} with {{"activation": "elu"}}, '
+            f"or another of {', '.join(_ACTIVATIONS)}"
+        )
+    activation = files.read_json(described)["activation"]
+    if activation not in _ACTIVATIONS:
+        raise PolicyError(f"{described} has the activation {activation!r}; known: {', '.join(_ACTIVATIONS)}")
+    layers = _layers(weights, first)
+    _check_layers(path, layers)
+    statistics = None
+    if f"{normalizer}_mean" in weights:
+        mean, std = (weights[f"{normalizer}{name}"].flatten().double() for name in ("_mean", "_std"))
+        statistics = {"mean": mean, "scale": std + 1e-2, "limit": float("inf")}
+    return layers, activation, {}, statistics
+
+
+def _description_of(path: str | Path) -> Path:
+    """The file that says what a checkpoint of rsl_rl does not."""
+    return Path(path).with_suffix(".json")
+
+
+def _tensors(content: bytes) -> dict[str, Any]:
+    """What torch saved, as tensors and plain values: nothing is executed."""
+    saved = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
+    if not isinstance(saved, dict):
+        raise ValueError(f"it holds {type(saved).__name__} and no weights")
+    return saved
+
+
+def _layers(weights: Mapping[str, Any], *prefixes: str) -> list[Any]:
+    """Weight and bias of the linear layers under names that begin so, in order."""
+    layers = []
+    for prefix in prefixes:
+        numbers = {name.removeprefix(prefix).rpartition(".")[0] for name in weights if name.startswith(prefix)}
+        for number in sorted(numbers, key=lambda text: int(text or 0)):
+            start = f"{prefix}{number}." if number else prefix
+            layers.append((weights[f"{start}weight"].float(), weights[f"{start}bias"].float()))
+    return layers
+
+
+def _check_layers(path: Path, layers: list[Any]) -> None:
+    """Raises a PolicyError where layers do not follow one another, or do not end in two finite actions."""
+    shapes = [tuple(weight.shape) for weight, _ in layers]
+    fitting = all(len(shape) == 2 for shape in shapes) and all(
+        after[1] == before[0] for before, after in itertools.pairwise(shapes)
+    )
+    if not shapes or not fitting or shapes[-1][0] != 2:
+        raise PolicyError(f"{path} is no network of linear layers that ends in 2 actions: its weights are {shapes}")
+    if not all(part.isfinite().all() for layer in layers for part in layer):
+        raise PolicyError(f"{path} holds NaN or infinity; take an earlier model of the training, or train anew")
