@@ -278,3 +278,26 @@ def test_what_a_task_has_not_is_refused(name, settings, message):
 def test_demonstrations_without_starts_on_them_are_refused(tmp_path):
     with pytest.raises(ValueError, match="uses demonstrations only with"):
         LEARNERS["rsl_ppo"].make(make_task("turn"), default_params(), LEARNERS["rsl_ppo"].settings("turn"), 0, tmp_path)
+
+
+def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
+    torch.manual_seed(0)
+    task = replace(make_task("stabilize"), duration=2.0)
+    curriculum = Curriculum(short_episodes=0.5, short_seconds=0.1)
+    batch = CurriculumBatch(task, 400, default_params(), curriculum, gamma=0.99)
+    batch.reset(seed=0)
+    assert batch.state is not None
+    batch.state = batch.state._replace(steps=torch.full((400,), task.steps - 1))
+    actions = torch.zeros(400, 2)
+    assert batch.step(actions).truncated.all()  # the next episodes begin, some of them short
+    for _ in range(4):
+        assert not batch.step(actions).truncated.any()
+    short = batch.step(actions).truncated
+    assert 0.4 < short.double().mean() < 0.6
+    for _ in range(10):  # no other than short ones ends before 2 s
+        assert not (batch.step(actions).truncated & ~short).any()
+
+
+def test_a_task_that_ends_at_its_goal_has_no_short_episodes():
+    with pytest.raises(ValueError, match="pays at its goal"):
+        Curriculum(short_episodes=0.5).check(make_task("turn"))

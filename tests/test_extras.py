@@ -28,8 +28,8 @@ def run(code, *blocked):
         ("from ballbot_train import BallbotVecEnv", "stable_baselines3", "train"),
         ("from ballbot_train import load_policy", "safetensors", "train"),
         ("from ballbot_train.cli import main", "rich", "train"),
-        ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
         ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
+        ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
     ],
 )
 def test_missing_library_names_its_extra(code, library, extra):

@@ -13,14 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 import ballbot_gym
 from ballbot_gym import files
+from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicyNetwork, load_network
 from ballbot_train.policy_files import OBSERVATION_VERSION, read_description, weights_digest
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 _LARGEST_ERROR = 1e-5  # of an action: float32 sums in another order differ by less than 1e-6
 

@@ -23,11 +23,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ballbot_gym import files
+from ballbot_gym.lazy import missing
 from ballbot_gym.tasks import Task
 from ballbot_train.policy_files import PolicyError
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 _ACTIVATIONS = {
     "elu": "ELU",

@@ -4,7 +4,6 @@ import math
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
 
 from ballbot_baselines.linearize import discretize
 from ballbot_gym.params import BallbotParams
@@ -58,6 +57,8 @@ class DriveController:
 
 def _velocity_gain(params: BallbotParams, dt: float) -> np.ndarray:
     """(2, 6) LQR of leans, velocities and lean rates. Upright motion at any speed is an equilibrium of these."""
+    import scipy.linalg
+
     a, b = (matrix[0] for matrix in discretize(params, np.zeros((1, 8)), np.zeros((1, 2)), dt))
     a, b = a[2:, 2:], b[2:]
     r = _EFFORT * dt * np.eye(2)
