@@ -63,6 +63,12 @@ def test_pictures_and_commands_that_it_names_exist(page):
         assert command in COMMANDS
 
 
+def test_films_are_small_enough_to_load_at_once():
+    films = sorted((ROOT / "docs" / "pictures").glob("*.webp"))
+    assert [film.stem for film in films] == ["lean", "orbit", "weave"]
+    assert max(film.stat().st_size for film in films) <= 2e6
+
+
 def test_every_page_that_is_linked_exists():
     for page in PAGES:
         prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)

@@ -195,6 +195,12 @@ def test_two_policies_of_one_task_are_refused():
         engine_script([str(SHIPPED / "stabilize-ppo.json"), str(SHIPPED / "stabilize-sac.json")])
 
 
+def test_saved_models_of_other_libraries_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(playground, "task_name", lambda policy, task: "stabilize")
+    with pytest.raises(ValueError, match="saved model of another library"):
+        engine_script([str(tmp_path / "model.zip")])
+
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRIVER = shutil.which("chromedriver")
 FLAGS = ("headless", "no-sandbox", "no-first-run", "disable-background-networking", "disable-component-update")

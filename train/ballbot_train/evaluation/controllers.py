@@ -96,6 +96,10 @@ def policy_path(name: str, task: Task) -> Path:
         raise ValueError(f"{name} is an expert, and no policy; give a policy's .json, or one of {', '.join(shipped)}")
     if not is_file(name):
         raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
+    if is_saved_model(name):
+        raise ValueError(
+            f"{name} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
+        )
     return Path(name)
 
 

@@ -5,6 +5,7 @@ compute in double precision.
 """
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import casadi
 
@@ -47,7 +48,7 @@ _UNARY = {
 }
 
 
-def javascript_function(name: str, function: Callable[..., object], arguments: Mapping[str, int]) -> str:
+def javascript_function(name: str, function: Callable[..., Any], arguments: Mapping[str, int]) -> str:
     """A JavaScript function that computes what a Python function computes.
 
     Args:

@@ -24,7 +24,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.evaluation.controllers import task_name
+from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy_files import PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
 from ballbot_train.report.javascript import javascript_function
@@ -139,8 +139,8 @@ def _policies(given: Sequence[str]) -> dict[str, dict[str, Any]]:
         task = task_name(str(policy), None)
         if task in paths:
             raise ValueError(f"{paths[task]} and {policy} are both policies for {task}; give one")
-        _check_policy(Path(policy), make_task(task))
-        paths[task] = Path(policy)
+        paths[task] = policy_path(str(policy), make_task(task))
+        _check_policy(paths[task], make_task(task))
     shipped = {task: shipped_policies(make_task(task))[learner] for task, learner in _LEARNERS.items()}
     return {task: _policy_data(paths.get(task, path), make_task(task)) for task, path in shipped.items()}
 

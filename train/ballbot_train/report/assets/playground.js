@@ -303,7 +303,7 @@ class Playground {
     view.addEventListener(
       "wheel",
       (event) => {
-        if (!this.scene) return;
+        if (!this.scene || !event.ctrlKey) return; // the wheel alone scrolls the page around the playground; pinches hold ctrl
         event.preventDefault();
         this.wake();
         this.zoom = Math.min(Math.max(this.zoom * Math.exp(event.deltaY * 0.001), 0.4), 4);
