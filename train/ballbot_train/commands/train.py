@@ -1,6 +1,7 @@
 """`ballbot train LEARNER`: trains a policy. Every setting of the learner is an option; see `ballbot train LEARNER --help`."""
 
 import argparse
+import math
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -116,8 +117,12 @@ def train(
     row = training.train(made, problem, config, out, resume)
     console.print(
         f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
-        f"{row.regret_mean:.2%} mean, {row.regret_median:.2%} median\npolicy: {out / 'policy.json'}"
+        f"{_share(row.regret_mean)} mean, {_share(row.regret_median)} median\npolicy: {out / 'policy.json'}"
     )
+
+
+def _share(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.2%}"
 
 
 def command_line(arguments: Sequence[str]) -> None:
