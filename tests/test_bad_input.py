@@ -24,11 +24,13 @@ from builders import result
 
 from ballbot_baselines.optimum import Backoff
 from ballbot_gym import BallbotEnv, certified, files
+from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
 from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.tasks import TASKS as TASK_NAMES
 from ballbot_gym.trajectory import Trajectory
+from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train import evaluate, jobs, load_policy
 from ballbot_train.cli import _run
 from ballbot_train.evaluation.benchmark import controllers_of
@@ -526,16 +528,93 @@ def settings(learner, **changes):
     return lambda folder: check_settings(replace(LEARNERS[learner].settings("stabilize"), **changes))
 
 
+def batch(**given):
+    """Resets a batch of three with what the functions make of a state (8, 3) and constants (1, 3) of zeros."""
+    zeros = {"x": torch.zeros(8, 3), "c": torch.zeros(1, 3)}
+
+    def reset(folder):
+        made = BallbotBatch("turn", 3, compile=False)
+        made.reset(0)
+        made.reset(**{name: value(zeros.get(name)) for name, value in given.items()})
+
+    return reset
+
+
+def vector(seed=0, num_envs=3, **options):
+    return lambda folder: BallbotVectorEnv(num_envs, "turn", compile=False).reset(seed=seed, options=options)
+
+
+FINITE = "must be finite numbers within ±1e+06"
+
+BATCHES = [
+    (batch(x=lambda x: x * math.nan), f"x {FINITE}"),
+    (batch(x=lambda x: x + 1e200), f"x {FINITE}"),
+    (batch(x=lambda x: x + 1e7), f"x {FINITE}"),
+    (batch(x=lambda x: x[:7]), "x must be a tensor of shape (8, 3), not one of shape (7, 3)"),
+    (batch(x=lambda x: x.T), "x must be a tensor of shape (8, 3), not one of shape (3, 8)"),
+    (batch(x=lambda x: x.numpy()), "x must be a tensor of shape (8, 3), not array("),
+    (batch(x=lambda x: x + 1.5), "start states of envs [0, 1, 2] violate limits of BallbotTurn-v0"),
+    (batch(c=lambda c: c * math.nan), f"c {FINITE}"),
+    (batch(c=lambda c: c + 23), "speed must be in (0, 12] m/s, not 23"),
+    (batch(c=lambda c: c), "speed must be in (0, 12] m/s, not 0"),
+    (batch(c=lambda c: c.repeat(2, 1)), "c must be a tensor of shape (1, 3), not one of shape (2, 3)"),
+    (batch(mask=lambda _: [True] * 3), "mask must be a tensor of 3 bools, not [True, True, True]"),
+    (batch(mask=lambda _: torch.ones(3)), "mask must be a tensor of 3 bools, not one of shape (3,), torch.float32"),
+    (batch(mask=lambda _: torch.ones(2, dtype=torch.bool)), "mask must be a tensor of 3 bools"),
+    (batch(seed=lambda _: "abc"), "seed must be a whole number, or one or None for each env, not 'abc'"),
+    (batch(seed=lambda _: 1.5), "seed must be a whole number"),
+    (batch(seed=lambda _: [1.5, 2, 3]), "seeds must be whole numbers, not 1.5"),
+    (batch(seed=lambda _: [True, 2, 3]), "seeds must be whole numbers, not True"),
+    (batch(seed=lambda _: [1, 2]), "seed has 2 entries for 3 envs"),
+    (batch(seed=lambda _: 2**63), "seeds must be in [0, 2^63)"),
+    *(
+        case
+        for envs in (3, 80)  # a loop and a batch
+        for case in (
+            (vector(num_envs=envs, state=[1e200] + [0.0] * 7), "state must be numbers within ±1e+06, not [1e+200"),
+            (vector(num_envs=envs, state=[math.nan] * 8), "state must be finite numbers that broadcast to"),
+            (vector(num_envs=envs, state=np.zeros((2, 8))), "state must be finite numbers that broadcast to"),
+            (vector(num_envs=envs, state="x"), "state must be finite numbers that broadcast to"),
+            (vector(num_envs=envs, constants={"speed": 1e200}), "constant 'speed' must be numbers within ±1e+06"),
+            (vector(num_envs=envs, constants={"speed": math.nan}), "constant 'speed' must be finite numbers"),
+            (vector(num_envs=envs, constants=[[3.0]] * 2), "constants must be finite numbers that broadcast to"),
+            (vector(num_envs=envs, reset_mask=[True]), "must be a NumPy array of bool"),
+            (vector("abc", envs), "seed must be a whole number"),
+            (vector([1.5] * envs, envs), "seeds must be whole numbers, not 1.5"),
+            (vector(-1, envs), "seeds must be in [0, 2^63), not -1"),
+        )
+    ),
+]
+
 LEARNING = [
     (settings("shac", total_iterations=-5), "total_iterations must be 1 to 1000000000, not -5"),
     (settings("shac", evaluations=0), "evaluations must be 1 to"),
     (settings("shac", num_envs=0), "num_envs must be 1 to"),
-    (settings("shac", num_envs=10**12), "num_envs must be 1 to 1000000000"),
-    (settings("shac", learning_rate=math.nan), "learning_rate must be finite and at least 0, not nan"),
-    (settings("shac", learning_rate=-1e-3), "learning_rate must be finite and at least 0"),
+    (settings("shac", num_envs=10**12), "num_envs must be 1 to 1048576"),
+    (settings("shac", learning_rate=math.nan), "learning_rate must be finite and positive, not nan"),
+    (settings("shac", learning_rate=-1e-3), "learning_rate must be finite and positive"),
+    (settings("shac", learning_rate=0.0), "learning_rate must be finite and positive"),
+    (settings("shac", tau=2.0), "tau must be 0 to 1, not 2.0"),
+    (settings("shac", horizon=10**9), "horizon must be 1 to 100000"),
+    (settings("shac", horizon=10**4, num_envs=10**5), "1000000000 env steps per iteration, and at most 100000000"),
+    (settings("rsl_ppo", std=0.0), "std must be finite and positive, not 0.0"),
+    (settings("rsl_ppo", final_std=0.0), "final_std must be finite and positive"),
+    (settings("rsl_ppo", final_learning_rate=0.0), "final_learning_rate must be finite and positive"),
+    (settings("rsl_ppo", gamma=1.5), "gamma must be 0 to 1, not 1.5"),
+    (settings("rsl_ppo", gamma=-0.5), "gamma must be 0 to 1"),
+    (settings("rsl_ppo", gae_lambda=math.nan), "gae_lambda must be 0 to 1, not nan"),
+    (settings("rsl_ppo", num_envs=10**8), "num_envs must be 1 to 1048576"),
+    (settings("rsl_ppo", hidden=(10**6, 10**6)), "hidden must be 1 to 16384"),
+    (
+        settings("rsl_ppo", num_envs=3, num_steps=2, num_mini_batches=7),
+        "num_mini_batches 7 is more than the 6 env steps",
+    ),
+    (settings("rsl_ppo", clip_range=math.inf), "clip_range must be finite"),
+    (settings("ppo", reward_scale=0.0), "reward_scale must be finite and positive"),
+    (settings("sac", tau=-0.1), "tau must be 0 to 1"),
     (settings("bc", hidden=(0,)), "hidden must be 1 to"),
     (settings("bc", batch_size=0), "batch_size must be 1 to"),
-    (settings("ppo", gamma=math.inf), "gamma must be finite"),
+    (settings("ppo", gamma=math.inf), "gamma must be 0 to 1, not inf"),
     (settings("sac", rl_iterations=0), "rl_iterations must be 1 to"),
     (settings("dagger", gathering_iterations=-1), "gathering_iterations must be 0 to"),
 ]
@@ -596,6 +675,7 @@ GROUPS = {
     "policy": POLICIES,
     "results": RESULTS,
     "demos": DEMOS,
+    "batch": BATCHES,
     "learning": LEARNING,
     "evaluation": EVALUATION,
 }
@@ -673,12 +753,43 @@ TYPED = [
     ("train shac --seed -1", "seed must be 0 to"),
     ("train shac --evaluations 0", "evaluations must be 1 to"),
     ("train shac --total-iterations -5", "total_iterations must be 1 to"),
-    ("train shac --learning-rate nan", "learning_rate must be finite"),
+    ("train shac --learning-rate nan", "learning_rate must be finite and positive"),
     ("train shac --demos x", "shac uses no demonstrations"),
     ("train shac --start none.json", "none.json is not a policy"),
     ("train bc", "bc learns from demonstrations: give --demos"),
     ("train bc --demos none", 'is no dataset of "ballbot demos"'),
     ("train dagger --backoff.force 2", "Backoff: force must be at least 0 and below 1"),
+    ("evaluate shac --bins 0", "bins must be at least 1, not 0"),
+    ("evaluate shac --bins 1000000000", "bins must be at most 10000, not 1000000000"),
+    ("evaluate shac --fresh -5", "fresh must be at least 0, not -5"),
+    ("evaluate shac --fresh 0", "nothing to run: give --fresh or --episodes"),
+    ("evaluate shac --fresh 1e4", "invalid"),
+    ("evaluate shac --fresh 99999999999", "the number of fresh episodes must be 1 to 1,000,000"),
+    ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
+    ("evaluate shac --fresh 10 --seed 99999999999", "seed must be 0 to 4294967295"),
+    ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
+    ("evaluate shac --fresh 10 --workers 0", "workers must be at least 1, not 0"),
+    ("evaluate lqr --fresh 10", "lqr is an expert"),
+    ("evaluate lqr --episodes 201", "episodes must be at most 200"),
+    ("evaluate lqr --episodes -1", "episodes must be at least 0, not -1"),
+    ("evaluate nothere", "unknown controller nothere"),
+    ("evaluate .", "unknown controller ."),
+    ("evaluate /dev/zero", "unknown controller /dev/zero"),
+    ("benchmark --tasks", "give at least one task"),
+    ("benchmark --tasks turn --controllers lqr --physics rk4 --out /dev/null", "/dev/null cannot be a folder"),
+    ("train rsl_ppo --std 0", "std must be finite and positive, not 0.0"),
+    ("train rsl_ppo --gamma 2", "gamma must be 0 to 1, not 2.0"),
+    ("train rsl_ppo --num-envs 100000000", "num_envs must be 1 to 1048576"),
+    ("train rsl_ppo --num-envs 0", "num_envs must be 1 to"),
+    (
+        "train rsl_ppo --num-mini-batches 7 --num-envs 3 --num-steps 2",
+        "num_mini_batches 7 is more than the 6 env steps",
+    ),
+    ("train rsl_ppo --task turn --symmetry frame", "has no frame"),
+    ("train rsl_ppo --symmetry dance", "invalid choice 'dance'"),
+    ("train rsl_ppo --episode-seconds 0.013", "is not a whole number of control steps"),
+    ("train rsl_ppo --episode-seconds 1e9", "must be 1 to 1,000,000 control steps"),
+    ("train rsl_ppo --hidden 1000000000", "hidden must be 1 to 16384"),
     ("trian", "did you mean train?"),
 ]
 

@@ -55,6 +55,18 @@ class Job:
     """What its progress counts for."""
 
 
+def make_folder(out: Path) -> None:
+    """Makes the folder of a run, unless it is there. Call it before the work, which would else be lost.
+
+    Raises:
+        ValueError: there is a file of that name, or of the name of a folder above.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ValueError(f"{out} cannot be a folder, because a file is in its place; give another --out") from error
+
+
 def unfinished(out: Path) -> Path:
     """The folder within a run's folder that only serves to continue the run; `release` deletes it."""
     return out / _FOLDER
@@ -138,7 +150,7 @@ def _lock(out: Path) -> None:
     if _holds(out):
         return
     unlock(out)  # the folder was deleted meanwhile, and the lock with it
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     while not _holds(out):  # a lock that another process deleted between our opening and locking it is no lock
         lock = filelock.FileLock(out.resolve() / _LOCK, timeout=0, thread_local=False)
         try:

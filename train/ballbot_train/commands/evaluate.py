@@ -27,6 +27,7 @@ from ballbot_train.provenance import LoadRecord, provenance
 
 _FRESH = 10_000
 _WORST = 10
+_MOST_BINS = 10_000
 _SHOWN_BINS = 6
 _FULL_BIN = 20  # episodes from which a bin is called weak
 
@@ -66,6 +67,8 @@ def evaluate(
     chosen = controllers_of([task], [policy])
     check_least(0, seed=seed, optima=optima, episodes=episodes)
     check_least(1, workers=workers, **({} if bins is None else {"bins": bins}))
+    if bins is not None and bins > _MOST_BINS:
+        raise ValueError(f"bins must be at most {_MOST_BINS}, not {bins}")
     if episodes > certified.EPISODES:
         raise ValueError(f"episodes must be at most {certified.EPISODES}, the certified ones, not {episodes}")
     fresh = (0 if episodes else _FRESH) if fresh is None else fresh
@@ -93,6 +96,7 @@ def _fresh(
     from ballbot_train.report import figures
 
     fresh.check_fresh(episodes, seed)
+    jobs.make_folder(out)
     facts = provenance() | {
         "task": task,
         "policy": policy,

@@ -1,6 +1,7 @@
 """`ballbot train LEARNER`: trains a policy. Every setting of the learner is an option; see `ballbot train LEARNER --help`."""
 
 import argparse
+import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -130,7 +131,7 @@ def train(
     row = training.train(made, problem, config, out, resume)
     console.print(
         f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
-        f"{row.regret_mean:.2%} mean, {row.regret_median:.2%} median\npolicy: {out / 'policy.json'}"
+        f"{_share(row.regret_mean)} mean, {_share(row.regret_median)} median\npolicy: {out / 'policy.json'}"
     )
 
 
@@ -162,6 +163,10 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int
 def _row(name: str, values: Mapping[str, Any]) -> list[str]:
     shares = f"{values['success']:.1%}", f"{values['failures']:g}", f"{values['regret_mean']:.2%}"
     return [name, "", *shares, f"{values['minutes']:.1f}"]
+
+
+def _share(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.2%}"
 
 
 def command_line(arguments: Sequence[str]) -> None:

@@ -167,7 +167,7 @@ class CurriculumBatch(BallbotBatch):
         curriculum.check(task)
         super().__init__(task, num_envs, compile=False, params=params)
         self.curriculum = curriculum
-        self._own, self._gamma, self._pay, self._failure_price = task, gamma, pay, failure_price
+        self._own, self.gamma, self._pay, self._failure_price = task, gamma, pay, failure_price
         self._goal_factor = curriculum.goal_factor
         self._ramp = curriculum.ramp_start if curriculum.ramp else 0.0
         self._ended = self._succeeded = 0
@@ -205,7 +205,7 @@ class CurriculumBatch(BallbotBatch):
             start = self._potential(before.x, before.c)
             end = self._potential(result.final_x, before.c)
             # An episode that terminates ends with a potential of 0, and a truncated one goes on.
-            reward = reward + self._gamma * torch.where(result.terminated, 0.0, end) - start
+            reward = reward + self.gamma * torch.where(result.terminated, 0.0, end) - start
         ended = result.terminated | result.truncated
         self._count(ended & self._from_task, result.success)
         if self.curriculum.starts_on_optima:

@@ -76,13 +76,18 @@ _MAY_BE_ZERO = {
     "tube_samples",
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
+_SHARES = {"beta", "gae_lambda", "gamma", "tau"}
+_POSITIVE = {"demo_std", "final_learning_rate", "final_std", "learning_rate", "reward_scale", "std"}
 _MOST = 10**9  # of whole numbers
+_MOST_OF = {"critic_hidden": 2**14, "hidden": 2**14, "horizon": 10**5, "num_envs": 2**20, "num_steps": 10**6}
+_MOST_STEPS = 10**8  # env steps of an iteration, which are all in memory
 
 
 def check_settings(settings: Any) -> None:
     """Raises a ValueError that names the first of a learner's settings that makes no sense.
 
-    Whole numbers are positive, except those that switch something off with 0. Other numbers are finite and at least 0.
+    Whole numbers are positive, except those that switch something off with 0. Other numbers are finite and at least 0;
+    discounts and the like are at most 1.
     """
     for field in fields(settings):
         name, value = field.name, getattr(settings, field.name)
@@ -90,11 +95,26 @@ def check_settings(settings: Any) -> None:
             if isinstance(number, bool) or not isinstance(number, int | float):
                 continue
             if isinstance(number, int):
-                least = 0 if name in _MAY_BE_ZERO else 1
-                if not least <= number <= _MOST:
-                    raise ValueError(f"{name} must be {least} to {_MOST}, not {number}")
+                least, most = 0 if name in _MAY_BE_ZERO else 1, _MOST_OF.get(name, _MOST)
+                if not least <= number <= most:
+                    raise ValueError(f"{name} must be {least} to {most}, not {number}")
+            elif name in _SHARES and not 0 <= number <= 1:
+                raise ValueError(f"{name} must be 0 to 1, not {number}")
+            elif name in _POSITIVE and not 0 < number < math.inf:
+                raise ValueError(f"{name} must be finite and positive, not {number}")
             elif not math.isfinite(number) or (number < 0 and name not in _MAY_BE_NEGATIVE):
                 raise ValueError(f"{name} must be finite and at least 0, not {number}")
+    envs = getattr(settings, "num_envs", 1)
+    steps = getattr(settings, "num_steps", getattr(settings, "horizon", 1))
+    if envs * steps > _MOST_STEPS:
+        raise ValueError(
+            f"{envs} envs of {steps} steps are {envs * steps} env steps per iteration, and at most {_MOST_STEPS} are kept in "
+            "memory; take fewer of either"
+        )
+    if getattr(settings, "num_mini_batches", 1) > envs * steps:
+        raise ValueError(
+            f"num_mini_batches {settings.num_mini_batches} is more than the {envs * steps} env steps of an iteration"
+        )
 
 
 _HERE = __name__

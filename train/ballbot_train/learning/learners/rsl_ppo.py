@@ -52,9 +52,12 @@ class RslPpoConfig:
     """Duration of an episode in training, s. Time-outs are bootstrapped, and the first episodes start at staggered times."""
     reward_scale: float = 0.02
     """Factor of every reward."""
-    gamma: float = 0.995
-    """Discount factor per control step."""
-    gae_lambda: float = 0.95
+    gamma: float = 0.99
+    """Discount factor per control step at the start."""
+    final_gamma: float = 0.99
+    """Discount factor at the end; 1 less it goes there geometrically. A low one learns fast, but spares force at the
+    start of an episode that costs more later."""
+    gae_lambda: float = 0.9
     """λ of generalized advantage estimation."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the actor's hidden layers."""
@@ -67,11 +70,11 @@ class RslPpoConfig:
     over the task's mirror images, or it sees and acts in the task's frame."""
     learning_rate: float = 2e-3
     """Step size at the start."""
-    final_learning_rate: float = 5e-5
+    final_learning_rate: float = 1e-4
     """Step size at the end. It falls geometrically."""
     std: float = 0.2
     """Standard deviation of the actions at the start, in units of the force limit. It is not learnt."""
-    final_std: float = 0.02
+    final_std: float = 0.05
     """Standard deviation at the end. It falls geometrically."""
     update_epochs: int = 5
     """Passes over the rollouts of an iteration."""
@@ -92,8 +95,13 @@ class RslPpoConfig:
 
 
 TUNED: dict[str, RslPpoConfig] = {
-    "stabilize": RslPpoConfig(symmetry="odd", total_iterations=600),
-    "orbit": RslPpoConfig(symmetry="frame", total_iterations=600),
+    "stabilize": RslPpoConfig(
+        symmetry="odd",
+        total_iterations=400,
+        final_gamma=0.9985,
+        curriculum=Curriculum(short_episodes=0.85),
+    ),
+    "orbit": RslPpoConfig(symmetry="frame", total_iterations=600, gae_lambda=0.95),
     "weave": RslPpoConfig(
         symmetry="mirrors", episode_seconds=8.0, hidden=(128, 128), critic_hidden=(128, 128), total_iterations=800
     ),
@@ -196,7 +204,11 @@ class RslPpo:
         """
         if demos is not None and not config.curriculum.starts_on_optima:
             raise ValueError("rsl_ppo uses demonstrations only with --curriculum.starts-on-optima above 0")
-        self.config, self.iteration = config, 0
+        if not 0 < config.gamma <= config.final_gamma < 1:
+            raise ValueError(
+                f"gamma {config.gamma:g} and final_gamma {config.final_gamma:g} must be in (0, 1), in this order"
+            )
+        self.config, self.iteration, self._task = config, 0, task
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         torch.manual_seed(seed)
         self._random = ScopedRng()
@@ -218,15 +230,16 @@ class RslPpo:
             self._env = RslVecEnv(self._batch, seed, inputs)
             self._env.episode_length_buf = torch.randint(shorter.steps, (config.num_envs,))
             self._seen = seen = self._env.get_observations()
-            value = value_of_living(task, config.reward_scale, config.gamma) if config.pay else 0.0
+            value = self._value_of_living(config.gamma)
             self._actor = Actor(seen, PolicyNetwork(spec), config.std)
             with torch.no_grad():  # so that the first policy does next to nothing
                 last_layer(self._actor.network.mlp).weight.mul_(0.1)
             self._average = PolicyNetwork(spec)
             self._average.load_state_dict(self._actor.network.state_dict())
+            self._critic = Critic(seen, config.critic_hidden, value)
             self._ppo = PPO(
                 self._actor,
-                Critic(seen, config.critic_hidden, value),
+                self._critic,
                 Storage("rl", config.num_envs, config.num_steps, seen, (2,)),
                 num_learning_epochs=config.update_epochs,
                 num_mini_batches=config.num_mini_batches,
@@ -261,6 +274,7 @@ class RslPpo:
         for group in self._ppo.optimizer.param_groups:
             group["lr"] = rate
         self._actor.set_std(std)
+        self._set_gamma(1 - schedules.geometric(1 - config.gamma, 1 - config.final_gamma, progress))
         ended = early = paid = 0.0
         with torch.no_grad():
             for _ in range(config.num_steps):
@@ -282,9 +296,20 @@ class RslPpo:
             "train/early_end_rate": early / max(1.0, ended),
             "train/learning_rate": rate,
             "train/std": std,
+            "train/gamma": self._ppo.gamma,
             "train/env_steps": self.iteration * config.num_envs * config.num_steps,
             **{f"curriculum/{name}": value for name, value in self.difficulty.items()},
         }
+
+    def _value_of_living(self, gamma: float) -> float:
+        return value_of_living(self._task, self.config.reward_scale, gamma) if self.config.pay else 0.0
+
+    def _set_gamma(self, gamma: float) -> None:
+        """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
+        change = self._value_of_living(gamma) - self._value_of_living(self._ppo.gamma)
+        with torch.no_grad():
+            self._critic.linear.bias += change
+        self._ppo.gamma = self._batch.gamma = gamma
 
     def state_dict(self) -> dict[str, Any]:
         assert self._batch.state is not None
@@ -297,6 +322,7 @@ class RslPpo:
             "batch": list(self._batch.state),
             "curriculum": self._batch.curriculum_state(),
             "random": self._random.state_dict(),
+            "gamma": self._ppo.gamma,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -309,6 +335,7 @@ class RslPpo:
         self._batch.load_curriculum_state(state["curriculum"])
         self._seen = self._env.get_observations()
         self._random.load_state_dict(state["random"])
+        self._ppo.gamma = self._batch.gamma = state["gamma"]
 
 
 def make(task: Task, params: BallbotParams, config: RslPpoConfig, seed: int, demos: Path | None) -> RslPpo:
