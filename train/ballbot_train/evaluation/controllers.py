@@ -108,8 +108,8 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
     """The controller that a name stands for. torch is imported only for a policy.
 
     Args:
-        name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file or of a model
-            that Stable-Baselines3 or rsl_rl saved; see `saved_models`.
+        name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
+            or of a model that Stable-Baselines3 or rsl_rl saved; see `saved_models`.
         task: what it is to do.
         params: the robot it believes to control.
 
