@@ -97,7 +97,7 @@ def test_entries_survive_json_and_make_the_set_that_the_optima_make(params):
 def test_entry_of_an_episode_without_an_optimum_says_why(monkeypatch, params):
     certification = pytest.importorskip("ballbot_baselines.certification")
 
-    def fail(*args):
+    def fail(*args, **options):
         raise PlanError("no feasible episode")
 
     monkeypatch.setattr(certification, "find_optimum", fail)

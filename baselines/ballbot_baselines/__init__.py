@@ -24,9 +24,14 @@ CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 }
 """Every controller by its name on the command line. To add a controller, write one file and add one line here."""
 
+VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
+    "nmpc-offset-free": called("ballbot_baselines.nmpc:offset_free_nmpc"),
+}
+"""Controllers that run where they are named, and in the robustness track. They have no row on the leaderboard."""
+
 _LAZY = {"find_optimum": "ballbot_baselines.optimum:find_optimum"}
 
-__all__ = ["CONTROLLERS", "Controller", "find_optimum"]
+__all__ = ["CONTROLLERS", "VARIANTS", "Controller", "find_optimum"]
 
 
 def __getattr__(name: str) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import Optimum, find_optimum
+from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
@@ -38,7 +38,7 @@ def entries(task_name: str, indices: Iterable[int]) -> Iterator[Entry]:
     task, params = make_task(task_name), default_params()
     for index in indices:
         try:
-            optimum = find_optimum(task, params, *episode(task, params, index))
+            optimum = find_optimum(task, params, *episode(task, params, index), guesses=ALL_GUESSES)
         except PlanError as error:
             yield {"episode": index, "error": str(error)}
             continue

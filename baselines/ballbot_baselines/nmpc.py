@@ -12,13 +12,21 @@ quadratic program by HPIPM: the sequential quadratic programming of Diehl et al.
 optimization in optimal feedback control" (2005). One iteration per step is that scheme; more iterate to convergence. The
 Hessian is the cost's along the plan, so a converged solution is a stationary point of the nonlinear problem.
 
+`offset_free` makes up for a robot that differs from the model: what the model mispredicts of the accelerations from step to
+step is fitted by recursive least squares, and added to the model over the horizon. As in Pannocchia and Rawlings,
+"Disturbance models for offset-free model-predictive control" (2003), there is a constant disturbance. Errors of masses and
+lengths are proportional to lean and force, so those are fitted as well.
+
 The horizon's intervals are whole numbers of control steps: the first is one, as the env holds its force, and where there
 are more control steps than nodes the later intervals hold theirs longer. Near the plan's end intervals shrink to nothing.
 """
 
+import multiprocessing
 import time
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from typing import Literal
 
 import casadi
 import numpy as np
@@ -34,12 +42,18 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
 _BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan; for the goal it is half of TrajoptController's
+_OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05)  # what is left of a wrong model
 _SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
 _MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
 _LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
 _QP_ITERATIONS = 30
+_FORGETTING = 0.98  # of the disturbance's estimator per control step: it remembers about a second
+_TRUST = np.array([1e-1, 1e1, 1e-3])  # variances of its constant, lean and force parts before the first step; SI units
+_FAR = 10.0  # units of cost that a deviation from the plan will take: more is planned anew, if that is done in the background
+_PLANNING_SECONDS = 0.2  # after which a new plan begins, on which the horizon predicts the robot then
+_STALE_SECONDS = 1.0  # by which a plan may come too late
 
 
 @dataclass
@@ -49,7 +63,8 @@ class Counts:
     `steps` are calls of `act` that wanted a solution, `iterations` quadratic programs solved, `failed` the steps without
     a usable solution (`injected` of them on purpose), `late` solutions that came after the deadline, `cut` searches that
     the deadline ended before they converged, and `fallbacks` the steps taken under TVLQR: failed + late. `replans` are
-    whole plans made anew because a first-exit goal was missed at the plan's end: they take longer than a step.
+    whole plans made anew because a first-exit goal was missed at the plan's end, or because the robot was far from its plan:
+    they take longer than a step. `unplanned` of them found no plan, or came too late.
     """
 
     steps: int = 0
@@ -60,6 +75,7 @@ class Counts:
     cut: int = 0
     fallbacks: int = 0
     replans: int = 0
+    unplanned: int = 0
 
 
 @dataclass(frozen=True)
@@ -137,6 +153,41 @@ class _Matrix:
         return slice(self.inputs.stop, self.inputs.stop + self.margins)
 
 
+class Disturbance:
+    """What is added to the model's accelerations: for each axis a constant, a part of its lean, and a part of its force.
+
+    The coefficients (2 axes, 3, 2) say, by axis, what the constant, the lean (rad) and the force (fraction of its limit) add
+    to the ball's acceleration, m/s², and to the lean's, rad/s². They are fitted by recursive least squares, and start at 0.
+    """
+
+    def __init__(self, force_limit: float):
+        self.coefficients = np.zeros((2, 3, 2))
+        self._limit = force_limit
+        self._covariance = np.tile(np.diag(_TRUST * [1.0, 1.0, force_limit**2 / 100]), (2, 1, 1))
+
+    def fit(self, x: np.ndarray, u: np.ndarray, errors: np.ndarray) -> None:
+        """Takes the errors (4,) of the accelerations over a control step from state x (8,) under force u (2,), N."""
+        for axis in range(2):
+            features = np.array([1.0, x[2 + axis], u[axis] / self._limit])
+            covariance = self._covariance[axis]
+            gain = covariance @ features / (_FORGETTING + features @ covariance @ features)
+            missed = errors[[axis, 2 + axis]] - features @ self.coefficients[axis]
+            self.coefficients[axis] += np.outer(gain, missed)
+            # Forgetting is limited: at rest nothing is learned, and the covariance must not grow.
+            updated = covariance - np.outer(gain, features @ covariance)
+            self._covariance[axis] = updated / _FORGETTING if np.trace(updated) < _TRUST.sum() else updated
+
+    def rates(self, x: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is added to the rates of states x (n, 8) under actions a (n, 2): (n, 8), and its slopes (10, 8)."""
+        added, slopes = np.zeros(x.shape), np.zeros((10, 8))
+        for axis in range(2):
+            constant, lean, force = self.coefficients[axis]
+            places = [4 + axis, 6 + axis]
+            added[:, places] = constant + x[:, 2 + axis, None] * lean + a[:, axis, None] * force
+            slopes[2 + axis, places], slopes[8 + axis, places] = lean, force
+        return added, slopes
+
+
 class HorizonQp:
     """The quadratic program of one iteration, for N intervals; arrays are allocated once and filled in place.
 
@@ -150,6 +201,7 @@ class HorizonQp:
         count = len(task.margins((0.0,) * 8, (1.0,) * len(task.constant_names)))
         self.distinct = np.arange(count)
         """Indices of the task's margins that are considered."""
+        self.disturbance: Disturbance | None = None
         self._make_stage(task, params, nodes, count)
         self._make_program(nodes, min(count, _MARGINS))
 
@@ -258,6 +310,10 @@ class HorizonQp:
         """
         x, a = self.x, self.a
         self._stage()
+        if self.disturbance is not None:
+            rates, slopes = self.disturbance.rates(self.x, self.a)
+            self._next += self.h[:, None] * rates
+            self._jacobian += self.h[:, None, None] * slopes
         if not np.isfinite(self._next).all():
             return False
         self._set_constraints(margin)
@@ -296,6 +352,47 @@ class HorizonQp:
         return np.take_along_axis(margins, least, 1), np.take_along_axis(slopes, least[:, None, :], 2)
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """A plan with all that the controller needs to follow it: gains and weights along it. Making it takes several steps."""
+
+    plan: Optimum
+    tracker: TvlqrController
+    q: np.ndarray
+    r: np.ndarray
+    p: np.ndarray
+    slopes: np.ndarray
+    sums: np.ndarray
+    distinct: np.ndarray
+
+    @classmethod
+    def make(cls, task: Task, params: BallbotParams, plan: Optimum, c: np.ndarray) -> "Prepared":
+        """Of a plan for constants c (nc,)."""
+        trajectory = plan.trajectory
+        tracker = TvlqrController.for_task(task, params, trajectory, c)
+        q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
+        margins = np.array([task.margins(x, c) for x in trajectory.x])
+        return cls(
+            plan=plan,
+            tracker=tracker,
+            q=2 * q,
+            r=2 * r * params.force_limit**2,
+            p=np.concatenate([tracker.gains.p, final_weight(task, params, trajectory.x[-1], c)[None]]),
+            slopes=np.concatenate([np.zeros((1, 8)), plan.costates]),
+            sums=np.concatenate([np.zeros((1, 2)), np.cumsum(trajectory.u, axis=0)]) / params.force_limit,
+            distinct=np.unique(margins, axis=1, return_index=True)[1],  # unused obstacles repeat others
+        )
+
+
+def prepared_plan(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, backoff: Backoff) -> Prepared:
+    """Plans from state x (8,), and prepares the plan.
+
+    Raises:
+        PlanError: there is no plan.
+    """
+    return Prepared.make(task, params, find_optimum(task, params, x, c, backoff), c)
+
+
 class NmpcController:
     """Model predictive control about the episode's plan. One iteration per control step by default (real-time iteration).
 
@@ -319,6 +416,8 @@ class NmpcController:
         deadline: float | None = None,
         failure_rate: float = 0.0,
         seed: int = 0,
+        offset_free: bool = False,
+        replanning: Literal["wait", "background"] = "wait",
     ):
         """Builds the program; `reset` does the planning.
 
@@ -334,11 +433,19 @@ class NmpcController:
             deadline: s of wall time per step; a later solution is not used. None makes results repeatable.
             failure_rate: share of steps whose solution is thrown away, drawn with `seed`: fault injection.
             seed: of the injected failures.
+            offset_free: whether to estimate how the robot's accelerations differ from the model's, and to correct the model.
+            replanning: "wait" makes a new plan within the step that wants it, so that results are repeatable. "background"
+                makes it in another process, also where the robot is far from its plan, and no step waits for it. When it
+                arrives depends on the machine. A script that asks for it needs the guard `if __name__ == "__main__":`.
 
         Raises:
-            ValueError: a horizon or delay that is no whole number of control steps, or a horizon of fewer than 2.
+            ValueError: another `replanning`, a horizon or delay that is no whole number of control steps, or a horizon of
+                fewer than 2.
         """
+        if replanning not in ("wait", "background"):
+            raise ValueError(f'replanning must be "wait" or "background", not {replanning!r}')
         self._task, self._params, self._backoff = task, params, backoff
+        self._offset_free, self._background = offset_free, replanning == "background"
         self._iterations, self._tolerance = iterations, tolerance
         self._deadline, self._failure_rate = deadline, failure_rate
         self._rng = np.random.default_rng(seed)
@@ -351,36 +458,43 @@ class NmpcController:
         self.plan: Optimum | None = None
         self.predicted: np.ndarray | None = None
         self.counts = Counts()
+        if self._background:
+            _worker().submit(_start_up)  # so that the first new plan need not wait for the process
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         """Plans from the state that the first force will meet."""
         self._start, self._c, self._lost = t, np.asarray(c, np.float64), False
+        self._disturbance = Disturbance(self._params.force_limit) if self._offset_free else None
+        self._before: tuple[np.ndarray, np.ndarray] | None = None
+        self._planning: Future[Prepared] | None = None
         self._commanded = [np.zeros(2)] * self._delay
         self.follow(find_optimum(self._task, self._params, self._predicted(x), self._c, self._backoff))
 
     def follow(self, plan: Optimum) -> None:
         """Takes a plan of the episode, and starts the horizon on it."""
-        task, c, trajectory = self._task, self._c, plan.trajectory
-        self.plan, self._trajectory, self.predicted = plan, trajectory, None
-        self._tracker = TvlqrController.for_task(task, self._params, trajectory, c)
-        self._tracker.reset(self._start, trajectory.x[0], c)
-        self._length = len(trajectory.u)
-        q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
-        self._q, self._r = 2 * q, 2 * r * self._params.force_limit**2
-        self._p = np.concatenate([self._tracker.gains.p, final_weight(task, self._params, trajectory.x[-1], c)[None]])
-        self._slopes = np.concatenate([np.zeros((1, 8)), plan.costates])
-        self._sums = np.concatenate([np.zeros((1, 2)), np.cumsum(trajectory.u, axis=0)]) / self._params.force_limit
+        self._adopt(Prepared.make(self._task, self._params, plan, self._c))
+
+    def _adopt(self, prepared: Prepared) -> None:
+        plan = prepared.plan
+        self.plan, self._trajectory, self.predicted = plan, plan.trajectory, None
+        self._tracker = prepared.tracker
+        self._tracker.reset(self._start, plan.trajectory.x[0], self._c)
+        self._length = len(plan.trajectory.u)
+        self._q, self._r, self._p = prepared.q, prepared.r, prepared.p
+        self._slopes, self._sums, self._distinct = prepared.slopes, prepared.sums, prepared.distinct
         self._step = 0
-        margins = np.array([task.margins(x, c) for x in trajectory.x])
-        self._distinct = np.unique(margins, axis=1, return_index=True)[1]  # unused obstacles repeat others
         nodes = len(self._grid.lengths)
         self._dx, self._da = np.zeros((nodes + 1, 8)), np.zeros((nodes, 2))
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         began = time.perf_counter()
-        elapsed = round((t - self._start) / self._task.control_dt)
+        self._estimate(x)
+        measured = x
         x = self._predicted(x)
-        if elapsed >= self._length and self._missed_goal(t, x):
+        if self._background:
+            self._take_new_plan(t)
+        elapsed = self._elapsed(t)
+        if elapsed >= self._length and not self._background and self._missed_goal(t, x):
             elapsed = 0
         if elapsed >= self._length:
             u = self._tracker.act(t, x)  # the plan's end is held
@@ -390,9 +504,25 @@ class NmpcController:
             solved = self._solve(x, began)
             self.predicted = self._x_plan + self._dx
             u = self._params.force_limit * self._qp.a[0] if solved else self._fall_back(x)
+        if self._background:
+            self._ask_for_new_plan(t, x, elapsed)
         u = np.clip(u, -self._params.force_limit, self._params.force_limit)
-        self._commanded = [*self._commanded, u][1:] if self._delay else []
+        self._commanded = [*self._commanded, u]
+        acting = self._commanded[0]
+        self._commanded = self._commanded[1:] if self._delay else []
+        self._before = measured, acting
         return u
+
+    def _elapsed(self, t: float) -> int:
+        return round((t - self._start) / self._task.control_dt)
+
+    def _estimate(self, x: np.ndarray) -> None:
+        """Fits the disturbance to what the model mispredicted over the last control step."""
+        if self._disturbance is None or self._before is None or not np.isfinite(x).all():
+            return
+        dt = self._task.control_dt
+        expected = dynamics.step(self._params, *self._before, dt, dynamics.substeps_for(dt))
+        self._disturbance.fit(*self._before, (x - expected)[4:] / dt)
 
     def _missed_goal(self, t: float, x: np.ndarray) -> bool:
         """Whether the plan is over, the first-exit goal is not reached, and a new plan to it was found."""
@@ -402,17 +532,60 @@ class NmpcController:
         try:
             plan = find_optimum(self._task, self._params, x, self._c, self._backoff)
         except PlanError:
+            self.counts.unplanned += 1
             self._lost = True
             return False
         self._start = t
         self.follow(plan)
         return True
 
+    def _ask_for_new_plan(self, t: float, x: np.ndarray, elapsed: int) -> None:
+        """Has the other process plan, if the plan is over or far, from where the robot will be in `_PLANNING_SECONDS`."""
+        if self._planning is not None:
+            return
+        over = elapsed >= self._length
+        if over and not self._task.first_exit:
+            return
+        if over:
+            begin, ahead = self._coasted(x), round(_PLANNING_SECONDS / self._task.control_dt)
+        else:
+            off = x - self._trajectory.x[elapsed]
+            if not off @ self._p[elapsed] @ off > _FAR:
+                return
+            node = int(np.searchsorted(self._grid.offsets, _PLANNING_SECONDS / self._task.control_dt))
+            begin, ahead = self._qp.x[node].copy(), int(self._grid.offsets[node])
+        if not np.isfinite(begin).all():
+            return
+        self.counts.replans += 1
+        self._planned_start = t + ahead * self._task.control_dt
+        self._planning = _worker().submit(prepared_plan, self._task, self._params, begin, self._c, self._backoff)
+
+    def _coasted(self, x: np.ndarray) -> np.ndarray:
+        """The state after `_PLANNING_SECONDS` under the tracker, which holds the plan's end."""
+        dt, limit = self._task.control_dt, self._params.force_limit
+        for k in range(round(_PLANNING_SECONDS / dt)):
+            u = np.clip(self._tracker.act(self._start + (self._length + k) * dt, x), -limit, limit)
+            x = dynamics.step(self._params, x, u, dt, dynamics.substeps_for(dt))
+        return x
+
+    def _take_new_plan(self, t: float) -> None:
+        """Follows the plan that the other process has made, from its start on."""
+        if self._planning is None or not self._planning.done() or t < self._planned_start - 1e-9:
+            return
+        planning, self._planning = self._planning, None
+        if planning.exception() is not None or t > self._planned_start + _STALE_SECONDS:
+            self.counts.unplanned += 1
+            return
+        self._start = self._planned_start
+        self._adopt(planning.result())
+
     def _predicted(self, x: np.ndarray) -> np.ndarray:
         """The state that the force commanded now will meet."""
         dt = self._task.control_dt
         for u in self._commanded:
             x = dynamics.step(self._params, x, u, dt, dynamics.substeps_for(dt))
+            if self._disturbance is not None:
+                x = x + dt * self._disturbance.rates(x[None], u[None] / self._params.force_limit)[0][0]
         return np.asarray(x, np.float64)
 
     def _advance(self, elapsed: int) -> None:
@@ -465,7 +638,7 @@ class NmpcController:
         self._guess_x, self._guess_a = self._x_plan + self._dx, self._a_plan + self._da
         qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
         qp.x[0] = x
-        qp.distinct = self._distinct
+        qp.distinct, qp.disturbance = self._distinct, self._disturbance
         qp.h[:-1], qp.c[:] = dt * self._lengths, self._c
         weight = (dt * self._lengths)[:, None, None]
         end = self._nodes[-1]
@@ -478,6 +651,21 @@ class NmpcController:
         self.counts.fallbacks += 1
         gain = self._tracker.gains.k[self._step]
         return self._params.force_limit * self._guess_a[0] - gain @ (x - self._guess_x[0])
+
+
+def offset_free_nmpc(task: Task, params: BallbotParams) -> NmpcController:
+    """NMPC that estimates how the robot differs from the model, and keeps more distance from its limits."""
+    return NmpcController(task, params, backoff=_OFFSET_FREE_BACKOFF, offset_free=True)
+
+
+@cache
+def _worker() -> ProcessPoolExecutor:
+    """One process that plans for all controllers. It is spawned: forking a process with threads is not safe."""
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+
+
+def _start_up() -> None:
+    """What the process does first: it has imported this module by then."""
 
 
 def _whole_steps(seconds: float, dt: float, what: str) -> int:

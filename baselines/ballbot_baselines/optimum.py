@@ -18,13 +18,14 @@ from typing import Literal
 import casadi
 import numpy as np
 
-from ballbot_baselines import guess, righting
+from ballbot_baselines import guess, righting, sides
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver, spent
 from ballbot_gym import dynamics
 from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.weave import Weave, sides_passed, split_constants
 from ballbot_gym.trajectory import Trajectory
 
 FEASIBLE = 1e-6
@@ -39,6 +40,9 @@ _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a se
 _COARSE = 2  # control steps per interval when several guesses are compared
 _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
+_SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
+ALL_GUESSES = 2**10
+"""`guesses` that make `find_optimum` solve every guess."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,8 @@ def find_optimum(
         x0: (8,) initial state.
         c: (nc,) constants of the episode.
         backoff: distance kept from limits; none for the true optimum.
-        guesses: how many of the task's guessed paths to try at most.
+        guesses: how many of the task's guessed paths to solve at most. For a slalom all choices of sides are considered, and
+            those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
         paths: ground paths to start from instead of the task's.
 
     Returns:
@@ -123,10 +128,16 @@ def find_optimum(
         PlanError: no try came to a feasible episode.
     """
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
-    paths = task.guess_paths(x0, c, params)[:guesses] if paths is None else paths
+    own_paths = paths is None
+    paths = task.guess_paths(x0, c, params) if paths is None else paths
+    likely = own_paths and isinstance(task, Weave) and 1 < guesses < len(paths) and task.steps % _COARSE == 0
+    paths = paths if likely else paths[: guesses if own_paths else None]
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
-    tried = solve(task, params, x0, c, backoff, paths)
+    if likely:
+        tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses)
+    else:
+        tried = solve(task, params, x0, c, backoff, paths)
     if not _any_optimal(tried):
         tried += _solve_from_righting(task, params, x0, c, backoff)
     if not _any_optimal(tried) and not task.first_exit:
@@ -342,6 +353,65 @@ def _simulated(
     ]
 
 
+def _solve_likely_sides(
+    task: Weave,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff,
+    paths: list[np.ndarray],
+    most: int,
+) -> list[tuple[int, OcpSolution]]:
+    """As `_solve_fixed_time`, but of all choices of sides only those are solved that are predicted to be the best, or nearly.
+
+    Every solution predicts all other choices. The search ends when no choice is left that is predicted to contend.
+    """
+    solver, quick = (
+        _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, iterations)
+        for iterations in (_MOST_ITERATIONS, _QUICK_ITERATIONS)
+    )
+    starts = _starts(task, params, x0, paths)
+    _, obstacles = split_constants(c)
+    chosen = [_side_choice(path, obstacles) for path in paths]
+    solved: dict[int, OcpSolution] = {}
+    unsolved = list(range(len(paths)))
+    predicted = np.zeros(len(paths))
+    along, predicted_y = np.zeros(0), np.zeros((0, 0))
+    while unsolved and len(solved) < most:
+        likeliest = min(unsolved, key=lambda i: predicted[i])
+        found = [s for s in solved.values() if is_feasible(s)]
+        best = min(found, key=lambda s: s.cost, default=None)
+        if best is not None and predicted[likeliest] > best.cost * (1 + _SIDE_DOUBT):
+            break
+        unsolved.remove(likeliest)
+        _, x, a = starts[likeliest]
+        if best is None:
+            solution = _solve_with(solver, x[::_COARSE], a[::_COARSE], c, backoff)
+        else:
+            solution = _solve_with(quick, x[::_COARSE], a[::_COARSE], c, backoff)
+            if not is_feasible(solution):  # the path from rest to rest is far from this choice's
+                path = np.column_stack([along, predicted_y[likeliest]])
+                x, u = guess.along_path(params, path, task.control_dt, start=x0)
+                solution = _solve_with(quick, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
+        solved[likeliest] = solution
+        if is_feasible(solution) and (best is None or solution.cost < best.cost):
+            path = guess.resampled(solution.states[:, :2], task.steps)
+            prediction = sides.predict(task, params, x0, c, path)
+            rows = {tuple(side): k for k, side in enumerate(prediction.sides.tolist())}
+            order = [rows[side] for side in chosen]
+            here = prediction.costs[rows[sides_passed(path, c)]]
+            predicted = solution.cost + prediction.costs[order] - here
+            along, predicted_y = path[:, 0], prediction.y[order]
+    fine = _refined(task, [(i, s) for i, s in solved.items() if is_feasible(s)])
+    return [(i, s) for i, x, a in fine or starts[:most] for s in _solve_from(task, params, x, a, c, backoff)]
+
+
+def _side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
+    """The sides on which a guessed path passes obstacles (n, 3), where it crosses their x."""
+    nearest = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
+    return tuple(1 if path[k, 1] > y else -1 for k, y in zip(nearest, obstacles[:, 1], strict=True))
+
+
 def _contenders(
     task: Task,
     params: BallbotParams,
@@ -359,11 +429,16 @@ def _contenders(
         solution = solver.solve(x[::_COARSE], a[::_COARSE], bounds, [*c, backoff.margin, backoff.goal])
         if is_feasible(solution):
             solved.append((index, solution))
+    return _refined(task, solved) or starts
+
+
+def _refined(task: Task, solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Starts at the coarse solutions within `_BASIN_DOUBT` of the best."""
     fine = []
     for index, solution in _distinct(solved):
         x = guess.resampled(solution.states, task.steps)
         fine.append((index, x, np.repeat(solution.inputs, _COARSE, axis=0)))
-    return fine or starts
+    return fine
 
 
 def _distinct(solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, OcpSolution]]:

@@ -4,6 +4,7 @@ import math
 import os
 from pathlib import Path
 
+from ballbot_baselines import VARIANTS
 from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
@@ -33,7 +34,7 @@ def robustness(
 
     Args:
         tasks: names of tasks.
-        controllers: as of `ballbot benchmark`.
+        controllers: as of `ballbot benchmark`; by default NMPC with a disturbance estimator, nmpc-offset-free, runs too.
         stresses: names of disturbances.
         episodes: how many of each task's certified episodes.
         quick: only 3 episodes of each task.
@@ -43,6 +44,8 @@ def robustness(
         workers: processes.
     """
     chosen = controllers_of(tasks, controllers)
+    if not controllers:
+        chosen = {task: [*group, *VARIANTS] for task, group in chosen.items()}
     physics = physics_or_default(physics)
     check_some("stress", stresses, stressed.STRESSES)
     episodes = checked_episodes(episodes, quick, few=3)

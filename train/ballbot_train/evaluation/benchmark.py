@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ballbot_baselines import CONTROLLERS
+from ballbot_baselines import VARIANTS
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization
@@ -23,7 +23,7 @@ _CHUNK = 5  # episodes of a job
 
 
 def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str, list[str]]:
-    """The controllers to run on each task: those named that the task has; without names, all it has.
+    """The controllers to run on each task: those named that the task has; without names, all it has but for variants.
 
     A policy is made for one task, and is left out for the others; tasks left without a controller are left out too.
 
@@ -35,6 +35,7 @@ def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str,
     known = {task: registry.names(make_task(task)) for task in tasks}
     if not names:
         return known
+    known = {task: [*group, *VARIANTS] for task, group in known.items()}
     # two spellings of one path are one policy
     identities = [_identity(name) for name in names]
     repeated = [name for i, name in enumerate(names) if identities[i] in identities[:i]]
@@ -70,7 +71,7 @@ def policy_digests(controllers: Mapping[str, Sequence[str]]) -> dict[str, str]:
     for task, group in controllers.items():
         shipped = shipped_policies(make_task(task))
         for name in group:
-            if name not in CONTROLLERS:
+            if not registry.is_expert(name):
                 digests[f"{task}/{name}"] = registry.digest_of(str(shipped.get(name, name)))
     return digests
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS
+from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.statistics import CONFIDENCE, interval, verdict
 
@@ -127,7 +127,7 @@ def _pairs(a: Groups, b: Groups, match: tuple[str, str] | None) -> list[tuple[st
 
 def _trained_apart(a: str, b: str, about_a: Mapping[str, Any], about_b: Mapping[str, Any]) -> bool:
     """Whether either is a learned policy and they have not the same weights."""
-    if all(name.partition("/")[2] in CONTROLLERS for name in (a, b)):
+    if all(name.partition("/")[2] in CONTROLLERS | VARIANTS for name in (a, b)):
         return False
     weights = about_a.get("policies", {}).get(a)
     return weights is None or weights != about_b.get("policies", {}).get(b)

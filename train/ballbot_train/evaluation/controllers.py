@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ballbot_baselines import CONTROLLERS
+from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
@@ -18,9 +18,14 @@ def names(task: Task) -> list[str]:
     return [*CONTROLLERS, *shipped_policies(task)]
 
 
+def is_expert(name: str) -> bool:
+    """Whether a name is an expert's or a variant's, and no policy's."""
+    return name in CONTROLLERS or name in VARIANTS
+
+
 def is_file(name: str) -> bool:
     """Whether a controller's name is the path of a policy file or of a saved model."""
-    return name not in CONTROLLERS and bool(Path(name).suffix)
+    return not is_expert(name) and bool(Path(name).suffix)
 
 
 def is_saved_model(name: str) -> bool:
@@ -107,8 +112,8 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
     """The controller that a name stands for. torch is imported only for a policy.
 
     Args:
-        name: in `CONTROLLERS`, of a policy that comes with the package ("shac"), or the path of a policy file or of a model
-            that Stable-Baselines3 or rsl_rl saved; see `saved_models`.
+        name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
+            or of a model that Stable-Baselines3 or rsl_rl saved; see `saved_models`.
         task: what it is to do.
         params: the robot it believes to control.
 
@@ -116,8 +121,8 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
-    if name in CONTROLLERS:
-        return CONTROLLERS[name](task, params)
+    if is_expert(name):
+        return (CONTROLLERS | VARIANTS)[name](task, params)
     shipped = shipped_policies(task)
     if name not in shipped and not is_file(name):
         raise ValueError(

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS
+from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import make_task
@@ -268,7 +268,7 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
     """
     if isinstance(policy, str | Path):
         name, shipped = str(policy), shipped_policies(task)
-        if name in CONTROLLERS:
+        if name in CONTROLLERS or name in VARIANTS:
             raise ValueError(
                 f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
                 "policy, or run the expert on certified episodes with evaluate"

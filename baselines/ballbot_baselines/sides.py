@@ -1,0 +1,112 @@
+"""What every choice of sides in a slalom will cost, predicted without solving it.
+
+Across the way, the robot is nearly linear and moves nearly on its own: the sides hardly change how it moves along the way. So
+the times at which it passes the obstacles are taken from one solution, and the rest is a small quadratic program: the linear
+motion across the way of least cost that clears every obstacle on its side at that time.
+
+Without obstacles the optimal force is LQR's, u = −K y. Forces v added to it cost Σ s·v², with s = R + BᵀPB, and move the
+position by the impulse response g of the closed loop. So the cheapest way to move by d at the times t costs dᵀ k(t, t)⁻¹ d,
+with the kernel k(t, t') = Σ_r g(t − r) g(t' − r) / s. The program over d is solved for all choices at once, active set by
+active set.
+
+The prediction is no bound. Measured on 8 slaloms: where it says that a choice costs Δ more than the best, it costs between
+0.2 and 1.05 Δ more, and the best choice is predicted at most 0.6 above the least.
+"""
+
+import itertools
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.linalg
+
+from ballbot_baselines.linearize import discretize, quadratic_cost
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks.weave import Weave, split_constants
+
+_ACROSS = [1, 3, 5, 7]  # y, θ, ẏ, θ̇ in a state
+_REGULARIZATION = 1e-9  # of the kernel, m²: obstacles passed in the same control step
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Choices of sides and what follows from each.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | sides | (n, obstacles) | −1 or 1, as in `Weave.side_path` |
+    | costs | (n,) | what the choice costs more than the motion without obstacles |
+    | y | (n, steps+1) | the ground position across the way, m |
+    """
+
+    sides: np.ndarray
+    costs: np.ndarray
+    y: np.ndarray
+
+
+def predict(task: Weave, params: BallbotParams, x0: np.ndarray, c: np.ndarray, path: np.ndarray) -> Prediction:
+    """Predicts every choice of sides.
+
+    Args:
+        task: the slalom.
+        params: the robot.
+        x0: (8,) initial state.
+        c: (nc,) constants.
+        path: (steps+1, 2) ground positions of one solution, m.
+    """
+    goal, obstacles = split_constants(c)
+    model = _model(task, params)
+    passed = np.array([int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]])
+    responses = model.responses[passed]
+    kernel = responses @ responses.T + _REGULARIZATION * np.eye(len(passed))
+    free = goal[1] + model.free @ (np.asarray(x0)[_ACROSS] - [goal[1], 0, 0, 0])
+    sides = np.array(list(itertools.product((-1, 1), repeat=len(passed))))
+    wanted = obstacles[:, 1] + sides * (obstacles[:, 2] + task.ball_radius)
+    prices = _prices(kernel, sides, sides * (wanted - free[passed]))
+    costs = np.einsum("ni,ij,nj->n", sides * prices, kernel, sides * prices)
+    return Prediction(sides, costs, free + (sides * prices) @ responses @ model.responses.T)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Motion across the way: `free` (steps+1, 4) are the positions without obstacles by initial state.
+
+    `responses` (steps+1, steps) are the impulse responses divided by √s.
+    """
+
+    free: np.ndarray
+    responses: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def _model(task: Weave, params: BallbotParams) -> _Model:
+    dt, rest = task.control_dt, np.zeros((1, 8))
+    a, b = (matrix[0] for matrix in discretize(params, rest, np.zeros((1, 2)), dt))
+    a, b = a[np.ix_(_ACROSS, _ACROSS)], b[_ACROSS, 1:]
+    q, r = quadratic_cost(task, rest, np.zeros((1, 2)), np.zeros(len(task.constant_names)))
+    q, r = q[0][np.ix_(_ACROSS, _ACROSS)] * dt, r[0][1:, 1:] * dt
+    p = scipy.linalg.solve_discrete_are(a, b, q, r)
+    price = r + b.T @ p @ b
+    closed = a - b @ np.linalg.solve(price, b.T @ p @ a)
+    powers = [np.eye(4)]
+    for _ in range(task.steps):
+        powers.append(closed @ powers[-1])
+    impulse = np.array([0.0, *((power @ b)[0, 0] for power in powers[:-1])])
+    responses = scipy.linalg.toeplitz(impulse, np.zeros(task.steps))
+    return _Model(np.array([power[0] for power in powers]), responses / np.sqrt(price[0, 0]))
+
+
+def _prices(kernel: np.ndarray, sides: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """(n, m) multipliers λ ≥ 0 of the programs: minimize λᵀMλ/2 − hᵀλ with M = kernel with the sides' signs, h = `least`."""
+    matrices = kernel * sides[:, :, None] * sides[:, None, :]
+    prices, open_ = np.zeros(least.shape), np.ones(len(least), bool)
+    scale = 1e-9 * np.abs(least).max(initial=1.0)
+    for active in itertools.product((False, True), repeat=least.shape[1]):
+        at = np.flatnonzero(active)
+        tried = np.zeros(least.shape)
+        if len(at):
+            tried[:, at] = np.linalg.solve(matrices[:, at[:, None], at], least[:, at, None])[..., 0]
+        reached = np.einsum("nij,nj->ni", matrices, tried)
+        solved = open_ & (tried >= -scale).all(1) & (reached >= least - 10 * scale).all(1)
+        prices[solved], open_ = tried[solved], open_ & ~solved
+    return prices

@@ -1,0 +1,61 @@
+"""Predictions of what each choice of sides in a slalom costs."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("casadi")
+
+from ballbot_baselines import sides
+from ballbot_baselines.optimum import ALL_GUESSES, find_optimum
+from ballbot_gym import certified
+from ballbot_gym.tasks.weave import Weave, sides_passed, split_constants
+
+
+@pytest.fixture
+def slaloms():
+    """Start, constants and optimal path of certified slaloms."""
+    known = certified.load("weave")
+    return [(known.states[i], known.constants[i], known.trajectories[i].x[:, :2]) for i in range(20)]
+
+
+def test_predicted_motions_clear_every_obstacle_on_their_side(slaloms, params):
+    task = Weave()
+    for x0, c, path in slaloms[:5]:
+        _, obstacles = split_constants(c)
+        found = sides.predict(task, params, x0, c, path)
+        assert len(found.sides) == 2 ** len(obstacles)
+        passed = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
+        clearance = found.sides * (found.y[:, passed] - obstacles[:, 1]) - obstacles[:, 2] - task.ball_radius
+        assert clearance.min() > -1e-6
+        assert (found.costs >= 0).all()
+        np.testing.assert_allclose(found.y[:, 0], x0[1], atol=1e-9)
+        np.testing.assert_allclose(found.y[:, -1], 0.0, atol=1e-2)
+
+
+def test_obstacles_far_from_the_way_cost_nothing_on_one_side(slaloms, params):
+    x0, c, path = slaloms[0]
+    c = c.copy()
+    c[3::3] = 8.0  # all on the left
+    found = sides.predict(Weave(), params, x0, c, path)
+    right = (found.sides == -1).all(1)
+    assert found.costs[right] == 0.0
+    assert found.costs[~right].min() > 1.0
+
+
+def test_the_optimal_choice_is_predicted_among_the_best(slaloms, params):
+    task, excess = Weave(), []
+    for x0, c, path in slaloms:
+        found = sides.predict(task, params, x0, c, path)
+        optimal = (found.sides == sides_passed(path, c)).all(1)
+        excess.append(float(found.costs[optimal][0] - found.costs.min()))
+    assert max(excess) < 1.0
+    assert np.median(excess) < 0.1
+
+
+@pytest.mark.slow
+def test_likely_choices_hold_the_best_of_all_choices(params):
+    task = Weave()
+    for seed in range(6):
+        x0, c = task.sample(np.random.default_rng(seed), params)
+        best = find_optimum(task, params, x0, c, guesses=ALL_GUESSES).cost
+        assert find_optimum(task, params, x0, c).cost == pytest.approx(best, rel=1e-3)
