@@ -7,10 +7,6 @@ import ast
 from importlib.util import find_spec
 from pathlib import Path
 
-from ballbot_gym.lazy import need
-
-need(__name__, "rich", "tyro", "minari")
-
 COMMANDS: dict[str, str] = {
     "benchmark": "ballbot_train.commands.benchmark:benchmark",
     "evaluate": "ballbot_train.commands.evaluate:evaluate",

@@ -4,7 +4,6 @@ import os
 import shlex
 from pathlib import Path
 
-import minari
 import numpy as np
 
 from ballbot_baselines.optimum import Backoff
@@ -48,6 +47,8 @@ def demos(
     with progress_bar() as progress:
         bar = progress.add_task(f"{task} {expert}", total=episodes)
         folder = write_demos(config, out, workers, lambda count: progress.advance(bar, count))
+    import minari
+
     dataset = minari.MinariDataset(folder / "data")
     facts = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
     success = np.mean([fact["success"] for fact in facts])

@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import check_names, console, physics_or_default, print_table, progress_bar
 from ballbot_train.learning.learners import LEARNERS, check_settings
@@ -192,6 +190,8 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     Raises:
         ValueError: the learner or the task does not exist.
     """
+    import tyro
+
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--task", default=Run.task)
     task = early.parse_known_args(arguments)[0].task
@@ -234,6 +234,8 @@ def _command(name: str, task: str, call: Callable[[str, Run, Any], None], comple
 
     def without_options() -> None:
         raise AssertionError("only a learner that is named is called")
+
+    import tyro
 
     function: Callable[..., None] = without_options
     if complete:
