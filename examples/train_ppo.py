@@ -57,7 +57,7 @@ def main(
     ent_coef: float | None = None,
     clip_range: float | None = None,
     target_kl: float | None = None,
-    use_sde: bool | None = None,
+    use_sde: bool = False,
     log_std_init: float | None = None,
     net_arch: tuple[int, ...] | None = None,
     relu: bool = False,
@@ -92,7 +92,7 @@ def main(
         "ent_coef": ent_coef,
         "clip_range": clip_range,
         "target_kl": target_kl,
-        "use_sde": use_sde,
+        "use_sde": use_sde or None,
         "policy_kwargs": policy or None,
     }
     settings = {name: value for name, value in settings.items() if value is not None}
