@@ -13,6 +13,7 @@ import tyro
 from ballbot_train.commands.curves import curves
 from ballbot_train.commands.train import train
 from ballbot_train.console import check_names, console
+from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.learners import LEARNERS
 
 FAILURE_PRICE = 300.0  # of a failure, where living does not pay
@@ -25,6 +26,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no-pay-no-arena": {"pay": False, "failure_price": FAILURE_PRICE, "arena": False},
     "no-symmetry": {"symmetry": "none"},
     "whole-episodes": {"episode_seconds": 8.0},
+    "no-short-episodes": {"curriculum": Curriculum()},
+    "constant-discount": {"final_gamma": 0.99},
     "few-minibatches": {"num_mini_batches": 4},
     "constant-deviation": {"final_std": 0.2},
     "constant-step-size": {"final_learning_rate": 2e-3},
@@ -36,6 +39,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "symmetry": "none",
         "episode_seconds": 8.0,
         "num_mini_batches": 4,
+        "curriculum": Curriculum(),
+        "final_gamma": 0.99,
     },
 }
 """Settings of rsl_ppo that each variant changes."""
