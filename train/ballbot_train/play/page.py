@@ -566,14 +566,16 @@ class PlayPage:
             plot.data = data
 
     def _build_plots(self, names: tuple[str, ...]) -> None:
-        for plot in self._plots:
-            plot.remove()
+        """Gives each robot its line. Plots always have the same number of lines, because a browser that is late could not
+        tell old plots from new ones.
+        """
         playground = self.playground
         self._plotted = names
         lines = [
             {"label": labels.label(name), "stroke": playground.color_of(name), "width": 2.0 if i == 0 else 1.0}
             for i, name in enumerate(names)
         ]
+        lines += [{"label": " ", "show": False}] * (1 + _OTHERS - len(names))
         optimum = {"label": "optimum", "stroke": "#222222", "width": 1.0, "dash": (4, 3)}
         first = {"label": "s"}
         kinds = (  # title, lines, what the scale reaches at least
@@ -582,7 +584,10 @@ class PlayPage:
             ("cost so far, and the optimum's dashed", [*lines, optimum], 1.0),
             ("controller time, ms", lines, 5.0),
         )
-        self._plots = []
+        if self._plots:
+            for plot, (_, series, _) in zip(self._plots, kinds, strict=True):
+                plot.series = (first, *series)
+            return
         with self._plot_tab:
             for title, series, least in kinds:
                 empty = tuple(np.zeros(2) for _ in range(len(series) + 1))
@@ -601,7 +606,7 @@ class PlayPage:
         history = self.playground.history(_PLOT_POINTS)
         t = history.seconds
         tilt, force, cost, act = [], [], [], []
-        for name in names:
+        for name in (*names, *names[:1] * (1 + _OTHERS - len(names))):  # hidden lines repeat the first
             line = history.lines[name]
             tilt.append(np.degrees(line[:, 0]))
             force.append(line[:, 1])
