@@ -367,8 +367,8 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     shown(one, "LQR")
     wait_for(lambda: len(opened.viewer.server.get_clients()) == 1)
     two.get(address)
-    shown(two, "You watch.")
-    shown(one, "You drive.")
+    shown(two, "Take the controls")
+    shown(one, "2 browsers show this page")
 
     # a push makes the robot lean
     push = "return [...document.querySelectorAll('button')].filter(b => b.innerText.trim() == 'Push')[0].click()"

@@ -73,7 +73,7 @@ class PlayPage:
         self._stopped = self._paused = False
         self._single_steps = 0
         self._stick_until = 0.0
-        self._roles: dict[int, tuple[Any, Any]] = {}
+        self._open_pages: set[int] = set()
         self._bound: list[tuple[Any, Callable[[], Any]]] = []
         self._films: ProcessPoolExecutor | None = None
         self._jobs: list[tuple[Future, Callable[[Future], None]]] = []
@@ -155,16 +155,13 @@ class PlayPage:
     def _on_connect(self, client: Any) -> None:
         if self.driver is None:
             self.driver = client.client_id
-        text = client.gui.add_markdown("", order=-20)
-        button = client.gui.add_button("Take the controls", order=-19)
-        button.on_click(lambda _: self._take_over(client.client_id))
-        self._roles[client.client_id] = text, button
+        self._open_pages.add(client.client_id)
         if client.camera.image_width < _NARROW:
             client.camera.position, client.camera.look_at = _NARROW_EYE, _NARROW_AIM
         self._show_roles()
 
     def _on_disconnect(self, client: Any) -> None:
-        self._roles.pop(client.client_id, None)
+        self._open_pages.discard(client.client_id)
         if self.driver == client.client_id:
             self.driver = None
         self._show_roles()
@@ -174,14 +171,9 @@ class PlayPage:
         self._show_roles()
 
     def _show_roles(self) -> None:
-        open_pages = self.viewer.server.get_clients()
-        for client_id, (text, button) in list(self._roles.items()):
-            if client_id not in open_pages:
-                continue
-            button.visible = self.driver not in (client_id, None)
-            watched = f" {len(self._roles) - 1} watch." if len(self._roles) > 1 else ""
-            text.content = f"**You drive.**{watched}" if self.driver == client_id else "**You watch.**"
-            text.visible = len(self._roles) > 1
+        count = len(self._open_pages)
+        self._role_text.content = f"{count} browsers show this page. One drives, the others watch."
+        self._role_text.visible = self._role_button.visible = count > 1
 
     def _may(self, client_id: int | None) -> bool:
         """Whether this browser drives. The first one that asks takes a free seat."""
@@ -234,6 +226,9 @@ class PlayPage:
     def _build(self) -> None:
         gui, playground = self._gui, self.playground
         self._status = gui.add_markdown("")
+        self._role_text = gui.add_markdown("", visible=False)
+        self._role_button = gui.add_button("Take the controls", visible=False)
+        self._role_button.on_click(lambda event: self._take_over(event.client_id))
         tabs = gui.add_tab_group()
         with tabs.add_tab("Play"):
             self._bind(
@@ -571,14 +566,16 @@ class PlayPage:
             plot.data = data
 
     def _build_plots(self, names: tuple[str, ...]) -> None:
-        for plot in self._plots:
-            plot.remove()
+        """Gives each robot its line. Plots always have the same number of lines, because a browser that is late could not
+        tell old plots from new ones.
+        """
         playground = self.playground
         self._plotted = names
         lines = [
             {"label": labels.label(name), "stroke": playground.color_of(name), "width": 2.0 if i == 0 else 1.0}
             for i, name in enumerate(names)
         ]
+        lines += [{"label": " ", "show": False}] * (1 + _OTHERS - len(names))
         optimum = {"label": "optimum", "stroke": "#222222", "width": 1.0, "dash": (4, 3)}
         first = {"label": "s"}
         kinds = (  # title, lines, what the scale reaches at least
@@ -587,7 +584,10 @@ class PlayPage:
             ("cost so far, and the optimum's dashed", [*lines, optimum], 1.0),
             ("controller time, ms", lines, 5.0),
         )
-        self._plots = []
+        if self._plots:
+            for plot, (_, series, _) in zip(self._plots, kinds, strict=True):
+                plot.series = (first, *series)
+            return
         with self._plot_tab:
             for title, series, least in kinds:
                 empty = tuple(np.zeros(2) for _ in range(len(series) + 1))
@@ -606,7 +606,7 @@ class PlayPage:
         history = self.playground.history(_PLOT_POINTS)
         t = history.seconds
         tilt, force, cost, act = [], [], [], []
-        for name in names:
+        for name in (*names, *names[:1] * (1 + _OTHERS - len(names))):  # hidden lines repeat the first
             line = history.lines[name]
             tilt.append(np.degrees(line[:, 0]))
             force.append(line[:, 1])
