@@ -12,7 +12,7 @@ What makes the tasks learnable, besides rewards that pay for living (see `ballbo
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -172,7 +172,7 @@ class Storage(RolloutStorage):
         def shuffled(values: torch.Tensor) -> torch.Tensor:
             return values.flatten(0, 1).index_select(0, order)
 
-        observations = {name: shuffled(values) for name, values in self.observations.items()}
+        observations = {name: shuffled(cast(torch.Tensor, values)) for name, values in self.observations.items()}
         actions, values, returns = shuffled(self.actions), shuffled(self.values), shuffled(self.returns)
         log_prob, advantages = shuffled(self.actions_log_prob), shuffled(self.advantages)
         assert self.distribution_params is not None
@@ -308,7 +308,7 @@ class RslPpo:
         """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
         change = self._value_of_living(gamma) - self._value_of_living(self._ppo.gamma)
         with torch.no_grad():
-            self._critic.linear.bias += change
+            self._critic.linear.bias.add_(change)
         self._ppo.gamma = self._batch.gamma = gamma
 
     def state_dict(self) -> dict[str, Any]:
