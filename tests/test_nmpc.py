@@ -350,8 +350,7 @@ def test_far_from_its_plan_it_follows_a_new_one_from_where_its_horizon_ended(par
     controller, first, x = far_from_its_plan(params)
     assert controller.plan is not first
     assert controller._start > 0.0
-    assert controller.counts.replans >= 1
-    assert controller.counts.unplanned == 0
+    assert controller.counts.replans > controller.counts.unplanned
     assert np.abs(x).max() < 0.1
 
 

@@ -130,12 +130,13 @@ def find_optimum(
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     own_paths = paths is None
     paths = task.guess_paths(x0, c, params) if paths is None else paths
-    likely = own_paths and isinstance(task, Weave) and 1 < guesses < len(paths) and task.steps % _COARSE == 0
-    paths = paths if likely else paths[: guesses if own_paths else None]
+    likely = own_paths and 1 < guesses < len(paths) and task.steps % _COARSE == 0
+    slalom = task if isinstance(task, Weave) and likely else None
+    paths = paths if slalom else paths[: guesses if own_paths else None]
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
-    if likely:
-        tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses)
+    if slalom:
+        tried = _solve_likely_sides(slalom, params, x0, c, backoff, paths, guesses)
     else:
         tried = solve(task, params, x0, c, backoff, paths)
     if not _any_optimal(tried):
