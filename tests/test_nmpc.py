@@ -1,14 +1,17 @@
+from concurrent.futures import Future
+
 import numpy as np
 import pytest
 
 pytest.importorskip("casadi")
 
+from ballbot_baselines import nmpc
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import Disturbance, Grid, NmpcController, offset_free_nmpc
 from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_gym import certified, dynamics
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.rollout import DelayedController, rollout, simulate
+from ballbot_gym.rollout import DelayedController, PlanError, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave
@@ -317,22 +320,54 @@ def test_replanning_must_be_known(params):
         NmpcController(Stabilize(), params, replanning="later")
 
 
-def test_far_from_its_plan_it_takes_a_new_one_that_another_process_makes(params):
+class AtOnce:
+    """A worker that is done at once, in this process."""
+
+    def submit(self, function, *args):
+        future = Future()
+        try:
+            future.set_result(function(*args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def far_from_its_plan(params, plan_arrives=lambda controller: None):
+    """Pushed far from its plan, 6 s long: controller, first plan and last state."""
     task = Stabilize()
     controller = NmpcController(task, params, replanning="background")
     controller.reset(0.0, REST, NO_CONSTANTS)
-    first, x, k = controller.plan, pushed(6.8, 1.6), 0
-    while controller.plan is first:
-        if controller.counts.replans and k * task.control_dt >= 0.2:
-            controller._planning.result(timeout=100)  # a robot would not wait
+    first, x = controller.plan, pushed(6.8, 1.6)
+    for k in range(300):
+        if controller.counts.replans and controller._planning is not None:
+            plan_arrives(controller)
         x = dynamics.step(params, x, controller.act(k * task.control_dt, x), task.control_dt)
-        k += 1
-        assert k < 50
-    assert controller.counts.replans == 1
-    assert controller.counts.unplanned == 0
-    # the new plan starts where the horizon expected the robot
-    np.testing.assert_allclose(controller.plan.trajectory.x[0], x, atol=1.0)
-    for _ in range(300):
-        x = dynamics.step(params, x, controller.act(k * task.control_dt, x), task.control_dt)
-        k += 1
+    return controller, first, x
+
+
+def test_far_from_its_plan_it_follows_a_new_one_from_where_its_horizon_ended(params, monkeypatch):
+    monkeypatch.setattr(nmpc, "_worker", AtOnce)
+    controller, first, x = far_from_its_plan(params)
+    assert controller.plan is not first
+    assert controller._start > 0.0
+    assert controller.counts.replans > controller.counts.unplanned
+    assert np.abs(x).max() < 0.1
+
+
+def test_without_a_new_plan_it_goes_on_with_the_old_one(params, monkeypatch):
+    def fail(*args):
+        raise PlanError("none")
+
+    monkeypatch.setattr(nmpc, "_worker", AtOnce)
+    monkeypatch.setattr(nmpc, "prepared_plan", fail)
+    controller, first, x = far_from_its_plan(params)
+    assert controller.plan is first
+    assert controller.counts.unplanned == controller.counts.replans > 0
+    assert np.abs(x).max() < 0.1
+
+
+@pytest.mark.slow
+def test_another_process_makes_the_new_plan(params):
+    controller, first, x = far_from_its_plan(params, lambda controller: controller._planning.result())
+    assert controller.plan is not first
     assert np.abs(x).max() < 0.1

@@ -22,7 +22,7 @@ def test_predicted_motions_clear_every_obstacle_on_their_side(slaloms, params):
     task = Weave()
     for x0, c, path in slaloms[:5]:
         _, obstacles = split_constants(c)
-        found = sides.predict(task, params, x0, c, path)
+        found = sides.predict(task, params, x0, c, path, task.passed_obstacles(c))
         assert len(found.sides) == 2 ** len(obstacles)
         passed = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
         clearance = found.sides * (found.y[:, passed] - obstacles[:, 1]) - obstacles[:, 2] - task.ball_radius
@@ -36,7 +36,7 @@ def test_obstacles_far_from_the_way_cost_nothing_on_one_side(slaloms, params):
     x0, c, path = slaloms[0]
     c = c.copy()
     c[3::3] = 8.0  # all on the left
-    found = sides.predict(Weave(), params, x0, c, path)
+    found = sides.predict(Weave(), params, x0, c, path, Weave().passed_obstacles(c))
     right = (found.sides == -1).all(1)
     assert found.costs[right] == 0.0
     assert found.costs[~right].min() > 1.0
@@ -45,7 +45,7 @@ def test_obstacles_far_from_the_way_cost_nothing_on_one_side(slaloms, params):
 def test_the_optimal_choice_is_predicted_among_the_best(slaloms, params):
     task, excess = Weave(), []
     for x0, c, path in slaloms:
-        found = sides.predict(task, params, x0, c, path)
+        found = sides.predict(task, params, x0, c, path, task.passed_obstacles(c))
         optimal = (found.sides == sides_passed(path, c)).all(1)
         excess.append(float(found.costs[optimal][0] - found.costs.min()))
     assert max(excess) < 1.0

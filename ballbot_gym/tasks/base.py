@@ -171,6 +171,14 @@ class Task(ABC):
         Each is (n+1, 2), m, one ball position per control step: n = `steps`, or less for first-exit tasks.
         """
 
+    def passed_obstacles(self, c: np.ndarray) -> np.ndarray | None:
+        """Obstacles passed along x, where `guess_paths` has one path for every choice of sides; None for other tasks.
+
+        Returns:
+            (n, 3) x, y and the distance that the ball's centre keeps, m.
+        """
+        return None
+
     @abstractmethod
     def observe(self, x: Vector, c: Vector) -> Vector:
         """Observation (..., no), each quantity divided by its `observation_scale`; no running statistics."""

@@ -193,6 +193,10 @@ class Weave(Task):
         paths.sort(key=lambda path: np.hypot(*np.diff(path, axis=0).T).sum())
         return paths
 
+    def passed_obstacles(self, c: np.ndarray) -> np.ndarray:
+        _, obstacles = split_constants(c)
+        return obstacles + [0.0, 0.0, self.ball_radius]
+
     def side_path(self, x: np.ndarray, goal: np.ndarray, obstacles: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
         """From rest to rest, passing obstacle i on the left where sides[i] = 1, on the right where it is −1."""
         clearance = obstacles[:, 2] + self.ball_radius + 0.1

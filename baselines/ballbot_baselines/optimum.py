@@ -25,7 +25,6 @@ from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.weave import Weave, sides_passed, split_constants
 from ballbot_gym.trajectory import Trajectory
 
 FEASIBLE = 1e-6
@@ -130,12 +129,13 @@ def find_optimum(
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     own_paths = paths is None
     paths = task.guess_paths(x0, c, params) if paths is None else paths
-    likely = own_paths and isinstance(task, Weave) and 1 < guesses < len(paths) and task.steps % _COARSE == 0
-    paths = paths if likely else paths[: guesses if own_paths else None]
+    likely = own_paths and 1 < guesses < len(paths) and task.steps % _COARSE == 0
+    obstacles = task.passed_obstacles(c) if likely else None
+    paths = paths if obstacles is not None else paths[: guesses if own_paths else None]
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
-    if likely:
-        tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses)
+    if obstacles is not None:
+        tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses, obstacles)
     else:
         tried = solve(task, params, x0, c, backoff, paths)
     if not _any_optimal(tried):
@@ -354,13 +354,14 @@ def _simulated(
 
 
 def _solve_likely_sides(
-    task: Weave,
+    task: Task,
     params: BallbotParams,
     x0: np.ndarray,
     c: np.ndarray,
     backoff: Backoff,
     paths: list[np.ndarray],
     most: int,
+    obstacles: np.ndarray,
 ) -> list[tuple[int, OcpSolution]]:
     """As `_solve_fixed_time`, but of all choices of sides only those are solved that are predicted to be the best, or nearly.
 
@@ -371,7 +372,6 @@ def _solve_likely_sides(
         for iterations in (_MOST_ITERATIONS, _QUICK_ITERATIONS)
     )
     starts = _starts(task, params, x0, paths)
-    _, obstacles = split_constants(c)
     chosen = [_side_choice(path, obstacles) for path in paths]
     solved: dict[int, OcpSolution] = {}
     unsolved = list(range(len(paths)))
@@ -396,10 +396,10 @@ def _solve_likely_sides(
         solved[likeliest] = solution
         if is_feasible(solution) and (best is None or solution.cost < best.cost):
             path = guess.resampled(solution.states[:, :2], task.steps)
-            prediction = sides.predict(task, params, x0, c, path)
+            prediction = sides.predict(task, params, x0, c, path, obstacles)
             rows = {tuple(side): k for k, side in enumerate(prediction.sides.tolist())}
             order = [rows[side] for side in chosen]
-            here = prediction.costs[rows[sides_passed(path, c)]]
+            here = prediction.costs[rows[sides.passed(path, obstacles)]]
             predicted = solution.cost + prediction.costs[order] - here
             along, predicted_y = path[:, 0], prediction.y[order]
     fine = _refined(task, [(i, s) for i, s in solved.items() if is_feasible(s)])

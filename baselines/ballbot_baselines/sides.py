@@ -22,7 +22,7 @@ import scipy.linalg
 
 from ballbot_baselines.linearize import discretize, quadratic_cost
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.weave import Weave, split_constants
+from ballbot_gym.tasks import Task
 
 _ACROSS = [1, 3, 5, 7]  # y, θ, ẏ, θ̇ in a state
 _REGULARIZATION = 1e-9  # of the kernel, m²: obstacles passed in the same control step
@@ -44,7 +44,9 @@ class Prediction:
     y: np.ndarray
 
 
-def predict(task: Weave, params: BallbotParams, x0: np.ndarray, c: np.ndarray, path: np.ndarray) -> Prediction:
+def predict(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, path: np.ndarray, obstacles: np.ndarray
+) -> Prediction:
     """Predicts every choice of sides.
 
     Args:
@@ -53,18 +55,25 @@ def predict(task: Weave, params: BallbotParams, x0: np.ndarray, c: np.ndarray, p
         x0: (8,) initial state.
         c: (nc,) constants.
         path: (steps+1, 2) ground positions of one solution, m.
+        obstacles: (n, 3) as `Task.passed_obstacles` gives.
     """
-    goal, obstacles = split_constants(c)
+    goal_y = task.reference(x0, c, params).x[-1, 1]
     model = _model(task, params)
     passed = np.array([int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]])
     responses = model.responses[passed]
     kernel = responses @ responses.T + _REGULARIZATION * np.eye(len(passed))
-    free = goal[1] + model.free @ (np.asarray(x0)[_ACROSS] - [goal[1], 0, 0, 0])
+    free = goal_y + model.free @ (np.asarray(x0)[_ACROSS] - [goal_y, 0, 0, 0])
     sides = np.array(list(itertools.product((-1, 1), repeat=len(passed))))
-    wanted = obstacles[:, 1] + sides * (obstacles[:, 2] + task.ball_radius)
+    wanted = obstacles[:, 1] + sides * obstacles[:, 2]
     prices = _prices(kernel, sides, sides * (wanted - free[passed]))
     costs = np.einsum("ni,ij,nj->n", sides * prices, kernel, sides * prices)
     return Prediction(sides, costs, free + (sides * prices) @ responses @ model.responses.T)
+
+
+def passed(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
+    """The side of each obstacle on which a path (n, 2) is where it is nearest to it: 1 for greater y, else −1."""
+    nearest = [int(np.argmin(np.hypot(*(path - obstacle[:2]).T))) for obstacle in obstacles]
+    return tuple(1 if path[k, 1] > o[1] else -1 for k, o in zip(nearest, obstacles, strict=True))
 
 
 @dataclass(frozen=True)
@@ -79,7 +88,7 @@ class _Model:
 
 
 @lru_cache(maxsize=8)
-def _model(task: Weave, params: BallbotParams) -> _Model:
+def _model(task: Task, params: BallbotParams) -> _Model:
     dt, rest = task.control_dt, np.zeros((1, 8))
     a, b = (matrix[0] for matrix in discretize(params, rest, np.zeros((1, 2)), dt))
     a, b = a[np.ix_(_ACROSS, _ACROSS)], b[_ACROSS, 1:]
