@@ -725,6 +725,7 @@ TYPED = [
     ("benchmark --tasks turn --controllers /", "unknown controller /"),
     ("benchmark --episodes -1", "episodes must be 1 to 200, not -1"),
     ("demos --backoff.margin nan", "margin must be at least 0 and below inf, not nan"),
+    ("demos --pushes 1e9", "pushes must be at most 50 per second, one in every control step"),
     ("demos --pushes inf", "pushes must be finite and at least 0, not inf"),
     ("certify --episodes 3 --install", "the package needs sets of 200 episodes"),
     ("paper --only fig9", "unknown problem fig9"),
