@@ -354,7 +354,7 @@ def main() -> None:
     _import_libraries()
     failed = []
     with tempfile.TemporaryDirectory() as folder:
-        demos = Path(folder) / "demos" / "tiny-v0"
+        demos = Path(folder) / "demonstrations" / "tiny-v0"
         if any("{demos}" in COMMANDS[name].words for name in options.commands):
             Trial("demos", Path(folder), demos, 0, random.Random()).start(demos).wait(_LIMIT)
         for name in options.commands:

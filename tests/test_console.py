@@ -55,7 +55,7 @@ def test_a_run_that_was_interrupted_on_a_busy_machine_stays_one_of_a_busy_machin
     monkeypatch.setattr(provenance, "load", lambda: 9.0)
     provenance.LoadRecord(tmp_path, 1)
     with (tmp_path / "unfinished" / "loads.jsonl").open("a") as file:
-        file.write("[9.")  # the kill
+        file.write("\n[9.")  # the kill
     monkeypatch.setattr(provenance, "load", lambda: 0.5)
     assert provenance.LoadRecord(tmp_path, 1).facts() == {"busy": True, "load_start": 9.0, "load_end": 0.5}
     assert not provenance.LoadRecord(tmp_path / "other", 1).facts()["busy"]

@@ -13,6 +13,7 @@ from ballbot_train import jobs
 from ballbot_train.console import check_least, check_some, console, progress_bars
 from ballbot_train.provenance import provenance
 
+_MOST_EPISODES = 100_000
 _CHUNK = 5  # episodes of a job
 
 
@@ -34,6 +35,8 @@ def certify(
     """
     check_some("task", tasks, TASKS)
     check_least(1, episodes=episodes, workers=workers)
+    if episodes > _MOST_EPISODES:
+        raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}")
     if install and episodes < certified.EPISODES:
         raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
     facts = provenance()

@@ -82,6 +82,9 @@ class DemoConfig:
         for name in ("noise", "pushes"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and at least 0, not {getattr(self, name)}")
+        most = round(1 / make_task(self.task).control_dt)
+        if self.pushes > most:
+            raise ValueError(f"pushes must be at most {most} per second, one in every control step, not {self.pushes}")
 
     def episode_seed(self, i: int) -> int:
         """Seed with which the env is reset in episode i."""
