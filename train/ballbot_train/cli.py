@@ -50,7 +50,10 @@ def _run(arguments: list[str]) -> int:
         errors.print("interrupted; the same command continues where it stopped")
         return 130
     except ModuleNotFoundError as error:
-        errors.print(f'ballbot: {error}; pip install "ballbot-gym[train]" installs what the commands need', style="red")
+        hint = (
+            "" if "pip install" in str(error) else '; pip install "ballbot-gym[train]" installs what the commands need'
+        )
+        errors.print(f"ballbot: {error}{hint}", style="red")
         return 1
     except (ValueError, TypeError, ImportError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and not _is_expected(error):
