@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
-from ballbot_train.learning.critics import CriticInputs
+from ballbot_train.learning.critics import CriticInputs, value_of_living
 from ballbot_train.learning.learners import LEARNERS, rsl_ppo
 
 TINY = {
@@ -93,6 +93,28 @@ def test_the_deviation_and_the_step_size_fall_as_they_are_set():
     logged = [learner.iterate() for _ in range(3)]
     assert [log["train/std"] for log in logged] == pytest.approx([0.2, 0.1, 0.05])
     assert [log["train/learning_rate"] for log in logged] == pytest.approx([1e-3, 10**-3.5, 1e-4])
+
+
+def test_the_discount_rises_and_takes_all_values_with_it():
+    learner = make(gamma=0.99, final_gamma=0.999)
+    seen = learner._env.get_observations()
+    living = []  # what the critic says beyond the value of living for ever
+    for gamma in (0.99, 0.995, 0.999):
+        learner._set_gamma(gamma)
+        with torch.no_grad():
+            value = learner._critic(seen)
+        living.append(value - value_of_living(learner._task, learner.config.reward_scale, gamma))
+    torch.testing.assert_close(living[1], living[0], atol=1e-4, rtol=0)
+    torch.testing.assert_close(living[2], living[0], atol=1e-4, rtol=0)
+    learner._set_gamma(0.99)
+    logged = [learner.iterate()["train/gamma"] for _ in range(3)]
+    assert logged == pytest.approx([0.99, 1 - 10**-2.5, 0.999])
+
+
+@pytest.mark.parametrize("setting", ["gamma", "final_gamma"])
+def test_a_discount_that_is_no_discount_is_refused(setting):
+    with pytest.raises(ValueError, match=f"^{setting} must be between 0 and 1, not 1"):
+        make(**{setting: 1.0})
 
 
 @pytest.mark.parametrize(

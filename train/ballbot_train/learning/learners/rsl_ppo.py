@@ -204,10 +204,9 @@ class RslPpo:
         """
         if demos is not None and not config.curriculum.starts_on_optima:
             raise ValueError("rsl_ppo uses demonstrations only with --curriculum.starts-on-optima above 0")
-        if not 0 < config.gamma <= config.final_gamma < 1:
-            raise ValueError(
-                f"gamma {config.gamma:g} and final_gamma {config.final_gamma:g} must be in (0, 1), in this order"
-            )
+        for name in ("gamma", "final_gamma"):
+            if not 0 < getattr(config, name) < 1:
+                raise ValueError(f"{name} must be between 0 and 1, not {getattr(config, name):g}")
         self.config, self.iteration, self._task = config, 0, task
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         torch.manual_seed(seed)
