@@ -97,8 +97,9 @@ class RslPpoConfig:
 TUNED: dict[str, RslPpoConfig] = {
     "stabilize": RslPpoConfig(
         symmetry="odd",
-        total_iterations=400,
-        final_gamma=0.9985,
+        total_iterations=560,
+        gamma=0.995,
+        final_gamma=0.999,
         curriculum=Curriculum(short_episodes=0.85),
     ),
     "orbit": RslPpoConfig(symmetry="frame", total_iterations=600, gae_lambda=0.95),
