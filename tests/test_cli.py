@@ -259,16 +259,20 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     solved, again = [], []
     find_optimum = certification.find_optimum
 
-    def find(*arguments):
+    def find(*arguments, **options):
         if len(solved) == 2:
             raise KeyboardInterrupt
         solved.append(arguments)
-        return find_optimum(*arguments)
+        return find_optimum(*arguments, **options)
+
+    def find_again(*arguments, **options):
+        again.append(arguments)
+        return find_optimum(*arguments, **options)
 
     monkeypatch.setattr(certification, "find_optimum", find)
     with pytest.raises(KeyboardInterrupt):
         certify(("turn",), 3, workers=1)
-    monkeypatch.setattr(certification, "find_optimum", lambda *arguments: again.append(1) or find_optimum(*arguments))
+    monkeypatch.setattr(certification, "find_optimum", find_again)
     certify(("turn",), 3, workers=1)
     assert (len(solved), len(again)) == (2, 1)
     out = tmp_path / "runs" / "certify"
@@ -319,7 +323,7 @@ def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
 def test_certify_says_which_episode_has_no_optimum_and_writes_no_set(tmp_path, monkeypatch):
     certification = importlib.import_module("ballbot_baselines.certification")
 
-    def fail(*arguments):
+    def fail(*arguments, **options):
         raise PlanError("no plan")
 
     monkeypatch.setattr(certification, "find_optimum", fail)

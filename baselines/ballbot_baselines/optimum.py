@@ -136,11 +136,13 @@ def find_optimum(
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
     if obstacles is not None:
         tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses, obstacles)
+    elif not own_paths and len(paths) == 1 and not task.first_exit:  # nothing but this path, however long it takes
+        tried = _solve_patiently(task, params, x0, c, backoff, paths)
     else:
         tried = solve(task, params, x0, c, backoff, paths)
     if not _any_optimal(tried):
         tried += _solve_from_righting(task, params, x0, c, backoff)
-    if not _any_optimal(tried) and not task.first_exit:
+    if not _any_optimal(tried) and not task.first_exit and own_paths:
         tried += _solve_patiently(task, params, x0, c, backoff, paths)
     best = min((t for t in tried if is_within_limits(t[1])), key=_rank, default=None)
     if best is None:
