@@ -134,16 +134,17 @@ def find_optimum(
     paths = paths if obstacles is not None else paths[: guesses if own_paths else None]
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     solve = _solve_first_exit if task.first_exit else _solve_fixed_time
+    alone = own_paths and len(paths) == 1 and not task.first_exit
     if obstacles is not None:
         tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses, obstacles)
-    elif not own_paths and len(paths) == 1 and not task.first_exit:  # nothing but this path, however long it takes
-        tried = _solve_patiently(task, params, x0, c, backoff, paths)
+    elif alone:
+        tried = _solve_quickly(task, params, x0, c, backoff, paths)
     else:
         tried = solve(task, params, x0, c, backoff, paths)
     if not _any_optimal(tried):
         tried += _solve_from_righting(task, params, x0, c, backoff)
-    if not _any_optimal(tried) and not task.first_exit and own_paths:
-        tried += _solve_patiently(task, params, x0, c, backoff, paths)
+    if alone and not _any_optimal(tried):
+        tried += _solve_fixed_time(task, params, x0, c, backoff, paths)
     best = min((t for t in tried if is_within_limits(t[1])), key=_rank, default=None)
     if best is None:
         tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for _, s in tried)
@@ -284,20 +285,17 @@ def _solve_fixed_time(
     compare the paths. Only the paths that may be the best are then solved in full.
     """
     starts = _starts(task, params, x0, paths)
-    if len(paths) == 1:
-        solver = _solver(task, params, task.steps, "fatrop", iterations=_QUICK_ITERATIONS)
-        return [(i, _solve_with(solver, x, a, c, backoff)) for i, x, a in starts]
-    if task.steps % _COARSE == 0:
+    if len(paths) > 1 and task.steps % _COARSE == 0:
         starts = _contenders(task, params, x0, c, backoff, starts)
     return [(i, s) for i, x, a in starts for s in _solve_from(task, params, x, a, c, backoff)]
 
 
-def _solve_patiently(
+def _solve_quickly(
     task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, paths: list[np.ndarray]
 ) -> list[tuple[int, OcpSolution]]:
-    """From every path with both solvers and many iterations; only where there is one path, because else it was done."""
-    starts = _starts(task, params, x0, paths) if len(paths) == 1 else []
-    return [(i, s) for i, x, a in starts for s in _solve_from(task, params, x, a, c, backoff)]
+    """From every path with fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
+    solver = _solver(task, params, task.steps, "fatrop", iterations=_QUICK_ITERATIONS)
+    return [(i, _solve_with(solver, x, a, c, backoff)) for i, x, a in _starts(task, params, x0, paths)]
 
 
 def _starts(
