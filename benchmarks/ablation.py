@@ -27,7 +27,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no-symmetry": {"symmetry": "none"},
     "whole-episodes": {"episode_seconds": 8.0},
     "no-short-episodes": {"curriculum": Curriculum()},
-    "constant-discount": {"final_gamma": 0.99},
+    "constant-discount": {"final_gamma": 0.995},
     "few-minibatches": {"num_mini_batches": 4},
     "constant-deviation": {"final_std": 0.2},
     "constant-step-size": {"final_learning_rate": 2e-3},
@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "episode_seconds": 8.0,
         "num_mini_batches": 4,
         "curriculum": Curriculum(),
-        "final_gamma": 0.99,
+        "final_gamma": 0.995,
     },
 }
 """Settings of rsl_ppo that each variant changes."""

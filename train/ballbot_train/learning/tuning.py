@@ -69,6 +69,14 @@ class Choice:
 
 _WIDTHS = Choice(((64, 64), (128, 128), (256, 256)))
 _GAMMAS = Choice((0.98, 0.99, 0.995, 0.998))
+_OF_PPO: dict[str, Range | Choice] = {
+    "clip_range": Choice((0.1, 0.2, 0.3)),
+    "max_grad_norm": Range(0.2, 5.0),
+    "std": Range(0.1, 0.8),
+    "final_std": Range(0.01, 0.1),
+    "reward_scale": Range(0.005, 0.2),
+    "hidden": _WIDTHS,
+}
 
 SPACES: dict[str, dict[str, Range | Choice]] = {
     "ppo": {
@@ -79,12 +87,7 @@ SPACES: dict[str, dict[str, Range | Choice]] = {
         "final_learning_rate_fraction": Range(0.005, 0.5),
         "gamma": _GAMMAS,
         "gae_lambda": Range(0.9, 0.99, log=False),
-        "clip_range": Choice((0.1, 0.2, 0.3)),
-        "max_grad_norm": Range(0.2, 5.0),
-        "std": Range(0.1, 0.8),
-        "final_std": Range(0.01, 0.1),
-        "reward_scale": Range(0.005, 0.2),
-        "hidden": _WIDTHS,
+        **_OF_PPO,
     },
     "rsl_ppo": {
         "num_steps": Choice((16, 24, 48)),
@@ -95,12 +98,7 @@ SPACES: dict[str, dict[str, Range | Choice]] = {
         "gamma": _GAMMAS,
         "final_gamma": Choice((0.99, 0.995, 0.998, 0.9985, 0.999)),
         "gae_lambda": Range(0.8, 0.99, log=False),
-        "clip_range": Choice((0.1, 0.2, 0.3)),
-        "max_grad_norm": Range(0.2, 5.0),
-        "std": Range(0.1, 0.8),
-        "final_std": Range(0.01, 0.1),
-        "reward_scale": Range(0.005, 0.2),
-        "hidden": _WIDTHS,
+        **_OF_PPO,
         "critic_hidden": _WIDTHS,
     },
     "sac": {
