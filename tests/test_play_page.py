@@ -2,7 +2,6 @@
 
 import contextlib
 import http.client
-import shutil
 import socket
 import threading
 import time
@@ -12,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from browser import start_chromium
 
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.viewer import Viewer
@@ -23,8 +23,6 @@ from ballbot_train.policy_files import SHIPPED
 viser = pytest.importorskip("viser")
 
 STANDING = 3  # a certified episode of Stabilize in which LQR comes to rest
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-DRIVER = shutil.which("chromedriver")
 
 
 class Opened:
@@ -326,21 +324,12 @@ def test_what_is_no_request_is_dropped(gate):
 
 @pytest.fixture
 def chromium(tmp_path_factory):
-    webdriver = pytest.importorskip("selenium.webdriver")
-    if not (CHROMIUM and DRIVER):
-        pytest.skip("no chromium and chromedriver")
     started = []
 
     def start():
-        options = webdriver.ChromeOptions()
-        options.binary_location = CHROMIUM
-        for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=640,480"):
-            options.add_argument(argument)
-        for argument in ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"):
-            options.add_argument(argument)
-        options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('chromium')}")
-        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-        browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+        browser = start_chromium(
+            tmp_path_factory.mktemp("chromium"), "640,480", "use-gl=angle", "use-angle=swiftshader"
+        )
         started.append(browser)
         return browser
 

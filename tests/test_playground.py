@@ -12,6 +12,7 @@ import casadi
 import numpy as np
 import pytest
 import torch
+from browser import start_chromium
 
 from ballbot_gym import certified, dynamics
 from ballbot_gym.env import BallbotEnv, make_task
@@ -201,23 +202,9 @@ def test_saved_models_of_other_libraries_are_refused(tmp_path, monkeypatch):
         engine_script([str(tmp_path / "model.zip")])
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-DRIVER = shutil.which("chromedriver")
-FLAGS = ("headless", "no-sandbox", "no-first-run", "disable-background-networking", "disable-component-update")
-
-
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    webdriver = pytest.importorskip("selenium.webdriver")
-    if not (CHROMIUM and DRIVER):
-        pytest.skip("no chromium and chromedriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in (*FLAGS, "disable-sync", "disable-dev-shm-usage", "enable-unsafe-swiftshader", "window-size=800,600"):
-        options.add_argument(f"--{flag}")
-    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('chromium')}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    driver = start_chromium(tmp_path_factory.mktemp("chromium"), "800,600")
     yield driver
     driver.quit()
 

@@ -2,11 +2,11 @@
 
 import json
 import re
-import shutil
 import time
 
 import numpy as np
 import pytest
+from browser import start_chromium
 from markupsafe import Markup
 
 from ballbot_gym.tasks.marker import Marker
@@ -26,22 +26,6 @@ from ballbot_train.report.page import (
 from ballbot_train.report.replay import Replay, Take
 from ballbot_train.report.sections import learning_section
 
-webdriver = pytest.importorskip("selenium.webdriver")
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-DRIVER = shutil.which("chromedriver")
-FLAGS = (
-    "headless",
-    "no-sandbox",
-    "disable-quic",
-    "no-first-run",
-    "disable-background-networking",
-    "disable-component-update",
-    "disable-sync",
-    "disable-dev-shm-usage",
-    "enable-unsafe-swiftshader",  # WebGL without a GPU
-    "window-size=1280,1600",
-)
 LARGEST = 15e6  # bytes
 
 HEADER = ["task", "controller", "regret", "falls"]
@@ -151,15 +135,7 @@ def test_learning_curves_come_from_what_training_wrote(tmp_path):
 
 @pytest.fixture(scope="module")
 def chromium(tmp_path_factory):
-    if not (CHROMIUM and DRIVER):
-        pytest.skip("no chromium and chromedriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in FLAGS:
-        options.add_argument(f"--{flag}")
-    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('chromium')}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    browser = start_chromium(tmp_path_factory.mktemp("chromium"), "1280,1600")
     yield browser
     browser.quit()
 

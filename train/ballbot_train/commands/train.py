@@ -159,7 +159,7 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int
 
 
 def _row(name: str, values: Mapping[str, Any]) -> list[str]:
-    shares = f"{values['success']:.1%}", f"{values['failures']:g}", f"{values['regret_mean']:.2%}"
+    shares = f"{values['success']:.1%}", f"{values['failures']:g}", _share(values["regret_mean"])
     return [name, "", *shares, f"{values['minutes']:.1f}"]
 
 

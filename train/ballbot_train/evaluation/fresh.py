@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import make_task
@@ -27,7 +26,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import is_file, is_saved_model
+from ballbot_train.evaluation.controllers import is_expert, is_file, is_saved_model
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
@@ -268,7 +267,7 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
     """
     if isinstance(policy, str | Path):
         name, shipped = str(policy), shipped_policies(task)
-        if name in CONTROLLERS or name in VARIANTS:
+        if is_expert(name):
             raise ValueError(
                 f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
                 "policy, or run the expert on certified episodes with evaluate"
