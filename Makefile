@@ -40,12 +40,13 @@ fuzz: $(VENV)/installed
 docs: $(VENV)/installed
 	$(BIN)/mkdocs build --strict
 
-# RLlib is tested where it is installed; it pins another Gymnasium, so that it cannot be here. RL Zoo wants an older dateutil.
-CLIENTS := torchrl skrl rl-zoo3 rsl-rl-lib minari[create]
+# RLlib is tested where it is installed; it pins another Gymnasium, so that it cannot be here. RL Zoo wants an older dateutil,
+# and torchrl an older tensordict; without this minimum pip takes a torchrl from before Gymnasium 1.
+CLIENTS := torchrl>=0.14 skrl rl-zoo3 rsl-rl-lib minari[create]
 
 clients: $(VENV)/installed
 	$(BIN)/python -m venv .venv-clients
-	grep -v "^python-dateutil" constraints.txt > .venv-clients/constraints.txt
+	grep -v "^python-dateutil\|^tensordict" constraints.txt > .venv-clients/constraints.txt
 	.venv-clients/bin/pip install -c .venv-clients/constraints.txt "torch==2.13.0"
 	.venv-clients/bin/pip install -c .venv-clients/constraints.txt -e ".[all]" pytest $(patsubst %,"%",$(CLIENTS))
 	.venv-clients/bin/python -m pytest -rs tests/test_clients.py

@@ -39,5 +39,5 @@ def test_every_client_that_make_installs_has_a_section():
     makefile = (ROOT / "Makefile").read_text()
     listed = re.search(r"^CLIENTS := (.*)$", makefile, re.MULTILINE)[1].split()
     imported = set().union(*map(libraries, SECTIONS))
-    modules = {"rl-zoo3": "rl_zoo3", "rsl-rl-lib": "rsl_rl", "minari[create]": "minari"}
+    modules = {"torchrl>=0.14": "torchrl", "rl-zoo3": "rl_zoo3", "rsl-rl-lib": "rsl_rl", "minari[create]": "minari"}
     assert {modules.get(name, name) for name in listed} <= imported

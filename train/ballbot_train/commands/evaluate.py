@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
@@ -21,7 +20,7 @@ from ballbot_train.console import (
     progress_bars,
 )
 from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
-from ballbot_train.evaluation.controllers import make_controller, task_name
+from ballbot_train.evaluation.controllers import is_expert, make_controller, task_name
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
 from ballbot_train.provenance import LoadRecord, provenance
 
@@ -77,7 +76,7 @@ def evaluate(
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
     if not fresh and not episodes:
         raise ValueError("nothing to run: give --fresh or --episodes")
-    if fresh and policy in CONTROLLERS:
+    if fresh and is_expert(policy):
         raise ValueError(
             f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a policy, "
             "or run the expert on certified episodes with --episodes"

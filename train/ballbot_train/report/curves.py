@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.stats
 from matplotlib.figure import Figure
 
 from ballbot_gym import files
@@ -81,9 +82,7 @@ class LearningCurve:
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
     """(..., m) mean of the middle half of (..., n, m) values over n."""
-    cut = values.shape[-2] // 4
-    kept = np.sort(values, axis=-2)[..., cut : values.shape[-2] - cut, :]
-    return kept.mean(-2)
+    return scipy.stats.trim_mean(values, 0.25, axis=-2)
 
 
 def bootstrap_band(values: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
