@@ -33,6 +33,33 @@ _LARGEST_PUSH_ARROW = 1.0  # m
 _FOLLOW = 0.15  # share of the distance by which the camera follows in each drawing
 _GRAB_REACH = 3.0  # m, the farthest that a drag counts
 
+# viser's page connects again only where it has the focus: it asks for the focus whenever it has no connection. It also begins
+# another attempt every second. After some failures Chromium delays attempts by more than that, so that none lasts.
+# Here the page waits until the server answers, and then has viser begin one attempt, by a moment of focus.
+_CONNECT_AGAIN = """
+if (window.connectsAgain) return;
+window.connectsAgain = true;
+let focus = false, busy = false;
+async function connectAgain() {
+  busy = true;
+  for (let answered = false; !answered; ) {
+    await new Promise((resolve) => setTimeout(resolve, 1000));
+    const request = new AbortController();
+    const asked = fetch(location.href, {cache: "no-store", signal: request.signal});
+    const status = await asked.then((answer) => answer.status, () => 0);
+    request.abort();
+    if (status === 401) location.reload();  // another token is needed, and the answer says so
+    answered = status === 200;
+  }
+  for (focus of [true, false]) window.dispatchEvent(new Event(focus ? "focus" : "blur"));
+  busy = false;
+}
+document.hasFocus = () => {
+  if (!busy) connectAgain();
+  return focus;
+};
+"""
+
 Grab = Callable[[int, str, np.ndarray], None]
 """Gets the id of the client who drags the robot, "start", "update" or "end", and how far (2,) on the floor, m."""
 
@@ -66,6 +93,7 @@ class Viewer:
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints an address that may not be the one to open
             self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        self.server.gui._websock_interface.queue_message(viser._messages.RunJavascriptMessage(source=_CONNECT_AGAIN))
         self.follow = follow
         self.on_grab: Grab | None = None
         self._host = host
