@@ -463,12 +463,25 @@ class NmpcController:
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         """Plans from the state that the first force will meet."""
+        self._begin(t, c)
+        self.follow(find_optimum(self._task, self._params, self._predicted(x), self._c, self._backoff))
+
+    def start(self, t: float, c: np.ndarray, prepared: Prepared) -> None:
+        """As `reset`, with a plan that `prepared_plan` has made before, for instance in another process."""
+        self._begin(t, c)
+        self._adopt(prepared)
+
+    @property
+    def backoff(self) -> Backoff:
+        """How far its plans keep from their limits."""
+        return self._backoff
+
+    def _begin(self, t: float, c: np.ndarray) -> None:
         self._start, self._c, self._lost = t, np.asarray(c, np.float64), False
         self._disturbance = Disturbance(self._params.force_limit) if self._offset_free else None
         self._before: tuple[np.ndarray, np.ndarray] | None = None
         self._planning: Future[Prepared] | None = None
         self._commanded = [np.zeros(2)] * self._delay
-        self.follow(find_optimum(self._task, self._params, self._predicted(x), self._c, self._backoff))
 
     def follow(self, plan: Optimum) -> None:
         """Takes a plan of the episode, and starts the horizon on it."""

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Literal
 
-from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import HOST, PORT, Viewer, import_viser
-from ballbot_train.console import check_names, console
+from ballbot_train.console import console
+from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.play.gate import Gate
 from ballbot_train.play.page import PlayPage
 from ballbot_train.play.playground import Playground
@@ -14,10 +14,11 @@ _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 def play(
-    task: str = "stabilize",
+    task: str | None = None,
     /,
     controller: str = "nmpc",
     ghosts: tuple[str, ...] = ("lqr",),
+    policies: tuple[str, ...] = (),
     episode: int | None = 0,
     physics: Literal["bullet", "rk4"] | None = None,
     robot: str = "paper",
@@ -29,9 +30,11 @@ def play(
     """Opens a page on which you push the robot, change it, drive it, and compare controllers.
 
     Args:
-        task: name of a task.
-        controller: of the robot: an expert, a shipped policy, a policy's .json, "you" or "you (force)".
+        task: name of a task; default the one that the controller's file names or whose observations fit, or else stabilize.
+        controller: of the robot: an expert, a policy that comes with the package, a policy file, a model saved by
+            Stable-Baselines3 (.zip) or rsl_rl (.pt), "you" or "you (force)".
         ghosts: controllers that get the same start and the same pushes beside it.
+        policies: more policy files and saved models, which the page offers in the tasks that they are made for.
         episode: index of the certified episode it starts with; None for a random start.
         physics: "bullet" or "rk4"; default, bullet where PyBullet is installed.
         robot: name of a robot.
@@ -40,9 +43,9 @@ def play(
         port: where the page is; the next free one, if it is taken.
         out: folder of saved files.
     """
-    check_names("task", [task], TASKS)
+    task = task_name(controller, task)
     import_viser()
-    playground = Playground(task, controller, ghosts, physics, episode, seed, robot)
+    playground = Playground(task, controller, ghosts, physics, episode, seed, robot, policies, other_process=True)
     local = host in _LOCAL
     viewer = Viewer(HOST if not local else host, port if local else 0, "ballbot play")
     gate = None if local else Gate(host, port, viewer.port)

@@ -1,21 +1,87 @@
 """Work that takes longer than a control step, such as planning, beside a simulation that goes on."""
 
+import contextlib
+import multiprocessing
+import pickle
+import signal
 import threading
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 _ONE_JOB = threading.Lock()  # solvers are kept for reuse, and none may be used by two threads at once
 _CLOSING = 30.0  # s, that `close` waits for the job that is being done
 
 
+class OtherProcess:
+    """Another process that calls functions, one at a time.
+
+    Threads of one process take turns at running Python. So a simulation in real time would wait for the setup of a solver.
+    """
+
+    def __init__(self) -> None:
+        """Starts it. It is spawned: forking a process with threads is not safe."""
+        context = multiprocessing.get_context("spawn")
+        self._here, there = context.Pipe()
+        self._process = context.Process(target=_serve, args=(there,), daemon=True, name="ballbot-play")
+        self._process.start()
+        there.close()
+
+    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What the function returns there. It is named in a module, and arguments and result can be pickled.
+
+        Raises:
+            EOFError: the process has ended.
+            Exception: what the function raises.
+        """
+        try:
+            self._here.send((function, arguments))
+            succeeded, value = self._here.recv()
+        except OSError as error:
+            raise EOFError("the process that plans has ended") from error
+        if succeeded:
+            return value
+        raise value
+
+    @property
+    def pid(self) -> int:
+        """Its number."""
+        assert self._process.pid is not None
+        return self._process.pid
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.is_alive()
+
+    def close(self) -> None:
+        """Ends it, whatever it does; may be called again."""
+        self._process.terminate()
+        self._process.join()
+
+
+def _serve(there: Connection) -> None:
+    """What the other process does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the process that started this one
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            function, arguments = there.recv()
+            try:
+                there.send_bytes(pickle.dumps((True, function(*arguments))))
+            except Exception as error:  # the one who asked decides what it means
+                there.send((False, error))
+
+
 class Background:
     """One thread that does jobs by key, in the order in which they came. Solvers let the simulation run while they compute.
 
     A new job replaces an older one of the same key. So while a slider moves, only its last value is worked on. All methods
-    are for the thread of the simulation.
+    are for the thread of the simulation, except `compute`, which is for jobs.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, other_process: bool = False):
+        """Starts the thread. With another process, `compute` calls functions there."""
+        self._other = OtherProcess() if other_process else None
         self._changed = threading.Condition()
         self._jobs: dict[str, tuple[int, Callable[[], Any]]] = {}
         self._done: dict[str, tuple[int, Any]] = {}
@@ -59,6 +125,23 @@ class Background:
         with self._changed:
             return self._changed.wait_for(lambda: all(self._ended(key) for key in self._wanted), seconds)
 
+    def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What a function returns, that may be called in another process.
+
+        Raises:
+            Exception: what the function raises.
+        """
+        if self._other is None:
+            return function(*arguments)
+        if not self._other.is_alive and not self._closed:
+            self._other = OtherProcess()
+        return self._other(function, *arguments)
+
+    @property
+    def other_pid(self) -> int | None:
+        """The number of the other process; None if there is none."""
+        return None if self._other is None else self._other.pid
+
     def close(self) -> None:
         """Ends the thread after the job that it does, and waits for that; may be called again."""
         with self._changed:
@@ -66,6 +149,8 @@ class Background:
             self._jobs.clear()
             self._wanted.clear()
             self._changed.notify_all()
+        if self._other is not None:
+            self._other.close()
         self._thread.join(_CLOSING)
 
     def _ended(self, key: str) -> bool:

@@ -4,6 +4,7 @@ Callbacks of viser run in other threads. They put requests into a queue, and the
 steps. So the playground itself needs no locks.
 """
 
+import gc
 import math
 import queue
 import time
@@ -17,6 +18,7 @@ import numpy as np
 
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
+from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play.clock import Clock
 from ballbot_train.play.playground import AT_END, DRIVERS, LARGEST_PUSH, PLANT, ROBOTS, Playground
@@ -48,6 +50,7 @@ _FILE_ENDINGS = {"film (WebP)": ".webp", "film (MP4)": ".mp4"}
 _FILM_WIDTH = 640  # px
 _FILM_FPS = 20
 
+_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip) or rsl_rl (.pt), where the simulation runs"
 _HELP = "Drag the robot and let go to push it."
 _TIME_BUTTONS = ("Play / pause", "Step", "Restart")
 _START_BUTTONS = ("Certified", "Random")
@@ -70,7 +73,7 @@ class PlayPage:
         """Id of the browser that drives; the next that touches anything, if None."""
         self._gui = viewer.server.gui
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._stopped = self._paused = False
+        self._stopped = self._paused = self._moving = False
         self._single_steps = 0
         self._stick_until = 0.0
         self._open_pages: set[int] = set()
@@ -95,7 +98,9 @@ class PlayPage:
         next_draw = next_plot = next_text = drawn = 0.0
         while not self._stopped and (now := time.perf_counter()) < end:
             self._do_requests()
-            moving = self._advance()
+            stood, self._moving = not self._moving, self._advance()
+            if stood and self._moving:
+                self._collect_garbage()
             now = time.perf_counter()
             if now >= next_draw and (self.clock.wait() > 0 or now - drawn > _STARVED):
                 self.viewer.draw(self.playground.drawing())
@@ -107,7 +112,7 @@ class PlayPage:
                     self._write()
                     next_text = now + 1 / _TEXT_HZ
             until = min(next_draw, end) - time.perf_counter()
-            time.sleep(max(0.0, min(until, self.clock.wait() if moving else _IDLE)))
+            time.sleep(max(0.0, min(until, self.clock.wait() if self._moving else _IDLE)))
 
     def stop(self) -> None:
         """Ends `run`; from any thread."""
@@ -117,6 +122,13 @@ class PlayPage:
         """Gives up films that are not finished."""
         if self._films is not None:
             self._films.shutdown(wait=False, cancel_futures=True)
+
+    def _collect_garbage(self) -> None:
+        """Does it when the robot begins to move. A collection of everything that was imported would be a step too late."""
+        gc.unfreeze()
+        gc.collect()
+        gc.freeze()
+        self.clock.stop()  # the pause that this made is not caught up
 
     def _advance(self) -> bool:
         """Does the steps that are due; whether the simulation moves."""
@@ -244,7 +256,7 @@ class PlayPage:
                 )
             self._controller = gui.add_dropdown("Controller", ("",))
             self._bind(self._controller, self._choose, lambda: self._option(playground.controller))
-            file = gui.add_text("Policy file", "", hint="path of a policy's .json on the machine of the simulation")
+            file = gui.add_text("Policy file", "", hint=_FILE_HINT)
             self._bind(file, self._choose_file, self._shown_file)
             self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
             self._build_time()
@@ -394,7 +406,11 @@ class PlayPage:
         return list(dict.fromkeys([*playground.controllers, playground.controller, *playground.ghosts]))
 
     def _option(self, name: str) -> str:
-        return labels.label(name)
+        """How a controller is called in the page. Files called the same are told apart by their folders."""
+        label = labels.label(name)
+        if not is_file(name) or sum(labels.label(other) == label for other in self._choices()) == 1:
+            return label
+        return f"{Path(name).parent.name}/{Path(name).name}"
 
     def _name(self, option: str) -> str:
         """The name of what is chosen.
@@ -417,7 +433,7 @@ class PlayPage:
     def _shown_file(self) -> str:
         """The policy file of the main robot, if it has one."""
         name = self.playground.controller
-        return "" if name in self.playground.controllers else name
+        return name if is_file(name) else ""
 
     def _set_ghost(self, name: str, wanted: bool) -> None:
         others = [ghost for ghost in self.playground.ghosts if ghost != name]

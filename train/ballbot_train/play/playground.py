@@ -4,6 +4,7 @@ The robot that counts is the main one. Ghosts get the same start and the same pu
 made and plans are found in the background, while the robots go on under those that they have.
 """
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -12,7 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS
+from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_gym import certified
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_gym.env import make_task
@@ -22,12 +23,21 @@ from ballbot_gym.rollout import Controller
 from ballbot_gym.simulator import default_physics
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.evaluation.controllers import make_controller, names
+from ballbot_train.evaluation.controllers import (
+    is_expert,
+    is_file,
+    is_made_for,
+    is_saved_model,
+    made_for,
+    make_controller,
+    names,
+)
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play.background import Background
 from ballbot_train.play.driving import DriveController, Stick
 from ballbot_train.play.runner import Runner, Sample
 from ballbot_train.play.tunable import Tunable, weight_names
+from ballbot_train.policy_files import PolicyError
 from ballbot_train.report import labels
 from ballbot_train.report.replay import Replay, Take
 
@@ -71,6 +81,7 @@ _AHEAD = 1.0  # s before the end of an episode at which the plan for the next on
 _PLAN_POINTS = 60  # of a drawn plan
 _SETTLE = 900.0  # s: the first time in a task, solvers are compiled
 _EPISODES_KEPT = 100
+_FROM_ELSEWHERE = ("lqr", "trajopt")  # controllers that are data, so that they can come from another process
 _LEAST_COST = 0.01  # of an optimum to which a cost is compared; one that starts at rest costs nothing
 
 
@@ -121,21 +132,27 @@ class Playground:
         episode: int | None = 0,
         seed: int = 0,
         robot: str = "paper",
+        policies: Sequence[str] = (),
+        other_process: bool = False,
     ):
         """Begins an episode.
 
         Args:
             task: name of a task.
-            controller: of the main robot: an expert, a policy that comes with the package, the path of a policy file, or one
-                of `DRIVERS`.
+            controller: of the main robot: an expert, a policy that comes with the package, the path of a policy file or of a
+                model that Stable-Baselines3 or rsl_rl saved, or one of `DRIVERS`.
             ghosts: controllers of the ghosts.
             physics: "bullet" or "rk4"; default, as for environments.
             episode: index of a certified episode; None for a random start.
             seed: of random starts, sensor noise and random pushes.
             robot: name in `ROBOTS`.
+            policies: paths of more policies that can be chosen in the tasks that they are made for.
+            other_process: whether another process plans, so that planning takes no time from a simulation in real time. A
+                script that asks for it needs the guard `if __name__ == "__main__":`.
 
         Raises:
             ValueError: an unknown task, robot, controller or episode.
+            PolicyError: one of `policies` is missing or damaged.
         """
         self.physics = default_physics() if physics is None else physics
         self.robot = _known("robot", robot, ROBOTS)
@@ -148,8 +165,11 @@ class Playground:
         """What went wrong last, in words."""
         self.plant = dict.fromkeys(PLANT, 0.0)
         """Severity of each hidden change."""
+        self._policies = list(dict.fromkeys(policies))
+        for policy in self._policies:
+            made_for(policy)  # whether it can be read
         self._rng = np.random.default_rng(seed)
-        self._background = Background()
+        self._background = Background(other_process)
         self._randomization = Randomization()
         self._runners: dict[str, Runner] = {}
         self._step = 0
@@ -169,8 +189,8 @@ class Playground:
 
     @property
     def controllers(self) -> list[str]:
-        """What can be chosen in this task, besides policy files."""
-        return [*names(self.base), *DRIVERS]
+        """What can be chosen in this task; policy files that were not used yet come to it."""
+        return self._fitting
 
     @property
     def main(self) -> Runner:
@@ -216,6 +236,11 @@ class Playground:
         if self._optimum_costs is None:
             return math.nan
         return float(self._optimum_costs[min(self._elapsed, len(self._optimum_costs) - 1)])
+
+    @property
+    def other_pid(self) -> int | None:
+        """The number of the process that plans; None if there is none."""
+        return self._background.other_pid
 
     @property
     def episodes(self) -> int:
@@ -284,7 +309,7 @@ class Playground:
             ValueError: no task of this name.
         """
         _known("task", task, TASKS)
-        known = [*names(make_task(task)), *DRIVERS]
+        known = self._controllers_of(make_task(task))
         ghosts = [ghost for ghost in self.ghosts if ghost in known]
         self._open_task(task, self.controller if self.controller in known else "nmpc", ghosts, 0)
 
@@ -349,7 +374,7 @@ class Playground:
         self._set_constants()
         for key, runner in self._runners.items():
             runner.weigh_again(self._c)
-            if self._wanted[key] in CONTROLLERS:
+            if is_expert(self._wanted[key]):
                 self._request(key, runner.x)
         self._request_optimum()
 
@@ -508,6 +533,7 @@ class Playground:
     def _open_task(self, task: str, controller: str, ghosts: Sequence[str], episode: int | None) -> None:
         self.task_name = _known("task", task, TASKS)
         self.base: Task = make_task(task)
+        self._fitting = self._controllers_of(self.base)
         self._check_controller(controller)
         for name in ghosts:
             self._check_controller(name)
@@ -534,13 +560,24 @@ class Playground:
         runner = self._runners[key] = Runner(name, self.task, self.params, self.physics)
         runner.set_plant(self._randomization)
 
+    def _controllers_of(self, task: Task) -> list[str]:
+        """What can be chosen in a task."""
+        own = []
+        for policy in self._policies:
+            with contextlib.suppress(PolicyError):  # a file that is gone by now
+                own += [policy] * is_made_for(policy, task)
+        experts = [name for name in names(task) if is_expert(name)]
+        return [*experts, *VARIANTS, *(name for name in names(task) if name not in experts), *own, *DRIVERS]
+
     def _check_controller(self, name: str) -> None:
         """Raises a ValueError where nothing has this name. What is in a policy file is found out when it is loaded."""
-        if name in (*names(self.base), *DRIVERS):
+        if name in self._fitting:
             return
-        if Path(name).suffix not in (".json", ".safetensors") or not Path(name).is_file():
+        readable = is_saved_model(name) or Path(name).suffix in (".json", ".safetensors")
+        if not (readable and Path(name).is_file()):
             raise ValueError(
-                f"unknown controller {name!r}; {self.base.id} has {', '.join(self.controllers)}, or give a policy's .json"
+                f"unknown controller {name!r}; {self.base.id} has {', '.join(self.controllers)}, or give a policy's .json, "
+                "or a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt)"
             )
 
     def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: int | None) -> None:
@@ -567,17 +604,17 @@ class Playground:
         if at_step is None:
             self._background.cancel(f"next {key}")
             self._next.pop(key, None)
-        task, params, stick = self.task, self.params, self.stick
+        task, params, stick, compute = self.task, self.params, self.stick, self._background.compute
 
         def job() -> tuple[str, int, Controller]:
-            return name, step, _made(name, task, params, stick, np.array(x), np.array(c))
+            return name, step, _made(name, task, params, stick, np.array(x), np.array(c), compute)
 
         self._background.submit(job_key, job)
 
     def _request_optimum(self) -> None:
         self._optimum_costs: np.ndarray | None = None
-        task, params, (x, _), c = self.task, self.params, self._start, self._c
-        self._background.submit("optimum", lambda: _optimum_costs(task, params, x, np.array(c)))
+        task, params, (x, _), c = self.task, self.params, self._start, np.array(self._c)
+        self._background.submit("optimum", lambda: self._background.compute(_optimum_costs, task, params, x, c))
 
     def _poll(self) -> None:
         """Takes what the background has finished."""
@@ -604,6 +641,9 @@ class Playground:
                 self._request(key, runner.x)
             return
         runner.name, step, controller = value
+        if is_file(runner.name) and runner.name not in self._policies:
+            self._policies.append(runner.name)
+            self._fitting = self._controllers_of(self.base)
         runner.take_controller(controller, step)
 
     def _plan_again(self) -> bool:
@@ -709,14 +749,40 @@ class Playground:
 AT_END: tuple[AtEnd, ...] = get_args(AtEnd)
 
 
-def _made(name: str, task: Tunable, params: BallbotParams, stick: Stick, x: np.ndarray, c: np.ndarray) -> Controller:
-    """The controller of a name, at the start of an episode in state x with constants c of the tunable task."""
+def _made(
+    name: str,
+    task: Tunable,
+    params: BallbotParams,
+    stick: Stick,
+    x: np.ndarray,
+    c: np.ndarray,
+    compute: Callable[..., Any],
+) -> Controller:
+    """The controller of a name, at the start of an episode in state x with constants c of the tunable task.
+
+    What takes long is called by `compute`, that may have another process do it.
+    """
     if name in DRIVERS:
-        controller: Controller = DriveController(task, params, stick, DRIVERS[name])
-    elif name in CONTROLLERS:
-        controller = CONTROLLERS[name](task, params)
+        return DriveController(task, params, stick, DRIVERS[name])
+    if name in _FROM_ELSEWHERE:
+        return compute(_expert, name, task, params, x, c)
+    if not is_expert(name):
+        controller = make_controller(name, task.base, params)
+        controller.reset(0.0, x, c[: len(task.base.constant_names)])
+        return controller
+    from ballbot_baselines.nmpc import NmpcController, prepared_plan  # it imports CasADi
+
+    controller = make_controller(name, task, params)
+    if isinstance(controller, NmpcController):  # its solver stays in this process
+        controller.start(0.0, c, compute(prepared_plan, task, params, x, c, controller.backoff))
     else:
-        controller, c = make_controller(name, task.base, params), c[: len(task.base.constant_names)]
+        controller.reset(0.0, x, c)
+    return controller
+
+
+def _expert(name: str, task: Tunable, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> Controller:
+    """An expert at the start of an episode."""
+    controller = CONTROLLERS[name](task, params)
     controller.reset(0.0, x, c)
     return controller
 
