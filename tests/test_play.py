@@ -1,12 +1,14 @@
 """The playground's simulation, which knows nothing of pages."""
 
 import math
+import os
 import threading
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from ballbot_baselines import CONTROLLERS, find_optimum
 from ballbot_gym import certified
@@ -19,6 +21,7 @@ from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.playground import LARGEST_PUSH, PLANT, Playground
 from ballbot_train.play.tunable import Tunable, weight_names
+from ballbot_train.policy_files import PolicyError
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
 
@@ -283,6 +286,35 @@ def test_wrong_input_is_refused_and_the_robot_goes_on(play, change, message):
     assert playground.notice == ""
 
 
+@pytest.fixture
+def saved_model(tmp_path):
+    """A checkpoint as rsl_rl writes it, of an actor that commands nothing."""
+    path = tmp_path / "mine.pt"
+    torch.save({"actor_state_dict": {"mlp.0.weight": torch.zeros(2, 8), "mlp.0.bias": torch.zeros(2)}}, path)
+    path.with_suffix(".json").write_text('{"activation": "elu"}')
+    return str(path)
+
+
+def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_model):
+    playground = play(policies=[saved_model])
+    assert saved_model in playground.controllers
+    playground.set_controller(saved_model)
+    playground.settle()
+    go(playground, 0.04)
+    assert playground.main.name == saved_model
+    assert playground.notice == ""
+    playground.set_task("orbit")  # its observations are others
+    assert saved_model not in playground.controllers
+
+
+def test_a_file_that_was_used_once_is_offered_from_then_on(play, saved_model):
+    playground = play(ghosts=[saved_model])
+    playground.set_ghosts([])
+    assert saved_model in playground.controllers
+    with pytest.raises(PolicyError, match="gone"):
+        play(policies=["gone.pt"])
+
+
 def test_a_controller_that_fails_gives_no_force_and_is_named(play):
     playground = play()
 
@@ -434,6 +466,27 @@ def test_the_background_does_only_the_last_job_of_a_key():
     assert done == [4]
     assert background.finished() == {}
     background.close()
+
+
+def test_another_process_computes_and_is_started_anew_after_it_was_killed():
+    background = Background(other_process=True)
+    try:
+        assert background.compute(os.getpid) == background.other_pid != os.getpid()
+        with pytest.raises(ValueError, match="math domain"):
+            background.compute(math.sqrt, -1.0)
+        background._other._process.kill()
+        background._other._process.join()
+        assert background.compute(math.sqrt, 4.0) == 2.0
+    finally:
+        background.close()
+        background.close()
+
+
+def test_a_job_of_another_process_does_not_hold_up_the_end():
+    background = Background(other_process=True)
+    background.submit("long", lambda: background.compute(time.sleep, 60.0))
+    background.close()
+    assert not background._thread.is_alive()
 
 
 def test_a_job_that_raises_gives_its_error():
