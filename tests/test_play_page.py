@@ -343,6 +343,11 @@ def shown(browser, words, seconds=120.0):
     wait_for(lambda: words in browser.execute_script("return document.body.innerText"), seconds)
 
 
+def focus(browser, has):
+    """Whether the page has the focus; without it viser's page does not try again where its first connection fails."""
+    browser.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", {"enabled": has})
+
+
 def choose(browser, present, wanted):
     """Chooses another controller in the page, as a hand does."""
     from selenium.webdriver.support.ui import WebDriverWait
@@ -378,6 +383,8 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     one, two = chromium(), chromium()
     port = opened.viewer.port
     address = f"{opened.viewer.address}/?fixedDpr=0.1"  # large pixels, because the processor draws them
+    for browser in (one, two):
+        focus(browser, True)
     one.get(address)
     shown(one, "LQR")
     wait_for(lambda: len(opened.viewer.server.get_clients()) == 1)
@@ -414,7 +421,9 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     for browser in (one, two):
         assert severe(browser) == []
 
-    # the server is stopped and started: the pages come back by themselves
+    # the server is stopped and started: the pages come back by themselves, even those that have not the focus
+    for browser in (one, two):
+        focus(browser, False)
     opened.close()
     again = Opened(tmp_path, port=port, task="orbit")
     try:
