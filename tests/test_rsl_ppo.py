@@ -70,6 +70,17 @@ def test_the_critic_alone_fits_a_quadratic_form_with_its_linear_path():
     assert inputs.shape[1] == 8 + 36
 
 
+def test_a_relative_advantage_is_that_of_the_logarithm_of_the_cost_to_go():
+    cost = torch.tensor([100.0, 10.0, 1.0, 0.1]).reshape(4, 1, 1)
+    saved = torch.tensor([10.0, 1.0, 0.1, 0.01]).reshape(4, 1, 1)  # a tenth each
+    values = 500 - cost
+    advantages = rsl_ppo.relative_advantages(values + saved, values, 500.0).flatten()
+    assert advantages.mean().abs() < 1e-6
+    assert advantages.std() == pytest.approx(1.0)
+    torch.testing.assert_close(advantages[:3], advantages[0].expand(3), rtol=0, atol=1e-2)
+    assert advantages[3] < advantages[0] - 1  # below 2 % of the mean cost it counts less
+
+
 def test_every_pass_sees_every_sample_once_in_the_same_mini_batches():
     storage = rsl_ppo.Storage("rl", 5, 4, TensorDict({"policy": torch.zeros(5, 1)}, batch_size=[5]), (1,))
     storage.observations["policy"][:] = torch.arange(20.0).reshape(4, 5, 1)

@@ -33,6 +33,7 @@ from ballbot_train.learning.rsl import RslVecEnv
 from ballbot_train.policy import PolicyNetwork
 
 _GROUPS = {"actor": ["policy"], "critic": ["critic"]}
+_LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
 _RETAINED = 0.9  # of the averaged actor per iteration
 
 
@@ -59,6 +60,9 @@ class RslPpoConfig:
     start of an episode that costs more later."""
     gae_lambda: float = 0.9
     """λ of generalized advantage estimation."""
+    relative_advantages: bool = False
+    """Whether an advantage counts relative to the cost to go that the critic expects, as regret does. Without it the first
+    second of an episode, which costs most, hides what the steps after it could save."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the actor's hidden layers."""
     critic_hidden: tuple[int, ...] = (64, 64)
@@ -102,7 +106,14 @@ TUNED: dict[str, RslPpoConfig] = {
         final_gamma=0.999,
         curriculum=Curriculum(short_episodes=0.85),
     ),
-    "orbit": RslPpoConfig(symmetry="frame", total_iterations=600, gae_lambda=0.95),
+    "orbit": RslPpoConfig(
+        symmetry="frame",
+        total_iterations=600,
+        gae_lambda=0.95,
+        relative_advantages=True,
+        final_std=0.03,
+        curriculum=Curriculum(short_episodes=0.3),
+    ),
     "weave": RslPpoConfig(
         symmetry="mirrors", episode_seconds=8.0, hidden=(128, 128), critic_hidden=(128, 128), total_iterations=800
     ),
@@ -128,6 +139,19 @@ class Actor(MLPModel):
         """Sets the standard deviation of both actions."""
         assert isinstance(self.distribution, GaussianDistribution)
         self.distribution.std_param.data.fill_(std)
+
+
+def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float) -> torch.Tensor:
+    """Advantages relative to the cost to go, normalized: (T, B, 1) of returns and values (T, B, 1).
+
+    Args:
+        returns: estimates of the return.
+        values: what the critic expects.
+        living: value of a state without any cost, so that the cost to go is `living` minus the value.
+    """
+    cost = living - values
+    relative = (returns - values) / torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6))
+    return (relative - relative.mean()) / (relative.std() + 1e-8)
 
 
 def last_layer(network: torch.nn.Module) -> torch.nn.Linear:
@@ -284,6 +308,10 @@ class RslPpo:
                 ended, early = ended + float(ends.sum()), early + float(terminated.sum())
                 paid += float(reward.mean())
             self._ppo.compute_returns(self._seen)
+            if config.relative_advantages:
+                storage = self._ppo.storage
+                living = self._value_of_living(self._ppo.gamma)
+                storage.advantages = relative_advantages(storage.returns, storage.values, living)
         losses = self._ppo.update()
         with torch.no_grad():
             share = max(1 - _RETAINED, 1 / (1 + self.iteration))  # the first iterations start the average
