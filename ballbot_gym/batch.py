@@ -23,9 +23,10 @@ except ImportError as error:
     raise ImportError('batches of environments need torch: pip install "ballbot-gym[train]"') from error
 
 from ballbot_gym import counter_rng, dynamics
-from ballbot_gym.env import LARGEST, make_task
-from ballbot_gym.params import BallbotParams, checked_params
+from ballbot_gym.env import LARGEST, limit_names, make_task
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
+from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.tasks import Task
 
 _log = logging.getLogger(__name__)
@@ -90,7 +91,7 @@ class BatchStep(NamedTuple):
     failure: torch.Tensor
     """(B,) bool: the episode ended at a violated limit."""
     violated: torch.Tensor
-    """(B,) int64 index in `task.limit_names` of the first limit violated, else −1."""
+    """(B,) int64 index in the batch's `limit_names` of the first limit violated, else −1."""
     force: torch.Tensor
     """(2, B) N, what the actuator applied."""
     clipped: torch.Tensor
@@ -99,6 +100,9 @@ class BatchStep(NamedTuple):
     """(B,) rad, of `final_x`; carries no gradient."""
     tilt: torch.Tensor
     """(B,) rad, of `final_x`, or where an episode ended of the next one's initial state; carries no gradient."""
+    grip: torch.Tensor | None = None
+    """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction it needs. It carries no
+    gradient, and is None where friction is unlimited."""
 
 
 class BatchEpisodes(NamedTuple):
@@ -111,7 +115,7 @@ class BatchEpisodes(NamedTuple):
     failure: torch.Tensor
     """(B,) bool: the episode ended at a violated limit."""
     violated: torch.Tensor
-    """(B,) int64 index in `task.limit_names` of the limit at which the episode ended, else −1."""
+    """(B,) int64 index in the batch's `limit_names` of the limit at which the episode ended, else −1."""
     terminated: torch.Tensor
     """(B,) bool: the episode ended by success or failure, not because its time was over."""
     steps: torch.Tensor
@@ -127,16 +131,34 @@ class _Robot(NamedTuple):
     """
 
     total_mass: Any
+    moving_mass: Any
     first_moment: Any
     pivot_inertia: Any
     axial_inertia: Any
     gravity: Any
+    weight: Any
+    rolls: bool
+    ball_radius: Any
+    friction: Any
+    grips: bool
 
     @classmethod
     def of(cls, params: BallbotParams) -> "_Robot":
-        derived = (BallbotParams.total_mass, BallbotParams.first_moment, BallbotParams.pivot_inertia)
-        total_mass, first_moment, pivot_inertia = (value.func(params) for value in derived)
-        return cls(total_mass, first_moment, pivot_inertia, params.axial_inertia, params.gravity)
+        total_mass = params.ball_mass + params.body_mass
+        rolling = params.ball_inertia / params.ball_radius**2 if params.rolls else None
+        return cls(
+            total_mass=total_mass,
+            moving_mass=total_mass if rolling is None else total_mass + rolling,
+            first_moment=BallbotParams.first_moment.func(params),
+            pivot_inertia=BallbotParams.pivot_inertia.func(params),
+            axial_inertia=params.axial_inertia,
+            gravity=params.gravity,
+            weight=total_mass * params.gravity,
+            rolls=params.rolls,
+            ball_radius=params.ball_radius,
+            friction=params.friction,
+            grips=params.grips,
+        )
 
 
 class BallbotBatch:
@@ -157,6 +179,7 @@ class BallbotBatch:
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
         randomization: Randomization | None = None,
+        robot: str | BallbotParams = PAPER,
         **task_fields: Any,
     ):
         """Makes the batch; call `reset` first.
@@ -168,8 +191,9 @@ class BallbotBatch:
             compile: True compiles `transition` at the first step, for half a minute or so, and raises if that fails.
                 "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
                 warning and runs eagerly. False never compiles.
-            params: the nominal robot; default, the paper's.
+            params: the nominal robot as a BallbotParams; the same as robot.
             randomization: what varies; default, nothing.
+            robot: a name in `ROBOTS`, or a BallbotParams.
             **task_fields: fields of the task that replace its defaults.
 
         Raises:
@@ -181,8 +205,9 @@ class BallbotBatch:
             raise ValueError(f"dtype must be torch.float32 or torch.float64, not {dtype}")
         if compile not in (True, False, "auto"):
             raise ValueError(f'compile must be True, False or "auto", not {compile!r}')
-        self.task = make_task(task, **task_fields)
-        self.params = checked_params(params)
+        self.params = checked_robot(robot, params)
+        self.task = make_task(task, self.params, **task_fields)
+        self.limit_names = limit_names(self.task, self.params)
         self.randomization = checked_randomization(randomization)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
@@ -344,7 +369,12 @@ class BallbotBatch:
 
         rate = task.cost(x, force, c)
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
-        violated = first_below_zero(task.limits(end, c))
+        limits, grip = task.limits(end, c), None
+        if self.params.grips:
+            asked = dynamics.contact(robot, x, total)
+            limits = (*limits, torch.minimum(*dynamics.grip_limits(robot, asked)))
+            grip = torch.stack(dynamics.grip(tuple(part.detach() for part in asked)))
+        violated = first_below_zero(limits)
         failure, reached = violated >= 0, all_of(g <= 0 for g in task.goal(end, c))
         safe = ~failure
         steps = state.steps + 1
@@ -376,6 +406,7 @@ class BallbotBatch:
             clipped=any_of(part.abs() > 1.0 for part in asked),
             final_tilt=tilt_of(end),
             tilt=tilt_of(new.x),
+            grip=grip,
         )
         return self._stacked(new), result
 

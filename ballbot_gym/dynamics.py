@@ -1,4 +1,4 @@
-"""Closed-form equations of motion of the ballbot, and their RK4 discretization.
+"""Closed-form equations of motion of the ballbot, its contact with the floor, and their RK4 discretization.
 
 State x = [x, y, γ, θ, ẋ, ẏ, γ̇, θ̇]: ball position, then leans. γ turns the body about the global y axis, then θ about
 the local −x axis, so the body's axis points along n = (sin γ cos θ, sin θ, cos γ cos θ). Input u = [Fx, Fy]: the force on
@@ -8,6 +8,18 @@ the ball. With total mass M + m, h = m·l, J = I + m·l² the energies are
 
 and the accelerations below are Lagrange's equations with ẍ and ÿ eliminated. Reference: "High lean angle trajectory
 optimization for ball balancing robots", whose linearization (5), (6) they reproduce.
+
+A ball that rolls without slipping and does not spin about the vertical turns at ω = e_z × ṗ / r, so T gains
+½ (I_b/r²) |ṗ|² with its inertia I_b: the mass M + m becomes M + m + I_b/r², but not in the weight. It is driven by a torque
+T = r e_z × F between the body and the ball, which F stands for. On the ball T does the work T·ω = F·ṗ, as the force F
+would. On the body −T does the work −T·(γ̇ e_y − θ̇ (cos γ e_x − sin γ e_z)). So the generalized forces are
+
+    Q_x = Fx,   Q_y = Fy,   Q_γ = −r Fx,   Q_θ = −r Fy cos γ,
+
+where the paper's ball has Q_γ = Q_θ = 0: the paper's robot is r = 0, I_b = 0.
+
+The floor acts on the ball with the horizontal force f and the normal force N. The ball's rolling, I_b ω̇ = T − r e_z × f,
+gives f = F − (I_b/r²) p̈. The height of the body's centre, with h n_z = m·height, gives N = (M + m) g + h n̈_z.
 """
 
 import math
@@ -32,6 +44,9 @@ STATE = (
 INPUT = (("Fx", "N"), ("Fy", "N"))
 """Name and unit of each input component, in order."""
 
+LEAST_NORMAL_FORCE = 0.02
+"""Least normal force of a robot that has to grip, as a fraction of its weight."""
+
 RK4_STEP = 0.01
 """Longest RK4 step, s. At 10 ms the model follows the exact solution to 1e-6 over 0.3 s at high lean."""
 
@@ -41,7 +56,7 @@ def accelerations(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any
     _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)
     fx, fy = ops.components(u)
     sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
-    mass, h, inertia = params.total_mass, params.first_moment, params.pivot_inertia
+    mass, h, inertia = params.moving_mass, params.first_moment, params.pivot_inertia
     ratio = h / mass
 
     # ẍ = ax − ratio·(nx_g γ̈ − nx_t θ̈) and ÿ = ay − ratio·cos θ θ̈
@@ -60,6 +75,9 @@ def accelerations(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any
     m22 = inertia - h * ratio * (nx_t * nx_t + cos_t * cos_t)
     f1 = weight * sin_g * cos_t - h * nx_g * ax - 2 * half_slope * rate_product
     f2 = weight * cos_g * sin_t + h * nx_t * ax - h * cos_t * ay + half_slope * gamma_rate2
+    if params.rolls:
+        f1 = f1 - params.ball_radius * fx
+        f2 = f2 - params.ball_radius * fy * cos_g
     determinant = m11 * m22 - m12 * m12
     gamma_ddot = (m22 * f1 - m12 * f2) / determinant
     theta_ddot = (m11 * f2 - m12 * f1) / determinant
@@ -69,6 +87,59 @@ def accelerations(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any
         gamma_ddot,
         theta_ddot,
     )
+
+
+def contact(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any, Any]:
+    """The floor's force on the ball, (f_x, f_y, N) in N, for state x (..., 8) and force u (..., 2).
+
+    A floor pushes only, N ≥ 0, and a coefficient of friction µ gives |f| ≤ µN. The paper's model asks of its floor whatever
+    this says. So does a rolling robot's, which rolls without slipping in this model; see `limits`.
+    """
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)
+    fx, fy = ops.components(u)
+    ax, ay, gamma_ddot, theta_ddot = accelerations(params, x, u)
+    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+    n_z_ddot = (
+        2 * sin_g * sin_t * gamma_dot * theta_dot
+        - sin_g * cos_t * gamma_ddot
+        - cos_g * sin_t * theta_ddot
+        - cos_g * cos_t * (gamma_dot * gamma_dot + theta_dot * theta_dot)
+    )
+    normal = params.weight + params.first_moment * n_z_ddot
+    if not params.rolls:
+        return fx, fy, normal
+    rolling = params.moving_mass - params.total_mass
+    return fx - rolling * ax, fy - rolling * ay, normal
+
+
+def limits(params: BallbotParams, x: Vector, u: Vector, backoff: Any = 0.0) -> tuple[Any, ...]:
+    """The robot grips the floor iff every entry is ≥ 0; () where friction is unlimited. See `grip_limits`."""
+    return grip_limits(params, contact(params, x, u), backoff) if params.grips else ()
+
+
+def grip_limits(params: BallbotParams, force: tuple[Any, Any, Any], backoff: Any = 0.0) -> tuple[Any, Any]:
+    """N/W − 0.02 and (N/W)² − (|f|/µW)² of the floor's force (f_x, f_y, N), N, with the robot's weight W.
+
+    Both are smooth. The second is that of a cone, whose squares solvers converge on, and not on µN − |f|; by itself it would
+    allow N < 0.
+
+    Args:
+        params: the robot.
+        force: as `contact` gives it.
+        backoff: fraction of the normal force, and so of the friction, that is kept in reserve.
+    """
+    fx, fy, normal = force
+    weight = params.weight
+    load = (1 - backoff) * normal / weight
+    slip = ops.squared(fx, fy) / (weight * params.friction) ** 2
+    return load - LEAST_NORMAL_FORCE, ops.squared(load) - slip
+
+
+def grip(force: tuple[Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
+    """The floor's force (f_x, f_y, N), and the coefficient of friction that it needs: |f|/N, and inf where N ≤ 0."""
+    fx, fy, normal = force
+    needed = ops.where(normal > 0, ops.sqrt(ops.squared(fx, fy)) / ops.where(normal > 0, normal, 1.0), math.inf)
+    return fx, fy, normal, needed
 
 
 def derivative(params: BallbotParams, x: Vector, u: Vector) -> Vector:
@@ -122,7 +193,7 @@ def energy(params: BallbotParams, x: Vector) -> Any:
     com_vy = cos_t * theta_dot
     lean_inertia = inertia * cos_t * cos_t + params.axial_inertia * sin_t * sin_t
     kinetic = (
-        0.5 * params.total_mass * (vx * vx + vy * vy)
+        0.5 * params.moving_mass * (vx * vx + vy * vy)
         + h * (vx * com_vx + vy * com_vy)
         + 0.5 * lean_inertia * gamma_dot * gamma_dot
         + 0.5 * inertia * theta_dot * theta_dot

@@ -11,10 +11,11 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
-from ballbot_gym.params import BallbotParams, checked_params
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
+from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.scene import CAMERA_YAW, Scene, no_display
-from ballbot_gym.simulator import PHYSICS, State, default_physics
+from ballbot_gym.simulator import PHYSICS, State, default_physics, make_simulator
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.viewer import PageScene
 
@@ -52,6 +53,8 @@ class Outcome(NamedTuple):
     success: bool
     violated: str
     clipped: bool
+    grip: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    """The floor's force on the ball, N, and the friction that it needs, of robots whose friction is limited."""
 
 
 class BallbotEnv(gymnasium.Env):
@@ -77,6 +80,13 @@ class BallbotEnv(gymnasium.Env):
     | force | (2,) N, applied in this step (0 after `reset`) |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
+    | grip | (4,) the floor's force on the ball when the step began, f_x, f_y and N, and the coefficient of friction that it \
+needs (0 after `reset`); only of robots whose friction is limited |
+
+    A robot with limited friction that needs more than it has, or a floor that pulls, has lost its grip. The closed form
+    cannot say how it slips, so with physics="rk4" that is a failure, and `violated` is "grip". PyBullet simulates the contact
+    of a rolling ball: it slips or leaves the floor, and that by itself is no failure. `grip` is then the force at the end of
+    the step.
 
     `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
     copy of a Bullet env has a physics client of its own. The window is not copied.
@@ -92,6 +102,7 @@ class BallbotEnv(gymnasium.Env):
         params: BallbotParams | None = None,
         physics_dt: float | None = None,
         randomization: Randomization | None = None,
+        robot: str | BallbotParams = PAPER,
         **task_fields: Any,
     ):
         """Makes the environment; usually through `gymnasium.make("BallbotStabilize-v0", ...)`.
@@ -101,10 +112,11 @@ class BallbotEnv(gymnasium.Env):
             physics: "bullet", the URDF in PyBullet, or "rk4", the closed-form model; default, "bullet" where PyBullet is
                 installed, else "rk4" with a warning.
             render_mode: None, "rgb_array" or "human": PyBullet's window, or a page in the browser where there is no display.
-            params: the robot; default, the paper's.
+            params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
             randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
                 and 5 kB of memory that PyBullet never frees.
+            robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -120,8 +132,8 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
-        self.task = make_task(task, **task_fields)
-        self.params = checked_params(params)
+        self.params = checked_robot(robot, params)
+        self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
@@ -132,7 +144,7 @@ class BallbotEnv(gymnasium.Env):
         )
         self.observation_space = observation_space(self.task, self.params)
         self._physics_dt = physics_dt
-        self._simulator = PHYSICS[physics](self.params, self.task.control_dt, physics_dt)
+        self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
         self._steps_left = 0
@@ -272,7 +284,7 @@ class BallbotEnv(gymnasium.Env):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._scene = None
-        self._simulator = PHYSICS[self.physics](self.params, self.task.control_dt, self._physics_dt)
+        self._simulator = make_simulator(self.physics, self.params, self.task.control_dt, self._physics_dt)
         if self._closed:
             self._simulator.close()
         elif self._state:
@@ -323,9 +335,14 @@ class BallbotEnv(gymnasium.Env):
             force = self._disturbance.actuate(force)
             total = self._disturbance.pushed(force, self.np_random)
         running = task.cost(self._state, force, c) * task.control_dt
+        before = self._state
         self._state = x = self._simulator.step(total)
         self._steps_left -= 1
         violated = task.violated(x, c)
+        grip = _START.grip
+        if self.params.grips:
+            grip, lost = self._grip(before, total)
+            violated = violated or (GRIP if lost else "")
         failure = violated != ""
         last = self._steps_left == 0
         success = not failure and (last or task.first_exit) and task.is_goal(x, c)
@@ -336,7 +353,16 @@ class BallbotEnv(gymnasium.Env):
         if terminated:
             self._steps_left = 0
         cost = running + ahead * failure
-        return Outcome(terminated, last and not terminated, reward, cost, force, success, violated, clipped)
+        return Outcome(terminated, last and not terminated, reward, cost, force, success, violated, clipped, grip)
+
+    def _grip(self, x: State, total: tuple[float, float]) -> tuple[tuple[float, ...], bool]:
+        """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
+        simulated = self._simulator.floor_force()
+        if simulated is not None:
+            return dynamics.grip(simulated), False
+        robot = self.episode_params
+        asked = dynamics.contact(robot, x, total)
+        return dynamics.grip(asked), not all(limit >= 0 for limit in dynamics.grip_limits(robot, asked))
 
     def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Initial state and constants. Those that the options do not give are drawn."""
@@ -396,7 +422,7 @@ class BallbotEnv(gymnasium.Env):
         return np.array(self._observed(), np.float32)
 
     def _info(self, outcome: Outcome) -> dict[str, Any]:
-        return {
+        info = {
             "state": np.array(self._state),
             "cost": outcome.cost,
             **dict(zip(REWARD_PARTS, outcome.reward, strict=True)),
@@ -408,6 +434,9 @@ class BallbotEnv(gymnasium.Env):
             "clipped": outcome.clipped,
             "constants": self._constants_array.copy(),
         }
+        if self.params.grips:
+            info["grip"] = np.array(outcome.grip)
+        return info
 
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
@@ -415,6 +444,9 @@ REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 
 _START = Outcome(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, "", False)
 """What `reset` reports."""
+
+GRIP = "grip"
+"""The limit that a robot violates that loses its grip."""
 
 _REPLACED = {
     "failure_cost": "a failure now costs survival_reward for every second not lived: give survival_reward (1/s) instead"
@@ -442,8 +474,18 @@ def spec_of(spec: EnvSpec | None, task: Task) -> EnvSpec | None:
     return dataclasses.replace(spec, max_episode_steps=task.steps, reward_threshold=threshold)
 
 
-def make_task(task: str | Task, **task_fields: Any) -> Task:
+def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:
+    """What can end an episode of a robot: the task's limits, and its grip where friction is limited."""
+    return (*task.limit_names, GRIP) if params.grips else task.limit_names
+
+
+def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fields: Any) -> Task:
     """The task named, with some fields replaced.
+
+    Args:
+        task: a name in `TASKS`, or a Task.
+        robot: whose defaults the fields have: a name in `ROBOTS`, or a BallbotParams.
+        **task_fields: fields that replace the defaults.
 
     Raises:
         ValueError: no task of that name, or fields given together with a Task.
@@ -460,7 +502,7 @@ def make_task(task: str | Task, **task_fields: Any) -> Task:
         # Python's own words, because clients such as torchrl look for them.
         hint = _REPLACED.get(name) or f"it has {', '.join(known)}"
         raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; {hint}")
-    return TASKS[task](**task_fields)
+    return TASKS[task](**(own_fields(robot, task) | task_fields))
 
 
 def check_constant_names(task: Task, named: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BatchState, BatchStep, check_num_envs, seeds_of
-from ballbot_gym.env import BallbotEnv, Outcome
+from ballbot_gym.env import BallbotEnv, Outcome, limit_names
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import DisturbanceState, Randomization
 from ballbot_gym.simulator import State
@@ -51,7 +51,7 @@ class BallbotLoop:
         self._singles = [_Single(task, params, randomization) for _ in range(self.num_envs)]
         first = self._singles[0]
         self.task, self.params, self.randomization = first.task, first.params, first.randomization
-        self._index = {name: i for i, name in enumerate(("", *self.task.limit_names), start=-1)}
+        self._index = {name: i for i, name in enumerate(("", *limit_names(self.task, self.params)), start=-1)}
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._started = False
         self._shown: tuple[np.ndarray, np.ndarray] | None = None  # x and c, until they change
@@ -139,7 +139,7 @@ class BallbotLoop:
         if restart and begun:
             observation = np.array([single.seen() for single in self._singles], np.float32)
             tilt = np.array([dynamics.tilt(single._state) for single in self._singles], self.dtype)
-        terminated, truncated, reward, cost, force, success, violated, clipped = zip(*outcomes, strict=True)
+        terminated, truncated, reward, cost, force, success, violated, clipped, grip = zip(*outcomes, strict=True)
         index = np.array([self._index[name] for name in violated])
         fields: Any = {
             "observation": observation,
@@ -156,6 +156,7 @@ class BallbotLoop:
             "clipped": np.array(clipped),
             "final_tilt": final_tilt,
             "tilt": tilt,
+            "grip": np.array(grip, self.dtype).T if self.params.grips else None,
         }
         return BatchStep(**fields)
 

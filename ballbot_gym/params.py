@@ -5,28 +5,40 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.ops import is_number
 
 _PACKAGE = Path(__file__).parent
-_IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf" / "ballbot.urdf", _PACKAGE.parent / "urdf" / "ballbot.urdf"
-URDF_PATH = _IN_WHEEL if _IN_WHEEL.is_file() else _IN_CHECKOUT
-"""The URDF of the paper's robot. A wheel holds it inside the package, a checkout beside the package."""
+_IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf", _PACKAGE.parent / "urdf"
+URDF_FOLDER = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
+"""The URDFs of all robots. A wheel holds it inside the package, a checkout beside the package."""
+URDF_PATH = URDF_FOLDER / "ballbot.urdf"
+"""The URDF of the paper's robot."""
+ROLLING_URDF_PATH = URDF_FOLDER / "rolling.urdf"
+"""The URDF of the paper's robot with a ball that rolls."""
 
 STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
 
-# joint: type, axis, parent link, child link. The closed-form dynamics hold for this chain only.
+# joint: type, axis, parent link, child link. The closed-form dynamics hold for these two chains only.
 _CHAIN = {
     "x": ("prismatic", (1.0, 0.0, 0.0), "world", "slide"),
     "y": ("prismatic", (0.0, 1.0, 0.0), "slide", "ball"),
     "gamma": ("continuous", (0.0, 1.0, 0.0), "ball", "yoke"),
     "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "body"),
 }
+_ROLLING_CHAIN = {
+    "x": ("prismatic", (1.0, 0.0, 0.0), "world", "slide_x"),
+    "y": ("prismatic", (0.0, 1.0, 0.0), "slide_x", "slide_y"),
+    "z": ("prismatic", (0.0, 0.0, 1.0), "slide_y", "hub"),
+    "roll": ("spherical", None, "hub", "ball"),
+    "gamma": ("continuous", (0.0, 1.0, 0.0), "hub", "yoke"),
+    "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "body"),
+}
 _NO_NUMBER = (str, bytes, bool, dict, list, tuple, type(None))
 _FILE_LIMIT = 16 * 2**20  # bytes
 _MASSLESS_LINKS = ("slide", "yoke")
+_ROLLING_MASSLESS_LINKS = ("slide_x", "slide_y", "hub", "yoke")
 
 
 class UrdfError(ValueError):
@@ -39,12 +51,17 @@ class BallbotParams:
 
     | field | meaning | unit |
     |---|---|---|
-    | ball_mass, ball_radius | the ball, which translates without rolling | kg, m |
+    | ball_mass, ball_radius | the ball | kg, m |
     | body_mass, body_radius, body_length | the body, a cylinder | kg, m |
     | com_height | body's centre of mass above the ball's centre | m |
     | inertia, axial_inertia | of the body about its centre of mass, across and along its axis | kg·m² |
     | force_limit | largest force on the ball along each axis | N |
     | gravity | | m/s² |
+    | rolls | whether the ball rolls without slipping, driven by a torque between it and the body; the paper's translates | |
+    | ball_inertia | of a rolling ball about its centre; 0 where the ball does not roll | kg·m² |
+    | friction | coefficient between ball and floor; the paper's floor gives whatever force is asked, which is inf | |
+
+    A force F on the ball of a rolling robot stands for the torque r e_z × F that the body applies to it.
 
     Raises:
         ValueError: a field is no number, or not positive and finite; the message names it.
@@ -60,12 +77,25 @@ class BallbotParams:
     axial_inertia: float
     force_limit: float
     gravity: float = STANDARD_GRAVITY
+    rolls: bool = False
+    ball_inertia: float = 0.0
+    friction: float = math.inf
 
     def __post_init__(self) -> None:
+        if not isinstance(self.rolls, bool):
+            raise ValueError(f"BallbotParams: rolls must be True or False, not {self.rolls!r}")
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == "rolls" or (field.name == "friction" and value == math.inf):
+                continue
             if isinstance(value, _NO_NUMBER):
                 raise ValueError(f"BallbotParams: {field.name} must be a number, not {value!r}")
+            if field.name == "ball_inertia" and not self.rolls:
+                if not is_number(value) or value != 0:
+                    raise ValueError(
+                        f"BallbotParams: ball_inertia must be 0 where the ball does not roll, not {value!r}; set rolls=True"
+                    )
+                continue
             # batches of robots hold tensors, whose values are not looked at
             if is_number(value) and not 0 < value < math.inf:
                 raise ValueError(f"BallbotParams: {field.name} must be positive and finite, not {value}")
@@ -74,6 +104,21 @@ class BallbotParams:
     def total_mass(self) -> float:
         """Ball and body, kg."""
         return self.ball_mass + self.body_mass
+
+    @cached_property
+    def moving_mass(self) -> float:
+        """What a horizontal acceleration of the upright robot moves: ball and body, and what the ball's rolling adds, kg."""
+        return self.total_mass + self.ball_inertia / self.ball_radius**2 if self.rolls else self.total_mass
+
+    @cached_property
+    def weight(self) -> float:
+        """Of ball and body, N."""
+        return self.total_mass * self.gravity
+
+    @cached_property
+    def grips(self) -> bool:
+        """Whether the floor's force is limited by friction, so that the robot can lose its grip."""
+        return not (is_number(self.friction) and self.friction == math.inf)
 
     @cached_property
     def first_moment(self) -> float:
@@ -87,7 +132,10 @@ class BallbotParams:
 
     @classmethod
     def from_urdf(cls, path: str | Path = URDF_PATH, gravity: float = STANDARD_GRAVITY) -> "BallbotParams":
-        """Reads the parameters from a URDF with the paper's chain of links and joints.
+        """Reads the parameters from a URDF with the paper's chain of links and joints, or with that of a rolling ball.
+
+        A joint 'roll' makes it a rolling ball's: world → x → y → z prismatic, hub; from the hub the ball on the spherical
+        joint 'roll', and gamma, yoke, theta, body. So only the ball rolls, and the body does not yaw.
 
         Args:
             path: the URDF; without one, the robot of the paper.
@@ -98,12 +146,15 @@ class BallbotParams:
                 chain differs from the one that the closed-form dynamics describe.
         """
         urdf = _Urdf(Path(path))
-        for joint, (kind, axis, parent, child) in _CHAIN.items():
+        rolls = urdf.has_joint("roll")
+        for joint, (kind, axis, parent, child) in (_ROLLING_CHAIN if rolls else _CHAIN).items():
             urdf.check_joint(joint, kind, axis, parent, child)
-        for link in _MASSLESS_LINKS:
+        for link in _ROLLING_MASSLESS_LINKS if rolls else _MASSLESS_LINKS:
             urdf.check_massless(link)
         ball_mass = urdf.positive_mass("ball")
-        urdf.principal_inertias("ball")
+        ball_inertias = urdf.principal_inertias("ball")
+        if rolls and len(set(ball_inertias)) > 1:
+            raise urdf.error(f"link 'ball' must be round: its inertias {ball_inertias} kg·m² differ")
         transverse, transverse_y, axial = urdf.principal_inertias("body")
         if transverse != transverse_y:
             raise urdf.error(f"link 'body' must be round: ixx = {transverse} differs from iyy = {transverse_y}")
@@ -118,30 +169,35 @@ class BallbotParams:
             axial_inertia=axial,
             force_limit=urdf.force_limit(),
             gravity=float(gravity),
+            rolls=rolls,
+            ball_inertia=ball_inertias[0] if rolls else 0.0,
+            friction=urdf.friction("ball"),
         )
 
     def to_urdf(self) -> str:
-        """The URDF text of this robot: the packaged file with this robot's numbers. `from_urdf` reads it back exactly."""
-        urdf = _Urdf(URDF_PATH)
+        """The URDF text of this robot: a packaged file with this robot's numbers. `from_urdf` reads it back exactly."""
+        urdf = _Urdf(ROLLING_URDF_PATH if self.rolls else URDF_PATH)
         urdf.find("link[@name='ball']/inertial/mass").set("value", repr(self.ball_mass))
         urdf.find("link[@name='body']/inertial/mass").set("value", repr(self.body_mass))
         body_inertia = urdf.find("link[@name='body']/inertial/inertia")
         for name, value in (("ixx", self.inertia), ("iyy", self.inertia), ("izz", self.axial_inertia)):
             body_inertia.set(name, repr(value))
-        ball_inertia = (
-            0.4 * self.ball_mass * self.ball_radius**2
-        )  # of a solid sphere; has no effect: the ball does not roll
+        # that of a solid sphere has no effect where the ball does not roll
+        ball_inertia = self.ball_inertia if self.rolls else 0.4 * self.ball_mass * self.ball_radius**2
         for name in ("ixx", "iyy", "izz"):
             urdf.find("link[@name='ball']/inertial/inertia").set(name, repr(ball_inertia))
         for place in ("inertial", "visual"):
             urdf.find(f"link[@name='body']/{place}/origin").set("xyz", f"0 0 {self.com_height!r}")
         urdf.find("link[@name='ball']/visual/geometry/sphere").set("radius", repr(self.ball_radius))
+        if self.rolls:
+            urdf.find("link[@name='ball']/collision/geometry/sphere").set("radius", repr(self.ball_radius))
         cylinder = urdf.find("link[@name='body']/visual/geometry/cylinder")
         cylinder.set("radius", repr(self.body_radius))
         cylinder.set("length", repr(self.body_length))
         urdf.find("joint[@name='x']/origin").set("xyz", f"0 0 {self.ball_radius!r}")
         for joint in ("x", "y"):
             urdf.find(f"joint[@name='{joint}']/limit").set("effort", repr(self.force_limit))
+        urdf.set_friction("ball", self.friction)
         return ElementTree.tostring(urdf.root, encoding="unicode")
 
 
@@ -149,22 +205,6 @@ class BallbotParams:
 def default_params() -> BallbotParams:
     """The paper's robot, read once from the packaged URDF."""
     return BallbotParams.from_urdf()
-
-
-def checked_params(params: Any) -> BallbotParams:
-    """The robot that was given, or the paper's for None.
-
-    Raises:
-        TypeError: it is something else, such as a dict of fields.
-    """
-    if params is None:
-        return default_params()
-    if not isinstance(params, BallbotParams):
-        raise TypeError(
-            "params must be a BallbotParams, for instance dataclasses.replace(default_params(), body_mass=12.0), "
-            f"not {params!r}"
-        )
-    return params
 
 
 class _Urdf:
@@ -225,7 +265,29 @@ class _Urdf:
             raise self.error(f"{where}: xyz = '{text}' is not three numbers")
         return vector
 
-    def check_joint(self, name: str, kind: str, axis: tuple[float, ...], parent: str, child: str) -> None:
+    def has_joint(self, name: str) -> bool:
+        return self.root.find(f"joint[@name='{name}']") is not None
+
+    def friction(self, link: str) -> float:
+        """The coefficient of a link's <contact>, which Bullet reads too; without one, inf."""
+        element = self._named("link", link).find("contact/lateral_friction")
+        if element is None:
+            return math.inf
+        value = self._number(element, "value", f"lateral_friction of link '{link}'")
+        if value <= 0:
+            raise self.error(f"link '{link}' must have a positive lateral_friction, not {value}")
+        return value
+
+    def set_friction(self, link: str, friction: float) -> None:
+        element = self._named("link", link)
+        contact = element.find("contact")
+        if contact is not None:
+            element.remove(contact)
+        if friction != math.inf:
+            contact = ElementTree.SubElement(element, "contact")
+            ElementTree.SubElement(contact, "lateral_friction").set("value", repr(friction))
+
+    def check_joint(self, name: str, kind: str, axis: tuple[float, ...] | None, parent: str, child: str) -> None:
         joint = self._named("joint", name)
         for tag, expected in (("parent", parent), ("child", child)):
             self._named("link", expected)
@@ -240,7 +302,7 @@ class _Urdf:
             raise self.error(f"joint '{name}' is displaced by {(x, y, z)} m; only joint 'x' may be, upwards")
         self._check_unrotated(joint.find("origin"), f"joint '{name}'")
         found_axis = self._vector(joint.find("axis"), "1 0 0", f"axis of joint '{name}'")
-        if found_axis != axis:
+        if axis is not None and found_axis != axis:
             raise self.error(f"joint '{name}' has axis {found_axis}; it must be {axis}")
 
     def check_massless(self, link: str) -> None:

@@ -36,7 +36,7 @@ class Randomization:
     body_mass: Range = (1.0, 1.0)
     """Factor on the body's mass, drawn per episode."""
     ball_mass: Range = (1.0, 1.0)
-    """Factor on the ball's mass, drawn per episode."""
+    """Factor on the ball's mass, and on its inertia where it rolls, drawn per episode."""
     com_height: Range = (1.0, 1.0)
     """Factor on the height of the body's centre of mass above the ball's centre, drawn per episode."""
     inertia: Range = (1.0, 1.0)
@@ -166,6 +166,7 @@ class Randomization:
             com_height=params.com_height * com_height,
             inertia=params.inertia * inertia,
             axial_inertia=params.axial_inertia * inertia,
+            ball_inertia=params.ball_inertia * ball_mass if params.rolls else params.ball_inertia,
         )
 
     def push(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, Any]:

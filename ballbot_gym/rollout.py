@@ -12,7 +12,7 @@ import numpy as np
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.simulator import PHYSICS, default_physics
+from ballbot_gym.simulator import default_physics, make_simulator
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -180,7 +180,7 @@ def simulate(
 
     `physics` is by default "bullet" where PyBullet is installed, else "rk4" with a warning.
     """
-    simulator = PHYSICS[default_physics() if physics is None else physics](params, control_dt)
+    simulator = make_simulator(default_physics() if physics is None else physics, params, control_dt)
     x = np.asarray(x0, np.float64)
     simulator.reset(tuple(x.tolist()))
     controller.reset(0.0, x, np.zeros(0))

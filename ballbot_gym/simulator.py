@@ -26,6 +26,8 @@ State = tuple[float, ...]
 
 _MOST_SUBSTEPS = 10_000
 _JOINTS = ("x", "y", "gamma", "theta")
+_PRESSED = -1e-5  # m: height of the ball at reset, about where its weight presses it
+_MOST_FRICTION = 1e3  # what Bullet takes for unlimited friction
 
 
 class Simulator(Protocol):
@@ -39,6 +41,10 @@ class Simulator(Protocol):
 
     def step(self, u: tuple[float, float]) -> State:
         """Holds force u, N, for one control step and returns the state after it."""
+        ...
+
+    def floor_force(self) -> tuple[float, float, float] | None:
+        """The floor's force on the ball, (f_x, f_y, N) in N, at the end of the last step; None where it is not simulated."""
         ...
 
     def close(self) -> None:
@@ -67,12 +73,15 @@ class Rk4Simulator:
         self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps)
         return self._x
 
+    def floor_force(self) -> None:
+        return None
+
     def close(self) -> None:
         pass
 
 
 class BulletSimulator:
-    """The URDF in PyBullet, in a physics client that this object owns."""
+    """The URDF of a robot whose ball translates in PyBullet, in a physics client that this object owns."""
 
     def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
         """Loads the robot.
@@ -126,8 +135,96 @@ class BulletSimulator:
         a, b, c, d = bullet.getJointStates(robot, self._joints, physicsClientId=client)
         return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1])
 
+    def floor_force(self) -> tuple[float, float, float] | None:
+        return None
+
     def close(self) -> None:
         self._release()
+
+
+class BulletContactSimulator(BulletSimulator):
+    """The URDF of a robot whose ball rolls in PyBullet, on a floor: the ball may slip, and leave the floor.
+
+    The force u stands for the torque r e_z × u from the body on the ball, which is held over the control step.
+    """
+
+    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+        """Args: as for `BulletSimulator`. It is of first order too: 5 mm after 0.5 s at 1 ms."""
+        super().__init__(params, control_dt, physics_dt)
+        bullet, client = self._bullet, self._client
+        self._params = params
+        self._substeps = _whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
+        self._floor = bullet.createMultiBody(
+            0, bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client), physicsClientId=client
+        )
+        # Bullet multiplies the friction of both bodies. Rolling without slipping is friction's work alone.
+        _set_surface(bullet, client, self._floor, -1, 1.0)
+        self._set_ball()
+
+    def reset(self, x: State) -> None:
+        """Puts the robot into state x, with a ball that rolls without slipping."""
+        super().reset(x)
+        bullet, client, radius = self._bullet, self._client, self._params.ball_radius
+        bullet.resetJointState(self._robot, self._height, _PRESSED, 0.0, physicsClientId=client)
+        spin = (-x[5] / radius, x[4] / radius, 0.0)
+        bullet.resetJointStateMultiDof(self._robot, self._ball, (0, 0, 0, 1), spin, physicsClientId=client)
+
+    def set_params(self, params: BallbotParams) -> None:
+        # The URDF is loaded again, so that nothing of the contact's settings is lost; see `_set_surface`.
+        self._bullet.removeBody(self._robot, physicsClientId=self._client)
+        self._robot, self._joints = load_robot(self._bullet, self._client, params)
+        self._params = params
+        self._set_ball()
+
+    def step(self, u: tuple[float, float]) -> State:
+        bullet, client, robot, radius = self._bullet, self._client, self._robot, self._params.ball_radius
+        torque = (-radius * u[1], radius * u[0], 0.0)
+        bullet.applyExternalTorque(robot, self._ball, torque, bullet.WORLD_FRAME, physicsClientId=client)
+        opposite = (-torque[0], -torque[1], 0.0)
+        bullet.applyExternalTorque(robot, self._joints[3], opposite, bullet.WORLD_FRAME, physicsClientId=client)
+        bullet.stepSimulation(physicsClientId=client)
+        a, b, c, d = bullet.getJointStates(robot, self._joints, physicsClientId=client)
+        return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1])
+
+    def floor_force(self) -> tuple[float, float, float]:
+        """Of the last step of Bullet; 0 where the ball is in the air."""
+        points = self._bullet.getContactPoints(self._robot, self._floor, physicsClientId=self._client)
+        total = [0.0, 0.0, 0.0]
+        for point in points:
+            for force, direction in ((point[9], point[7]), (point[10], point[11]), (point[12], point[13])):
+                for i in range(3):
+                    total[i] += (
+                        self._substeps * force * direction[i]
+                    )  # Bullet divides a substep's impulse by the whole step
+        return total[0], total[1], total[2]
+
+    def height(self) -> float:
+        """How far the ball is above the floor, m; negative where it presses into it."""
+        return self._bullet.getJointState(self._robot, self._height, physicsClientId=self._client)[0]
+
+    def slip(self) -> tuple[float, float]:
+        """Velocity of the ball's lowest point over the floor, m/s."""
+        bullet, client = self._bullet, self._client
+        vx, vy = (s[1] for s in bullet.getJointStates(self._robot, self._joints[:2], physicsClientId=client))
+        wx, wy, _ = bullet.getLinkState(self._robot, self._ball, computeLinkVelocity=1, physicsClientId=client)[7]
+        return vx - wy * self._params.ball_radius, vy + wx * self._params.ball_radius
+
+    def _set_ball(self) -> None:
+        bullet, client, robot = self._bullet, self._client, self._robot
+        index = joint_indices(bullet, client, robot)
+        self._ball, self._height = index["roll"], index["z"]
+        _set_surface(bullet, client, robot, self._ball, min(self._params.friction, _MOST_FRICTION))
+        bullet.setJointMotorControl2(robot, self._height, bullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
+        bullet.setJointMotorControlMultiDof(
+            robot,
+            self._ball,
+            bullet.POSITION_CONTROL,
+            targetPosition=(0, 0, 0, 1),
+            positionGain=0,
+            velocityGain=0,
+            force=(0, 0, 0),
+            physicsClientId=client,
+        )
 
 
 PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": BulletSimulator, "rk4": Rk4Simulator}
@@ -142,6 +239,16 @@ def default_physics() -> str:
         _noticed.append(True)
         warnings.warn(f'PyBullet is not installed: physics="rk4" is used. {_HOW_TO_GET_IT}', stacklevel=3)
     return "rk4"
+
+
+def make_simulator(
+    physics: str, params: BallbotParams, control_dt: float, physics_dt: float | None = None
+) -> Simulator:
+    """The simulator of a robot: "rk4", or "bullet" with contact where the ball rolls. Args: as for `BulletSimulator`."""
+    kind = PHYSICS[physics]
+    if kind is BulletSimulator and params.rolls:
+        kind = BulletContactSimulator
+    return kind(params, control_dt, physics_dt)
 
 
 PHYSICS_NAMES = {"bullet": "PyBullet", "rk4": "the closed-form model"}
@@ -210,10 +317,9 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
             flags=bullet.URDF_USE_INERTIA_FROM_FILE,
             physicsClientId=client,
         )
-    count = bullet.getNumJoints(robot, physicsClientId=client)
-    index = {bullet.getJointInfo(robot, i, physicsClientId=client)[1].decode(): i for i in range(count)}
+    index = joint_indices(bullet, client, robot)
     joints = tuple(index[name] for name in _JOINTS)
-    for joint in range(-1, count):
+    for joint in range(-1, len(index)):
         bullet.changeDynamics(
             robot,
             joint,
@@ -228,6 +334,29 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
         robot, joints, bullet.VELOCITY_CONTROL, forces=[0] * len(joints), physicsClientId=client
     )
     return robot, joints
+
+
+def joint_indices(bullet: ModuleType, client: int, robot: int) -> dict[str, int]:
+    """The index of every joint, and of the link that it carries, by the joint's name."""
+    count = bullet.getNumJoints(robot, physicsClientId=client)
+    return {bullet.getJointInfo(robot, i, physicsClientId=client)[1].decode(): i for i in range(count)}
+
+
+def _set_surface(bullet: ModuleType, client: int, body: int, link: int, friction: float) -> None:
+    """Friction as given, and nothing else that acts at a contact."""
+    # A call that sets damping too would drop lateralFriction without a word.
+    bullet.changeDynamics(
+        body,
+        link,
+        lateralFriction=friction,
+        rollingFriction=0,
+        spinningFriction=0,
+        restitution=0,
+        physicsClientId=client,
+    )
+    found = bullet.getDynamicsInfo(body, link, physicsClientId=client)[1]
+    if not math.isclose(found, friction, rel_tol=1e-6):
+        raise RuntimeError(f"PyBullet took {found} for a friction of {friction}")
 
 
 def _whole_substeps(control_dt: float, physics_dt: float) -> int:

@@ -14,9 +14,18 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ballbot_gym import dynamics
-from ballbot_gym.env import LARGEST, REWARD_PARTS, check_constant_names, make_task, observation_space, spec_of
+from ballbot_gym.env import (
+    LARGEST,
+    REWARD_PARTS,
+    check_constant_names,
+    limit_names,
+    make_task,
+    observation_space,
+    spec_of,
+)
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.scene import Scene
 from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import Task
@@ -106,6 +115,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         physics: str = "rk4",
         max_episode_steps: int | None = None,
         engine: str = "auto",
+        robot: str | BallbotParams = PAPER,
         **task_fields: Any,
     ):
         """Makes the environments. Arguments that are not listed are those of `BallbotBatch`.
@@ -129,7 +139,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if engine not in _ENGINES:
             raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
         self._spec: EnvSpec | None = None
-        task = _task(task, max_episode_steps, task_fields)
+        params = checked_robot(robot, params)
+        task = _task(task, params, max_episode_steps, task_fields)
         _check_physics(physics, task, num_envs)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         small = isinstance(num_envs, int) and num_envs < LOOP_BELOW
@@ -151,7 +162,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space = observation_space(self.task, self.params)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._limit_names = np.array(("", *self.task.limit_names), dtype=object)
+        self._limit_names = np.array(("", *limit_names(self.task, self.params)), dtype=object)
         self._survive = self.task.survival_reward * self.task.control_dt
         self._scene: Scene | None = None
 
@@ -213,6 +224,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             np.full(size, -1),
             np.zeros(size, bool),
             mask,
+            np.zeros((size, 4), self._dtype) if self.params.grips else None,
         )
         return self._array(observation, np.float32), infos
 
@@ -245,6 +257,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         result = self._advance(actions, waiting, restart)
         reward, cost, terminated, truncated = result.reward, result.cost, result.terminated, result.truncated
         success, violated, force, clipped = result.success, result.violated, result.force.T, result.clipped
+        grip = None if result.grip is None else result.grip.T
         done = terminated | truncated
         ended = done.nonzero()[0]
         parts = np.zeros((3, self.num_envs))
@@ -261,15 +274,19 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             self._ended = done
         elif ended.size:
             end = (cost, parts, result.final_tilt, force, success, violated, clipped)
-            infos["final_info"] = self._info(result.final_x, constants, *end, done)
+            infos["final_info"] = self._info(result.final_x, constants, *end, done, grip)
             infos["final_obs"] = _some_rows(result.final_observation, ended)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
             cost, parts, force, clipped = cost.copy(), parts.copy(), force.copy(), clipped.copy()
             cost[ended], parts[:, ended], force[ended], clipped[ended] = 0.0, 0.0, 0.0, False
             success, violated = success & ~done, np.where(done, -1, violated)
+            if grip is not None:
+                grip = np.where(done[:, None], 0.0, grip).astype(self._dtype)
         everywhere = np.ones(self.num_envs, np.bool_)
-        infos |= self._info(*self._x_and_c(), cost, parts, result.tilt, force, success, violated, clipped, everywhere)
+        infos |= self._info(
+            *self._x_and_c(), cost, parts, result.tilt, force, success, violated, clipped, everywhere, grip
+        )
         return result.observation, reward, terminated, truncated, infos
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -365,7 +382,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             return self.batch.step(actions, waiting, restart)
         with torch.no_grad():
             result = _advance(self.batch, self._to_batch(actions), waiting, restart)
-        arrays = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
+        arrays = {
+            name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items() if part is not None
+        }
         return result._replace(**arrays)
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
@@ -394,6 +413,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         violated: np.ndarray,
         clipped: np.ndarray,
         mask: np.ndarray,
+        grip: np.ndarray | None = None,
     ) -> dict[str, Any]:
         """An info with the keys of `BallbotEnv`'s, in the same order, each with Gymnasium's mask (B,) of valid entries.
 
@@ -407,6 +427,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         infos = {}
         for (name, mask_name), value in zip(_INFO_KEYS, values, strict=True):
             infos[name], infos[mask_name] = value, mask
+        if grip is not None:
+            infos["grip"], infos["_grip"] = grip, mask
         return infos
 
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
@@ -468,6 +490,7 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
             violated=torch.where(wait, -1, result.violated),
             force=result.force * no,
             clipped=result.clipped & no,
+            grip=None if result.grip is None else torch.where(no, result.grip, 0.0),
         )
     held = ended if wait is None else ended | wait
     if not held.any():
@@ -481,9 +504,9 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
     return result._replace(observation=observation, tilt=tilt_of(batch.state.x.unbind(0)))
 
 
-def _task(task: str | Task, max_episode_steps: int | None, fields: dict[str, Any]) -> Task:
+def _task(task: str | Task, params: BallbotParams, max_episode_steps: int | None, fields: dict[str, Any]) -> Task:
     """The task, with episodes of at most so many control steps."""
-    made = make_task(task, **fields)
+    made = make_task(task, params, **fields)
     if max_episode_steps is None:
         return made
     if isinstance(max_episode_steps, bool) or not isinstance(max_episode_steps, int) or max_episode_steps < 1:

@@ -3,6 +3,7 @@ import dataclasses
 import pytest
 
 from ballbot_gym.params import URDF_PATH, BallbotParams, UrdfError, default_params
+from ballbot_gym.robots import named_robot
 
 
 def test_packaged_robot_has_the_numbers_that_give_the_papers_linearization():
@@ -32,10 +33,12 @@ def test_derived_quantities_are_those_of_the_two_masses(params):
     assert params.pivot_inertia == pytest.approx(1.2875 + 15 * 0.6**2)
 
 
-def test_written_urdf_reads_back_bit_by_bit(params, tmp_path):
+@pytest.mark.parametrize("robot", ["paper", "rolling"])
+def test_written_urdf_reads_back_bit_by_bit(robot, tmp_path):
+    params = named_robot(robot)
+    numbers = {name: value for name, value in dataclasses.asdict(params).items() if value and value is not True}
     # thirds and sevenths: numbers that a short decimal would lose
-    fields = {field.name: getattr(params, field.name) * 8 / 7 + 1 / 3 for field in dataclasses.fields(params)}
-    changed = BallbotParams(**fields)
+    changed = dataclasses.replace(params, **{name: value * 8 / 7 + 1 / 3 for name, value in numbers.items()})
     path = tmp_path / "changed.urdf"
     path.write_text(changed.to_urdf())
     assert BallbotParams.from_urdf(path, gravity=changed.gravity) == changed

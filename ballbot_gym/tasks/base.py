@@ -212,12 +212,16 @@ class Task(ABC):
         h = ml and J the body's inertia about the ball. The kinetic energy T is at least ½µ|v|² and gains F|v| per second at
         most, so √(2T/µ) grows by F/µ per second at most. It is also at least ½κ(γ̇² + θ̇²) with κ = min(J − h²/m_total,
         axial inertia). The start may bring 100 m/s. The step that leaves the arena or the tilt limit goes on for one
-        control step. Everything is doubled, for randomized robots, for sensor noise and for the integrator's error.
+        control step. Everything is doubled, for randomized robots, for sensor noise and for the integrator's error. The
+        torque that drives a rolling ball adds F r |ω| to the power, and |ω| is at most √(µ/κ) times √(2T/µ).
         """
         h, inertia = params.first_moment, params.pivot_inertia
-        felt = params.total_mass - h * h / inertia
-        least_inertia = min(inertia - h * h / params.total_mass, params.axial_inertia)
-        speed = 2 * (100.0 + math.sqrt(2) * params.force_limit * self.duration / felt)
+        felt = params.moving_mass - h * h / inertia
+        least_inertia = min(inertia - h * h / params.moving_mass, params.axial_inertia)
+        force = math.sqrt(2) * params.force_limit
+        if params.rolls:
+            force *= 1 + params.ball_radius * math.sqrt(felt / least_inertia)
+        speed = 2 * (100.0 + force * self.duration / felt)
         rate = speed * math.sqrt(felt / least_inertia)
         *_, radius = self.arena((self.LARGEST_CONSTANT,) * len(self.constant_names))
         return radius + speed * self.control_dt, self.max_tilt + rate * self.control_dt, speed, rate

@@ -231,11 +231,17 @@ class Orbit(Task):
 def orbit_speed(params: BallbotParams, radius: Any, tilt: Any) -> Any:
     """Speed, m/s, at which a steady orbit of this radius, m, leans inwards by this tilt, rad.
 
-    With J = I + ml², h = ml and Ω = v/r: tan(tilt)·(hg + JΩ² cos(tilt)) = hΩ² r. The body's axial inertia, 1.1 % of J
-    here, is left out: with it the orbit is steady to 2 % of the ball's and 4.5 % of the leans' accelerations at 45°.
+    With J = I + ml², h = ml and Ω = v/R: tan(tilt)·(hg + JΩ² cos(tilt)) = hΩ² R. The body's axial inertia, 1.1 % of J
+    here, is left out: with it the orbit is steady to 2 % of the ball's and 4.5 % of the leans' accelerations at 45°. A ball
+    that rolls is driven by a torque, which tilts the body too: Ω² = hg sin(tilt) / (cos(tilt) (hR − J sin(tilt)) +
+    r (m R − h sin(tilt))) with the ball's radius r and the moving mass m.
     """
     h, inertia = params.first_moment, params.pivot_inertia
     sin_tilt, cos_tilt = ops.sin(tilt), ops.cos(tilt)
+    if params.rolls:
+        torque = params.ball_radius * (params.moving_mass * radius - h * sin_tilt)
+        resistance = cos_tilt * (h * radius - inertia * sin_tilt) + torque
+        return radius * ops.sqrt(h * params.gravity * sin_tilt / resistance)
     return radius * ops.sqrt(h * params.gravity * sin_tilt / cos_tilt / (h * radius - inertia * sin_tilt))
 
 
@@ -245,7 +251,7 @@ def orbit_tilt(params: BallbotParams, radius: float, speed: float) -> float:
     for _ in range(60):
         middle = 0.5 * (low + high)
         h, inertia = params.first_moment, params.pivot_inertia
-        too_fast = inertia * math.sin(middle) >= h * radius
+        too_fast = inertia * math.sin(middle) >= h * radius  # sufficient where the ball rolls
         low, high = (low, middle) if too_fast or orbit_speed(params, radius, middle) > abs(speed) else (middle, high)
     return 0.5 * (low + high)
 
@@ -264,5 +270,6 @@ def steady_orbit(
     gamma_dot = axis_dot[:, 0] * math.cos(tilt) / (math.cos(tilt) ** 2 + axis[:, 0] ** 2)
     states = np.column_stack([radius * outward, gamma, theta, speed * along, gamma_dot, theta_dot])
     com_radius = radius - params.com_height * math.sin(tilt)
-    pull = rate**2 * (params.ball_mass * radius + params.body_mass * com_radius)
+    ball_mass = params.ball_mass + (params.moving_mass - params.total_mass)
+    pull = rate**2 * (ball_mass * radius + params.body_mass * com_radius)
     return states, -pull * outward

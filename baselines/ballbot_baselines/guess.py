@@ -38,7 +38,7 @@ def along_path(
     x = np.column_stack([path, lean, velocity, np.gradient(lean, dt, axis=0)])
     if start is not None:
         x[0] = start
-    u = np.clip(params.total_mass * acceleration[:-1], -params.force_limit, params.force_limit)
+    u = np.clip(params.moving_mass * acceleration[:-1], -params.force_limit, params.force_limit)
     return x, u
 
 

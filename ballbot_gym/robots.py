@@ -1,0 +1,97 @@
+"""The robots by name: their URDFs, and the episodes that each is given."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ballbot_gym.params import ROLLING_URDF_PATH, URDF_FOLDER, URDF_PATH, BallbotParams
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot by name.
+
+    `fields` are the fields of tasks, by the task's name, that differ from the defaults because the paper's episodes are
+    beyond this robot.
+    """
+
+    about: str
+    urdf: Path
+    fields: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+ROBOTS: dict[str, Robot] = {
+    "paper": Robot("the paper's: a ball that translates, on a floor that gives whatever force is asked", URDF_PATH),
+    "rolling": Robot(
+        "the paper's with a ball that rolls, driven by a torque, on a floor with friction 0.8",
+        ROLLING_URDF_PATH,
+        {
+            "stabilize": {"start_lean": 0.3, "start_lean_rate": 0.5},
+            "orbit": {"max_steady_tilt": 0.56},
+        },
+    ),
+    "kugle": Robot(
+        "Kugle V1 of Aalborg University, by its published numbers",
+        URDF_FOLDER / "kugle.urdf",
+        {
+            "stabilize": {"start_position": 1.0, "start_speed": 1.0, "start_lean": 0.1, "start_lean_rate": 0.2},
+            "turn": {"min_speed": 0.5, "max_speed": 1.5},
+            "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15},
+            "weave": {"ball_radius": 0.129},
+        },
+    ),
+}
+"""Every robot by its name on the command line. A new robot is one URDF and one entry here."""
+
+PAPER = "paper"
+"""The default."""
+
+
+@cache
+def named_robot(name: str) -> BallbotParams:
+    """The robot of a name in `ROBOTS`, read once from its URDF.
+
+    Raises:
+        ValueError: no robot of that name.
+    """
+    if name not in ROBOTS:
+        raise ValueError(f"unknown robot {name!r}; known: {', '.join(map(repr, ROBOTS))}")
+    return BallbotParams.from_urdf(ROBOTS[name].urdf)
+
+
+def robot_name(params: BallbotParams) -> str | None:
+    """The name in `ROBOTS` of a robot, or None where it is none of them."""
+    return next((name for name in ROBOTS if named_robot(name) == params), None)
+
+
+def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
+    """The robot that was given by name or by its parameters.
+
+    Args:
+        robot: a name in `ROBOTS`, or a BallbotParams.
+        params: the same as a BallbotParams, or None; not both.
+
+    Raises:
+        ValueError: no robot of that name, or a robot and params.
+        TypeError: it is something else, such as a dict of fields.
+    """
+    if params is not None:
+        if robot != PAPER:
+            raise ValueError("give either robot or params, not both: robot takes a name or a BallbotParams")
+        robot = params
+    if isinstance(robot, str):
+        return named_robot(robot)
+    if not isinstance(robot, BallbotParams):
+        raise TypeError(
+            "params must be a BallbotParams, for instance dataclasses.replace(default_params(), body_mass=12.0), "
+            f"not {robot!r}; robot may also be one of {', '.join(map(repr, ROBOTS))}"
+        )
+    return robot
+
+
+def own_fields(robot: str | BallbotParams, task: str) -> dict[str, float]:
+    """The fields of a task, by name, that a robot has other defaults of."""
+    name = robot if isinstance(robot, str) else robot_name(robot)
+    return dict(ROBOTS[name].fields.get(task, {})) if name in ROBOTS else {}

@@ -1,0 +1,314 @@
+"""A ball that rolls: its dynamics, its contact with the floor, and the robots that have one."""
+
+import dataclasses
+import math
+
+import casadi
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ballbot_baselines.linearize import linearize
+from ballbot_baselines.lqr import discrete_lqr
+from ballbot_gym import dynamics
+from ballbot_gym.env import BallbotEnv, limit_names
+from ballbot_gym.params import BallbotParams, UrdfError, default_params
+from ballbot_gym.robots import ROBOTS, checked_robot, named_robot, robot_name
+from ballbot_gym.simulator import BulletContactSimulator, Rk4Simulator
+from ballbot_gym.tasks import Orbit, Stabilize
+from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
+
+START = (0.0, 0.0, 0.2, -0.15, 0.5, -1.0, 0.3, -0.4)
+
+
+@pytest.fixture(params=["rolling", "kugle"])
+def robot(request):
+    return named_robot(request.param)
+
+
+@pytest.fixture
+def rolling():
+    return named_robot("rolling")
+
+
+def newton_euler(p, x, u):
+    """Accelerations (4,) and floor force (3,) from the balance of forces and torques on the ball and on the body.
+
+    Unknown are ẍ, ÿ, γ̈, θ̈, the floor's force (3), the force of the ball on the body (3), and the torque that keeps the
+    body from yawing.
+    """
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot = x
+    r, ball, body, g = p.ball_radius, p.ball_mass, p.body_mass, p.gravity
+    turned = Rotation.from_rotvec([0, gamma, 0])
+    turn = turned * Rotation.from_rotvec([-theta, 0, 0])
+    e_y, second, yaw_axis = np.eye(3)[1], -turned.apply([1, 0, 0]), turned.apply([0, 0, 1])
+    omega = gamma_dot * e_y + theta_dot * second
+    omega_rest = theta_dot * gamma_dot * np.cross(e_y, second)  # of the angular acceleration, without γ̈ and θ̈
+    centre = p.com_height * turn.apply([0, 0, 1])
+    inertia = turn.as_matrix() @ np.diag([p.inertia, p.inertia, p.axial_inertia]) @ turn.as_matrix().T
+    torque = r * np.cross([0, 0, 1], [u[0], u[1], 0])
+    a, b = np.zeros((13, 11)), np.zeros(13)
+    F, J, YAW = slice(4, 7), slice(7, 10), 10
+    e = np.eye(3)
+    # the ball: forces, then torques about its centre; rolling gives its angular acceleration e_z × p̈ / r
+    a[0:3, 0:2], a[0:3, F], a[0:3, J], b[0:3] = ball * e[:, :2], -e, e, [0, 0, -ball * g]
+    arm = np.cross([0, 0, -r], e).T  # of the floor's force about the centre
+    a[3:6, 0:2], a[3:6, F], b[3:6] = p.ball_inertia / r * np.cross([0, 0, 1], e).T[:, :2], -arm, torque
+    a[5, F] = 0  # nothing turns the ball about the vertical
+    # the body: forces, then torques about its centre of mass
+    a[6:9, 0:2] = body * e[:, :2]
+    for column, axis in ((2, e_y), (3, second)):
+        a[6:9, column] = body * np.cross(axis, centre)
+        a[9:12, column] = inertia @ axis
+    a[6:9, J] = -e
+    b[6:9] = [0, 0, -body * g] - body * (np.cross(omega_rest, centre) + np.cross(omega, np.cross(omega, centre)))
+    a[9:12, J], a[9:12, YAW] = -np.cross(-centre, e).T, -yaw_axis
+    b[9:12] = -torque - inertia @ omega_rest - np.cross(omega, inertia @ omega)
+    found, _residual, rank, _ = np.linalg.lstsq(a, b, rcond=None)
+    assert rank == 11
+    assert np.abs(a @ found - b).max() < 1e-9
+    return found[:4], found[F]
+
+
+def random_states(rng, n=20):
+    x = rng.uniform(-1, 1, (n, 8)) * [1, 1, 1.0, 1.0, 5, 5, 6, 6]
+    return zip(x, rng.uniform(-200, 200, (n, 2)), strict=True)
+
+
+def test_accelerations_and_contact_are_those_of_newton_and_euler(robot, rng):
+    for x, u in random_states(rng):
+        accelerations, floor = newton_euler(robot, x, u)
+        scale = 1 + np.abs(accelerations).max()
+        np.testing.assert_allclose(dynamics.accelerations(robot, x, u), accelerations, rtol=0, atol=1e-9 * scale)
+        np.testing.assert_allclose(dynamics.contact(robot, x, u), floor, rtol=0, atol=1e-9 * np.abs(floor).max())
+
+
+def test_accelerations_are_lagranges_from_the_energy(robot, rng):
+    """d/dt ∂T/∂q̇ − ∂(T − V)/∂q = Q, with T + V from `energy`, differentiated symbolically."""
+    q, v, u = casadi.SX.sym("q", 4), casadi.SX.sym("v", 4), casadi.SX.sym("u", 2)
+    total = dynamics.energy(robot, casadi.vertcat(q, v))
+    potential = casadi.substitute(total, v, casadi.SX.zeros(4))
+    lagrangian = total - 2 * potential  # T − V
+    momentum = casadi.gradient(lagrangian, v)
+    r = robot.ball_radius
+    force = casadi.vertcat(u[0], u[1], -r * u[0], -r * u[1] * casadi.cos(q[2]))
+    rest = force + casadi.gradient(lagrangian, q) - casadi.jtimes(momentum, q, v)
+    expected = casadi.Function("a", [q, v, u], [casadi.solve(casadi.jacobian(momentum, v), rest)])
+    for x, f in random_states(rng):
+        found = np.array(expected(x[:4], x[4:], f)).ravel()
+        np.testing.assert_allclose(
+            dynamics.accelerations(robot, x, f), found, rtol=1e-9, atol=1e-9 * np.abs(found).max()
+        )
+
+
+def test_the_papers_robot_is_a_rolling_one_of_no_radius_and_inertia(rng):
+    paper = default_params()
+    almost = dataclasses.replace(paper, rolls=True, ball_radius=1e-9, ball_inertia=1e-40)
+    for x, u in random_states(rng, 5):
+        np.testing.assert_allclose(dynamics.accelerations(almost, x, u), dynamics.accelerations(paper, x, u), rtol=1e-6)
+        fx, fy, normal = dynamics.contact(paper, x, u)
+        assert (fx, fy) == tuple(u)
+        np.testing.assert_allclose(dynamics.contact(almost, x, u)[2], normal, rtol=1e-6)
+
+
+def test_the_linearization_of_the_rolling_robot_moves_as_derived(rolling):
+    a, b = linearize(rolling, np.zeros(8), np.zeros(2))
+    # -a, b, c, -d of the paper's (5) and (6), which are 35.07, 60.40, 0.295 and 0.397
+    assert (a[4, 2], a[6, 2], b[4, 0], b[6, 0]) == pytest.approx((-33.12, 57.77, 0.316, -0.441), abs=0.005)
+
+
+def test_the_power_of_the_drive_is_the_change_of_energy(robot):
+    """Both bodies together take up T·(ω_ball − ω_body), and the floor does no work."""
+    x, u, h = np.array(START), np.array([20.0, -15.0]), 1e-5
+    before, after = (dynamics.energy(robot, dynamics.step(robot, x, u, s * h)) for s in (-1, 1))
+    gamma, vx, vy, gamma_dot, theta_dot = x[2], *x[4:]
+    r = robot.ball_radius
+    power = u[0] * (vx - r * gamma_dot) + u[1] * (vy - r * math.cos(gamma) * theta_dot)
+    assert (after - before) / (2 * h) == pytest.approx(power, rel=1e-6)
+
+
+def test_a_steady_orbit_stays_one(rolling):
+    """Without the axial inertia, which the formula leaves out, the orbit is steady to rounding."""
+    thin = dataclasses.replace(rolling, axial_inertia=1e-12)
+    radius, tilt = 1.5, math.radians(30)
+    speed = orbit_speed(thin, radius, tilt)
+    (x,), (u,) = steady_orbit(thin, radius, speed, np.zeros(1))
+    ax, ay, gamma_ddot, theta_ddot = dynamics.accelerations(thin, x, u)
+    rate = speed / radius
+    assert dynamics.tilt(x) == pytest.approx(tilt)
+    # the body's axis turns at a constant rate: n = −sin(tilt) (cos Ωt, sin Ωt), of constant height
+    assert (ax, ay) == pytest.approx((-(rate**2) * radius, 0), abs=1e-9)
+    assert theta_ddot == pytest.approx(0, abs=1e-9)
+    assert gamma_ddot == pytest.approx(rate**2 * math.sin(tilt) * math.cos(tilt), rel=1e-9)
+
+
+def test_standing_the_floor_carries_the_weight(robot):
+    assert dynamics.contact(robot, np.zeros(8), np.zeros(2)) == pytest.approx((0, 0, robot.weight))
+    assert dynamics.limits(robot, np.zeros(8), np.zeros(2)) == pytest.approx((0.98, 1))
+
+
+def test_the_second_limit_is_zero_on_the_cone(rolling):
+    fx, fy, normal = dynamics.contact(rolling, np.array(START), np.array([40.0, 30.0]))
+    needed = dynamics.grip((fx, fy, normal))[3]
+    on_the_cone = dataclasses.replace(rolling, friction=float(needed))
+    assert dynamics.limits(on_the_cone, np.array(START), np.array([40.0, 30.0]))[1] == pytest.approx(0, abs=1e-12)
+    assert dynamics.limits(on_the_cone, np.array(START), np.array([40.0, 30.0]), backoff=0.1)[1] < 0
+    assert dynamics.grip((1.0, 0.0, -5.0))[3] == math.inf
+
+
+def test_the_paper_has_no_limits_of_grip(params, rng):
+    assert dynamics.limits(params, np.zeros(8), np.zeros(2)) == ()
+    assert params.moving_mass == params.total_mass
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robots_urdf_is_read_back_exactly(name, tmp_path):
+    robot = named_robot(name)
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot.to_urdf())
+    assert BallbotParams.from_urdf(path) == robot
+    assert robot_name(robot) == name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('<child link="ball" />', '<child link="body" />', "joint 'roll' has child link 'body'"),
+        ('name="roll" type="spherical"', 'name="roll" type="fixed"', "must be spherical"),
+        ('iyy="0.002"', 'iyy="0.003"', "must be round"),
+        ('lateral_friction value="0.8"', 'lateral_friction value="0"', "positive lateral_friction"),
+    ],
+)
+def test_a_wrong_rolling_chain_is_named(old, new, message, rolling, tmp_path):
+    path = tmp_path / "robot.urdf"
+    text = rolling.to_urdf()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(UrdfError, match=message):
+        BallbotParams.from_urdf(path)
+
+
+def test_a_robot_is_named_or_given(rolling):
+    assert checked_robot("rolling") == checked_robot(rolling) == checked_robot("paper", rolling) == rolling
+    with pytest.raises(ValueError, match="unknown robot 'rollin'; known: 'paper', 'rolling', 'kugle'"):
+        BallbotEnv(robot="rollin", physics="rk4")
+    with pytest.raises(ValueError, match="not both"):
+        BallbotEnv(robot="rolling", params=rolling, physics="rk4")
+    with pytest.raises(ValueError, match="ball_inertia must be 0 where the ball does not roll"):
+        dataclasses.replace(default_params(), ball_inertia=0.1)
+    with pytest.raises(ValueError, match="friction must be positive"):
+        dataclasses.replace(default_params(), friction=0.0)
+
+
+def balancing(robot, steps=25):
+    """Forces of LQR from `START`, and the exact states under them."""
+    gain = discrete_lqr(Stabilize(), robot, np.zeros(8), np.zeros(2), np.zeros(0))[0]
+    exact = Rk4Simulator(robot, 0.02, 0.0005)
+    exact.reset(START)
+    x, forces, states = np.array(START), [], []
+    for _ in range(steps):
+        forces.append(tuple((-gain @ x).tolist()))
+        x = np.array(exact.step(forces[-1]))
+        states.append(x)
+    return forces, states
+
+
+def test_bullets_contact_converges_to_the_closed_form_with_first_order(rolling):
+    grippy = dataclasses.replace(rolling, friction=3.0)
+    forces, states = balancing(grippy)
+    errors = []
+    for physics_dt in (2e-3, 1e-3, 5e-4):
+        simulator = BulletContactSimulator(grippy, 0.02, physics_dt)
+        simulator.reset(START)
+        found = [np.array(simulator.step(u)) for u in forces]
+        errors.append(np.abs(np.array(found) - states).max())
+        np.testing.assert_allclose(simulator.floor_force(), dynamics.contact(grippy, states[-1], forces[-1]), rtol=0.01)
+        assert np.hypot(*simulator.slip()) < 1e-5
+        assert abs(simulator.height()) < 1e-4
+        simulator.close()
+    assert errors[1] < 0.02
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(2, rel=0.1)
+
+
+def test_bullets_ball_slips_where_the_closed_form_leaves_the_cone(rolling):
+    """From standing still, the force at which the ball slips within a control step is that of the cone within 2 %."""
+
+    def slip(force):
+        simulator = BulletContactSimulator(rolling, 0.02)
+        simulator.reset((0.0,) * 8)
+        simulator.step((force, 0.0))
+        found = np.hypot(*simulator.slip())
+        simulator.close()
+        return found
+
+    low, high = 0.0, 350.0
+    while high - low > 0.5:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if slip(middle) > 1e-3 else (middle, high)
+
+    def limit(force):
+        """The least over the control step."""
+        x, u = np.zeros(8), np.array([force, 0.0])
+        return min(dynamics.limits(rolling, dynamics.step(rolling, x, u, t), u)[1] for t in (1e-6, 0.01, 0.02))
+
+    edge = next(f for f in np.arange(50, 350, 0.25) if limit(f) < 0)
+    assert low == pytest.approx(edge, rel=0.02)
+
+
+def test_losing_grip_is_a_failure_in_the_closed_form(rolling):
+    env = BallbotEnv(robot="rolling", physics="rk4")
+    _, info = env.reset(options={"state": np.zeros(8)})
+    assert info["grip"].tolist() == [0, 0, 0, 0]
+    _, _, terminated, _, info = env.step([0.1, 0.0])
+    assert not terminated
+    np.testing.assert_allclose(info["grip"][:3], dynamics.contact(rolling, np.zeros(8), np.array([35.0, 0.0])))
+    assert info["grip"][3] == pytest.approx(info["grip"][0] / info["grip"][2])
+    _, _, terminated, _, info = env.step([1.0, 0.0])
+    assert terminated
+    assert info["failure"]
+    assert info["violated"] == "grip"
+    assert info["grip"][3] > 0.8
+
+
+def test_slipping_is_no_failure_in_bullet():
+    env = BallbotEnv(robot="rolling", physics="bullet")
+    env.reset(options={"state": np.zeros(8)})
+    _, _, terminated, _, info = env.step([1.0, 0.0])
+    assert not terminated
+    assert info["grip"][3] == pytest.approx(0.8, rel=0.01)
+    env.close()
+
+
+def test_the_papers_info_has_no_grip(make_env):
+    env = make_env(physics="rk4")
+    assert "grip" not in env.reset(seed=0)[1]
+    assert limit_names(env.task, env.params) == env.task.limit_names
+
+
+@pytest.mark.parametrize("engine", ["torch", "loop"])
+def test_batches_lose_grip_as_single_envs_do(engine):
+    torch = pytest.importorskip("torch")
+    from ballbot_gym.vector import BallbotVectorEnv
+
+    count, rng = 8, np.random.default_rng(0)
+    vector = BallbotVectorEnv(count, robot="rolling", engine=engine, dtype=torch.float64, autoreset_mode="NextStep")
+    env = BallbotEnv(robot="rolling", physics="rk4")
+    x = rng.uniform(-0.2, 0.2, (count, 8))
+    _, infos = vector.reset(seed=0, options={"state": x})
+    assert infos["grip"].shape == (count, 4)
+    actions = rng.uniform(-1, 1, (count, 2))
+    _, reward, terminated, _, infos = vector.step(actions)
+    assert 0 < terminated.sum() < count
+    for i in range(count):
+        env.reset(options={"state": x[i]})
+        _, alone, ended, _, info = env.step(actions[i])
+        assert reward[i] == pytest.approx(alone)
+        assert (ended, info["violated"]) == (terminated[i], infos["violated"][i])
+        np.testing.assert_allclose(infos["grip"][i], info["grip"], rtol=1e-6)
+
+
+def test_a_robot_draws_its_own_episodes():
+    assert Orbit().max_steady_tilt > BallbotEnv("orbit", robot="rolling", physics="rk4").task.max_steady_tilt
+    given = BallbotEnv("orbit", robot="rolling", physics="rk4", max_steady_tilt=0.2)
+    assert given.task.max_steady_tilt == 0.2
