@@ -4,6 +4,7 @@
     subject to  Hermite–Simpson:  the cubic through (x_n, f_n) and (x_{n+1}, f_{n+1}) obeys the dynamics at mid-interval,
                                   with u linear between knots
                 equalities(x_n, u_n, q) = 0,  inequalities(x_n, u_n, q) ≥ 0 at every knot
+                limits(x_n, u_n) ≥ 0 at every knot, where the robot's friction is limited (`dynamics.limits`)
                 bounds on x_0, x_N, leans, forces, step h and free variables q;   x_N = x_0 if periodic
 
 This module writes the problem as a staged `Ocp`, and `ocp.OcpSolver` solves it. The input of a stage is the next knot. The
@@ -125,6 +126,10 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
     def path(function: Callable | None, s: casadi.SX) -> casadi.SX:
         return casadi.SX(0, 1) if function is None else casadi.vertcat(*function(s[at.x], limit * s[at.a], s[at.q]))
 
+    def inequalities(s: casadi.SX) -> casadi.SX:
+        asked = path(problem.inequalities, s)
+        return casadi.vertcat(asked, *dynamics.limits(params, s[at.x], limit * s[at.a])) if params.grips else asked
+
     initial = None
     if problem.periodic:  # x_start is x_0
         initial = np.zeros((8, at.size))
@@ -137,9 +142,9 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
         next=lambda s, w, p: casadi.vertcat(w, s[at.h :]),
         cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
         equalities=lambda s, w, p: casadi.vertcat(defect(s, w), path(problem.equalities, s)),
-        inequalities=lambda s, w, p: path(problem.inequalities, s),
+        inequalities=lambda s, w, p: inequalities(s),
         final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_final_path,
-        final_inequalities=lambda s, p: path(problem.inequalities, s),
+        final_inequalities=lambda s, p: inequalities(s),
         initial_matrix=initial,
     )
 

@@ -1,7 +1,8 @@
 """The optimum of any episode of any task, on the env's own discretization.
 
     minimize   Σ_k cost(x_k, u_k, c)·control_dt        over forces u_k, |u_k| ≤ limit, held for control_dt
-    subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n.
+    subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n,
+               limits(x_k, u_k) ≥ 0 where the robot's friction is limited (`dynamics.limits`).
 
 So an episode under physics="rk4" that follows the optimal trajectory returns minus this cost. The problem is solved by
 multiple shooting from each of the task's guessed paths, and the best solution is kept. If no path leads to a solution, the
@@ -79,7 +80,8 @@ class Backoff:
     """How far a plan stays from its limits, so that a controller that tracks it stays within them.
 
     `margin` is in the unit of the task's margins (obstacles: m). `goal` is the fraction of the goal's tolerance that the plan
-    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback.
+    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback, and `grip` the fraction of the
+    friction, for robots whose friction is limited.
 
     Raises:
         ValueError: a field is negative or not finite, or a fraction is not below 1.
@@ -89,9 +91,10 @@ class Backoff:
     margin: float = 1e-7
     goal: float = 1e-6
     force: float = 1e-7
+    grip: float = 1e-6
 
     def __post_init__(self) -> None:
-        for name, below in (("margin", math.inf), ("goal", 1.0), ("force", 1.0)):
+        for name, below in (("margin", math.inf), ("goal", 1.0), ("force", 1.0), ("grip", 1.0)):
             value = getattr(self, name)
             if not is_number(value):
                 raise ValueError(f"Backoff: {name} must be a number, not {value!r}")
@@ -168,6 +171,23 @@ def find_optimum(
     )
 
 
+def plan_to_track(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff) -> Optimum:
+    """As `find_optimum`, for feedback to track: with less friction in reserve where there is no plan with more.
+
+    Args: as of `find_optimum`. Without a limit of friction it is the same.
+
+    Raises:
+        PlanError: no try came to a feasible episode.
+    """
+    reserves = [backoff.grip, 0.3 * backoff.grip, Backoff().grip] if params.grips else [backoff.grip]
+    for grip in reserves[:-1]:
+        try:
+            return find_optimum(task, params, x0, c, replace(backoff, grip=grip))
+        except PlanError:
+            pass
+    return find_optimum(task, params, x0, c, replace(backoff, grip=reserves[-1]))
+
+
 def is_feasible(solution: OcpSolution) -> bool:
     """Converged, and within `FEASIBLE` of every constraint."""
     return solution.success and is_within_limits(solution)
@@ -190,13 +210,16 @@ def _rank(tried: tuple[int, OcpSolution]) -> tuple[bool, float]:
 def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
     """A task on its env's discretization, or with forces held for several control steps.
 
-    Inputs are actions, force / limit; p = [c, margin backoff, goal backoff].
+    Inputs are actions, force / limit; p = [c, margin backoff, goal backoff], and the grip backoff where friction is limited.
     """
     nc = len(task.constant_names)
     dt, limit = task.control_dt * coarseness, params.force_limit
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         return casadi.vertcat(*task.margins(x, p[:nc])) - p[nc]
+
+    def path(x: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+        return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[nc + 2]))
 
     def final(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not task.first_exit:
@@ -207,10 +230,10 @@ def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
         name=task.id,
         states=8,
         inputs=2,
-        params=nc + 2,
+        params=nc + 2 + params.grips,
         next=lambda x, a, p: dynamics.step(params, x, limit * a, dt, dynamics.substeps_for(task.control_dt)),
         cost=lambda x, a, p: task.cost(x, limit * a, p[:nc]) * dt,
-        inequalities=lambda x, a, p: margins(x, p),
+        inequalities=path if params.grips else lambda x, a, p: margins(x, p),
         final_inequalities=final,
     )
 
@@ -228,6 +251,11 @@ def free_time_ocp(task: Task, params: BallbotParams) -> Ocp:
         inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
         final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], p),
     )
+
+
+def shooting_parameters(params: BallbotParams, c: np.ndarray, backoff: Backoff) -> list[float]:
+    """p of `shooting_ocp`."""
+    return [*c, backoff.margin, backoff.goal, *([backoff.grip] if params.grips else [])]
 
 
 def _goal_room(task: Task, x: casadi.SX, p: casadi.SX, nc: int) -> casadi.SX:
@@ -266,14 +294,17 @@ def _solve_from(
     """Solves with fatrop from guessed states (n+1, 8) and actions (n, 2). If fatrop fails, ipopt tries the same guess."""
     solutions = []
     for name in ("fatrop", "ipopt"):
-        solutions.append(_solve_with(_solver(task, params, len(a), name), x, a, c, backoff))
+        solutions.append(_solve_with(_solver(task, params, len(a), name), params, x, a, c, backoff))
         if is_feasible(solutions[-1]):
             break
     return solutions
 
 
-def _solve_with(solver: OcpSolver, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff) -> OcpSolution:
-    return solver.solve(x, a, _bounds(solver.ocp, len(a), x[0], backoff), [*c, backoff.margin, backoff.goal])
+def _solve_with(
+    solver: OcpSolver, params: BallbotParams, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff
+) -> OcpSolution:
+    bounds = _bounds(solver.ocp, len(a), x[0], backoff)
+    return solver.solve(x, a, bounds, shooting_parameters(params, c, backoff))
 
 
 def _solve_fixed_time(
@@ -295,7 +326,7 @@ def _solve_quickly(
 ) -> list[tuple[int, OcpSolution]]:
     """From every path with fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
     solver = _solver(task, params, task.steps, "fatrop", iterations=_QUICK_ITERATIONS)
-    return [(i, _solve_with(solver, x, a, c, backoff)) for i, x, a in _starts(task, params, x0, paths)]
+    return [(i, _solve_with(solver, params, x, a, c, backoff)) for i, x, a in _starts(task, params, x0, paths)]
 
 
 def _starts(
@@ -324,7 +355,7 @@ def _solve_from_righting(
                 relaxed = _relax_time(task, params, x, a, c, backoff)
                 solved = _whole_steps(task, params, c, backoff, relaxed) if is_feasible(relaxed) else [relaxed]
             else:
-                solved = [_solve_with(_solver(task, params, len(a), "fatrop"), x, a, c, backoff)]
+                solved = [_solve_with(_solver(task, params, len(a), "fatrop"), params, x, a, c, backoff)]
             found += [(FROM_RIGHTING, s) for s in solved]
     return found
 
@@ -337,6 +368,7 @@ def _simulated(
         return []
     room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(member.x[-1], c)]
     room += [np.asarray(margin) - backoff.margin for margin in task.margins(member.x, c)]
+    room += dynamics.limits(params, member.x[:-1], member.u, backoff.grip)
     return [
         OcpSolution(
             success=False,
@@ -386,13 +418,13 @@ def _solve_likely_sides(
         unsolved.remove(likeliest)
         _, x, a = starts[likeliest]
         if best is None:
-            solution = _solve_with(solver, x[::_COARSE], a[::_COARSE], c, backoff)
+            solution = _solve_with(solver, params, x[::_COARSE], a[::_COARSE], c, backoff)
         else:
-            solution = _solve_with(quick, x[::_COARSE], a[::_COARSE], c, backoff)
+            solution = _solve_with(quick, params, x[::_COARSE], a[::_COARSE], c, backoff)
             if not is_feasible(solution):  # the path from rest to rest is far from this choice's
                 path = np.column_stack([along, predicted_y[likeliest]])
                 x, u = guess.along_path(params, path, task.control_dt, start=x0)
-                solution = _solve_with(quick, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
+                solution = _solve_with(quick, params, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
         solved[likeliest] = solution
         if is_feasible(solution) and (best is None or solution.cost < best.cost):
             path = guess.resampled(solution.states[:, :2], task.steps)
@@ -425,8 +457,7 @@ def _contenders(
     solver = _solver(task, params, n, "fatrop", _COARSE)
     solved = []
     for index, x, a in starts:
-        bounds = _bounds(solver.ocp, n, x0, backoff)
-        solution = solver.solve(x[::_COARSE], a[::_COARSE], bounds, [*c, backoff.margin, backoff.goal])
+        solution = _solve_with(solver, params, x[::_COARSE], a[::_COARSE], c, backoff)
         if is_feasible(solution):
             solved.append((index, solution))
     return _refined(task, solved) or starts
@@ -494,7 +525,7 @@ def _in_free_time(
         bounds = _bounds(solver.ocp, n, x[0], backoff)
         bounds.state_lower[:, 8], bounds.state_upper[:, 8] = task.control_dt / 4, task.duration / n
         states = np.column_stack([x, np.full(n + 1, h)])
-        solution = solver.solve(states, a, bounds, [*c, backoff.margin, backoff.goal])
+        solution = solver.solve(states, a, bounds, shooting_parameters(params, c, backoff))
         if is_feasible(solution):
             break
     return solution

@@ -20,7 +20,7 @@ import numpy as np
 
 from ballbot_baselines import guess, righting
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
-from ballbot_baselines.optimum import shooting_ocp
+from ballbot_baselines.optimum import Backoff, shooting_ocp, shooting_parameters
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
@@ -47,6 +47,7 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
         (n,) rad; NaN where no recoverable lean was found. The search goes outward from the value nearest 0. It starts from
         the neighbouring value's solution and from a recovery to the side, and if both fail from standing.
     """
+    p = shooting_parameters(params, np.zeros(0), Backoff(0.0, 0.0, 0.0, 0.0))
     solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
     leans = np.full(len(values), np.nan)
     middle = int(np.argmin(np.abs(values)))
@@ -54,9 +55,9 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
     for order in (range(middle, len(values)), range(middle, -1, -1)):
         start, failures = standing, 0
         for i in order:
-            found = [_solve(solver, *guessed, component, float(values[i])) for guessed in (start, sideways)]
+            found = [_solve(solver, *guessed, component, float(values[i]), p) for guessed in (start, sideways)]
             if not any(solution.violation <= _FEASIBLE for solution in found):
-                found = [_solve(solver, *standing, component, float(values[i]))]
+                found = [_solve(solver, *standing, component, float(values[i]), p)]
             recovered = [solution for solution in found if solution.violation <= _FEASIBLE]
             if recovered:
                 best = max(recovered, key=lambda solution: solution.states[0, _LEAN])
@@ -68,12 +69,14 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
     return leans
 
 
-def _solve(solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, value: float) -> OcpSolution:
+def _solve(
+    solver: OcpSolver, x: np.ndarray, a: np.ndarray, component: int, value: float, p: list[float]
+) -> OcpSolution:
     bounds = Bounds.free(solver.ocp, len(a))
     known = [i for i in range(8) if i != _LEAN]
     bounds.state_lower[0, known] = bounds.state_upper[0, known] = np.where(np.array(known) == component, value, 0.0)
     bounds.input_lower[:], bounds.input_upper[:] = -1.0, 1.0
-    return solver.solve(x, a, bounds, [0.0, 0.0])
+    return solver.solve(x, a, bounds, p)
 
 
 def _standing(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:

@@ -25,6 +25,7 @@ _TIME_CONSTANTS = (1.0, 1.3, 1.8)  # s, of the ball's loop
 _SIDEWAYS = (0.1, 0.3, 0.6)  # rad: lean to the side at first
 _FADES = (0.3, 0.8)  # s, in which that lean fades
 _LARGEST_LEAN = 0.95  # rad, that the ball's loop asks for
+_GRIPPING = 0.6  # of the friction at rest, that a simulated force uses per axis: the normal force may be less
 _UPRIGHT, _STEADY = 0.15, 1.0  # rad and rad/s: leans and lean rates of a robot that has righted itself
 
 
@@ -59,9 +60,13 @@ def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, fo
     ]
     gains = np.array(members).T
     with np.errstate(all="ignore"):  # members that fall may overflow, and are left out
+        if params.grips:
+            force = min(force, _GRIPPING * params.friction * params.weight)
         x, u = _simulate(params, x0, gains, _target(task, x0, c, params), task.steps, task.control_dt, force)
         margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in _margins(task, x, c)], axis=0)
         safe = np.logical_and.accumulate(margins >= 0, axis=0)
+        if params.grips:
+            safe[1:] &= np.logical_and.accumulate(_gripping(params, x[:-1], u), axis=0)
         costs = np.asarray(task.cost(x[:-1], u, c))
         upright = (np.abs(x[..., 2:4]).max(-1) < _UPRIGHT) & (np.abs(x[..., 6:8]).max(-1) < _STEADY) & safe
     found = []
@@ -109,7 +114,7 @@ def _simulate(
     size = np.hypot(*falling)
     along = falling / size if size > 1e-9 else np.array([1.0, 0.0])
     aside = lean * np.array([-along[1], along[0]])
-    h, mass = params.first_moment, params.total_mass
+    h, mass = params.first_moment, params.moving_mass
     inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
     x = np.tile(np.asarray(x0, np.float64), (gains.shape[1], 1))
     states, forces = [x], []
@@ -119,12 +124,22 @@ def _simulate(
         wanted = np.clip(wanted, -_LARGEST_LEAN, _LARGEST_LEAN) + aside * np.exp(-k * dt / fade)
         acceleration = -(bandwidth**2) * (leans - wanted) - 2 * bandwidth * rate
         # of a body in a vertical plane: inertia · lean acceleration = h g sin(lean) − (h/M) F cos(lean)
-        u = (h * params.gravity * np.sin(leans) - inertia * acceleration) * mass / (h * np.cos(leans))
+        moment = h * params.gravity * np.sin(leans) - inertia * acceleration
+        if params.rolls:
+            # the torque that drives the ball turns the body too
+            u = moment / (h * np.cos(leans) / mass + params.ball_radius)
+        else:
+            u = moment * mass / (h * np.cos(leans))
         u = np.clip(u, -force, force)
         forces.append(u)
         x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
         states.append(x)
     return np.array(states), np.array(forces)
+
+
+def _gripping(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """(n, k) whether members grip in each step."""
+    return np.logical_and.reduce([limit >= 0 for limit in dynamics.limits(params, x, u)])
 
 
 def _has_point(task: Task, x0: np.ndarray, c: np.ndarray, params: BallbotParams) -> bool:

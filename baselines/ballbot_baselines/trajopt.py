@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
+from ballbot_baselines.optimum import Backoff, Optimum, plan_to_track
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
-EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02)
+EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02, grip=0.1)
 """How far plans for execution stay from their limits: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the
-force."""
+force, a tenth of the friction where it is limited."""
 
 
 class TrajoptController:
@@ -24,7 +24,7 @@ class TrajoptController:
         self.plan: Optimum | None = None
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self.plan = find_optimum(self._task, self._params, x, c, self._backoff)
+        self.plan = plan_to_track(self._task, self._params, x, c, self._backoff)
         self._tracker = TvlqrController.for_task(self._task, self._params, self.plan.trajectory, c)
         self._tracker.reset(t, x, c)
 
