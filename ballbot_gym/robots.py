@@ -1,7 +1,7 @@
 """The robots by name: their URDFs, and the episodes that each is given."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -61,9 +61,15 @@ def named_robot(name: str) -> BallbotParams:
     return BallbotParams.from_urdf(ROBOTS[name].urdf)
 
 
-def robot_name(params: BallbotParams) -> str | None:
-    """The name in `ROBOTS` of a robot, or None where it is none of them."""
-    return next((name for name in ROBOTS if named_robot(name) == params), None)
+def robot_name(params: BallbotParams) -> str:
+    """The name in `ROBOTS` of a robot, or of the one that it is a variant of.
+
+    With another friction it is the same robot. Any other is taken for the paper's, or for "rolling" if its ball rolls.
+    """
+    for name in ROBOTS:
+        if replace(named_robot(name), friction=params.friction) == params:
+            return name
+    return "rolling" if params.rolls else PAPER
 
 
 def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
@@ -94,4 +100,5 @@ def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
 def own_fields(robot: str | BallbotParams, task: str) -> dict[str, float]:
     """The fields of a task, by name, that a robot has other defaults of."""
     name = robot if isinstance(robot, str) else robot_name(robot)
-    return dict(ROBOTS[name].fields.get(task, {})) if name in ROBOTS else {}
+    named_robot(name)  # raises if there is none
+    return dict(ROBOTS[name].fields.get(task, {}))

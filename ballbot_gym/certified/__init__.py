@@ -1,4 +1,4 @@
-"""Certified evaluation sets: for every task 200 fixed episodes with their optima.
+"""Certified evaluation sets: for every robot and task 200 fixed episodes with their optima.
 
 `load(task)` reads what `ballbot certify` computed: initial states, constants, optimal costs and the solver's status of each
 episode, and the optimal trajectories of the first 20 episodes. Costs hold for the env's discretization with physics="rk4".
@@ -12,6 +12,8 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -53,10 +55,11 @@ class EvaluationSet:
         """What to give `env.reset(options=...)` to start episode i."""
         return {"state": self.states[i], "constants": self.constants[i]}
 
-    def save(self, task: Task, path: Path) -> Path:
-        """Writes the set, with the fields that define its optima, so that it is never read for another problem."""
+    def save(self, task: Task, path: Path, robot: str = PAPER) -> Path:
+        """Writes the set, with what defines its optima, so that it is never read for another problem or robot."""
         arrays = {
             "task": np.array(task.problem()),
+            **({} if robot == PAPER else {"robot": np.array(repr(named_robot(robot)))}),
             **{name: getattr(self, name) for name in _PER_EPISODE},
             "lengths": np.array([len(trajectory.u) for trajectory in self.trajectories]),
             "x": np.concatenate([trajectory.x for trajectory in self.trajectories]),
@@ -68,26 +71,29 @@ class EvaluationSet:
 _PER_EPISODE = ("states", "constants", "costs", "durations", "violations", "statuses")
 
 
-def path_of(task: Task) -> Path:
-    """Where the package keeps the evaluation set of a task."""
-    return Path(__file__).parent / f"{task.id}.npz"
+def path_of(task: Task, robot: str = PAPER) -> Path:
+    """Where the package keeps the evaluation set of a task and a robot by name."""
+    return Path(__file__).parent / (f"{task.id}.npz" if robot == PAPER else f"{task.id}-{robot}.npz")
 
 
-def load(task: str | Task, path: str | Path | None = None) -> EvaluationSet:
-    """The evaluation set of a task.
+def load(task: str | Task, path: str | Path | None = None, robot: str | BallbotParams = PAPER) -> EvaluationSet:
+    """The evaluation set of a task and a robot.
 
     Args:
         task: a name in `TASKS`, or a Task that is the very problem of the set; its pay and its arena may differ.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
+        robot: a name in `ROBOTS`, or a robot that is one of them or a variant of it; see `robots.robot_name`.
 
     Raises:
         CertificateError: there is none, it belongs to other fields of the task, or it is damaged.
         ValueError: no task of that name.
     """
-    task = make_task(task)
-    path = path_of(task) if path is None else Path(path)
+    robot = robot if isinstance(robot, str) else robot_name(robot)
+    task = make_task(task, robot)
+    path = path_of(task, robot) if path is None else Path(path)
+    again = '"ballbot certify"' if robot == PAPER else f'"ballbot certify --robot {robot}"'
     if not path.exists():
-        raise CertificateError(f'{path}: no evaluation set of {task.id}; compute it with "ballbot certify"')
+        raise CertificateError(f"{path}: no evaluation set of {task.id}; compute it with {again}")
     try:
         arrays = files.read_npz(path)
         missing = [name for name in ("task", "lengths", "x", "u", *_PER_EPISODE) if name not in arrays]
@@ -95,7 +101,12 @@ def load(task: str | Task, path: str | Path | None = None) -> EvaluationSet:
             raise ValueError(f"it has no array {', '.join(missing)}")
         if str(arrays["task"]) != task.problem():
             raise CertificateError(
-                f'{path} was computed for {arrays["task"]}, not for {task.problem()}; compute another with "ballbot certify"'
+                f"{path} was computed for {arrays['task']}, not for {task.problem()}; compute another with {again}"
+            )
+        made_for = str(arrays.get("robot", repr(named_robot(PAPER))))
+        if made_for != repr(named_robot(robot)):
+            raise CertificateError(
+                f"{path} was computed for {made_for}, not for {named_robot(robot)!r}; compute another with {again}"
             )
         _check(task, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
@@ -106,7 +117,7 @@ def load(task: str | Task, path: str | Path | None = None) -> EvaluationSet:
     except CertificateError:
         raise
     except ValueError as error:
-        raise CertificateError(f'{path} is no evaluation set: {error}; compute it with "ballbot certify"') from error
+        raise CertificateError(f"{path} is no evaluation set: {error}; compute it with {again}") from error
     return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
 
 

@@ -2,6 +2,7 @@
 
     minimize    Σ_j cost(x_j, u_j, c)·h_j + ρ Σ_j s_j + V(x_N)        over u_j, |u_j| ≤ limit, and slacks s_j ≥ 0
     subject to  x_{j+1} = step(x_j, u_j, h_j),   margins(x_j, c) + s_j ≥ back-off,   x_0 the (predicted) state
+                limits(x_j, u_j) + s_j ≥ 0 where the robot's friction is limited, with a reserve of friction
 
 `reset` plans the whole episode. The plan gives the cost beyond the horizon: V(x) ≈ λᵀ(x − x̄) + (x − x̄)ᵀP(x − x̄) about the
 plan's state x̄ at the horizon's end. λ is the plan's costate (the multiplier of its dynamics), and P is TVLQR's cost-to-go
@@ -34,18 +35,22 @@ import numpy as np
 from ballbot_baselines.compiled import compiled
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.lqr import final_weight
-from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
+from ballbot_baselines.optimum import Backoff, Optimum, plan_to_track
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02)  # of the plan; for the goal it is half of TrajoptController's
-_OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05)  # what is left of a wrong model
+_BACKOFF = Backoff(
+    margin=0.01, goal=0.05, force=0.02, grip=0.1
+)  # of the plan; for the goal it is half of TrajoptController's
+_OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05, grip=0.1)  # what is left of a wrong model
 _SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
 _MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
+_GRIP_RESERVE = 0.05  # of the friction, kept by the horizon: half of what plans keep
+_GRIP_UNIT = 0.1  # of `dynamics.limits`, that costs as much as a unit of a margin
 _LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
 _QP_ITERATIONS = 30
@@ -109,20 +114,24 @@ class Grid:
         return np.add.reduceat(later, self.offsets[:-1], axis=0) / self.lengths[:, None]
 
 
+_INPUTS = 2
+"""Inputs of a stage."""
+
+
 class _Inner:
     """Where the parts of an inner stage (0 < j < N) stand among its entries.
 
-    The first stage has no state and no slack; the last stage has a state only.
+    The first stage has no state, and a slack only where the robot's grip is limited; the last stage has a state only.
     """
 
     # Variables: changes of the state and of the input, and the slack of the margins.
     X, A, SLACK, VARIABLES = slice(0, 8), slice(8, 10), 10, 11
     # Hessian, one dense block after the other: of the state (8, 8), of the input (2, 2), of the slack.
     Q, R, SLACK_CURVATURE, HESSIAN = slice(0, 64), slice(64, 68), 68, 69
-    # Constraints: the gap to the next state, then the margins.
+    # Constraints: the gap to the next state, then the margins, then the limits of the robot's grip.
     GAP, MARGINS = slice(0, 8), slice(8, None)
     # Column of a state in the constraints' matrix: −1 in the gap of the stage before, the slopes of the next state, and
-    # the slopes of the margins.
+    # the slopes of the margins and of the grip.
     BEFORE, NEXT, SLOPES = 0, slice(1, 9), slice(9, None)
 
 
@@ -130,15 +139,25 @@ class _Inner:
 class _Matrix:
     """Nonzeros of the constraints' matrix that belong to an inner stage, column after column.
 
-    Each of the 8 state columns has 1 + 8 + m entries (see `_Inner`), each of the 2 input columns has the 8 slopes of the
-    next state, and the slack's column has a 1 for each of the m margins.
+    Each of the 8 state columns has 1 + 8 + m + g entries (see `_Inner`), each of the 2 input columns has the 8 slopes of the
+    next state and those of the grip's g limits, and the slack's column has a 1 for each of the m margins and g limits.
     """
 
     margins: int
+    grips: int
+
+    @property
+    def rows(self) -> int:
+        """Constraints besides the gap."""
+        return self.margins + self.grips
 
     @property
     def state_column(self) -> int:
-        return 1 + 8 + self.margins
+        return 1 + 8 + self.rows
+
+    @property
+    def input_column(self) -> int:
+        return 8 + self.grips
 
     @property
     def states(self) -> slice:
@@ -146,11 +165,11 @@ class _Matrix:
 
     @property
     def inputs(self) -> slice:
-        return slice(self.states.stop, self.states.stop + 2 * 8)
+        return slice(self.states.stop, self.states.stop + 2 * self.input_column)
 
     @property
     def slack(self) -> slice:
-        return slice(self.inputs.stop, self.inputs.stop + self.margins)
+        return slice(self.inputs.stop, self.inputs.stop + self.rows)
 
 
 class Disturbance:
@@ -192,8 +211,9 @@ class HorizonQp:
     """The quadratic program of one iteration, for N intervals; arrays are allocated once and filled in place.
 
     Variables are changes δa_0, δx_1, δa_1, s_1, … δx_N: x_0 is known and no variable, inputs a are fractions of the force
-    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins. The last stage
-    has no margins, because CasADi's interface allows no slack there.
+    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins, then the limits
+    of the robot's grip, if it has any; then there is an s_0 too. The last stage has no margins, because CasADi's interface
+    allows no slack there.
     """
 
     def __init__(self, task: Task, params: BallbotParams, nodes: int):
@@ -202,24 +222,27 @@ class HorizonQp:
         self.distinct = np.arange(count)
         """Indices of the task's margins that are considered."""
         self.disturbance: Disturbance | None = None
-        self._make_stage(task, params, nodes, count)
-        self._make_program(nodes, min(count, _MARGINS))
+        grips = _grips(params)
+        self._make_stage(task, params, nodes, count, grips)
+        self._make_program(nodes, min(count, _MARGINS), grips)
 
-    def _make_stage(self, task: Task, params: BallbotParams, n: int, m: int) -> None:
+    def _make_stage(self, task: Task, params: BallbotParams, n: int, m: int, grips: int) -> None:
         nc = len(task.constant_names)
         self.x, self.a = np.zeros((n + 1, 8)), np.zeros((n + 1, 2))
         self.h, self.c = np.zeros(n + 1), np.zeros((n + 1, nc))
         self._next, self._jacobian = np.zeros((n + 1, 8)), np.zeros((n + 1, 10, 8))
         self._gradient = np.zeros((n + 1, 10))
         self._margin, self._margin_jacobian = np.zeros((n + 1, m)), np.zeros((n + 1, 8, m))
+        self._grip, self._grip_jacobian = np.zeros((n + 1, grips)), np.zeros((n + 1, 10, grips))
+        outputs = [self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian]
         self._stage = _InPlace(
             _stage_function(task, params).map(n + 1),
             [self.x, self.a, self.h, self.c],
-            [self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian],
+            [*outputs, self._grip, self._grip_jacobian] if grips else outputs,
         )
 
-    def _make_program(self, n: int, m: int) -> None:
-        hessian, constraints = _patterns(n, m)
+    def _make_program(self, n: int, m: int, grips: int) -> None:
+        hessian, constraints = _patterns(n, m, grips)
         program = casadi.conic(
             "qp",
             "hpipm",
@@ -229,8 +252,8 @@ class HorizonQp:
                 "error_on_fail": False,
                 "N": n,
                 "nx": [0] + [8] * n,
-                "nu": [2] + [3] * (n - 1) + [0],
-                "ng": [0] + [m] * (n - 1) + [0],
+                "nu": [3 if grips else 2] + [3] * (n - 1) + [0],
+                "ng": [grips] + [m + grips] * (n - 1) + [0],
                 "hpipm": {
                     "mode": "speed",
                     "mu0": 1.0,
@@ -252,12 +275,16 @@ class HorizonQp:
             [h, g, a, low, high, self._lower, self._upper, start, multipliers, row_multipliers],
             [z, self._cost, *duals],
         )
-        self._divide(h, g, a, low, high, z, n, m)
+        self._divide(h, g, a, low, high, z, n, _Matrix(m, grips))
         # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
         self._lower_stages[:, _Inner.SLACK] = 0.0
         self._h[:, _Inner.SLACK_CURVATURE] = _SLACK_CURVATURE
         self._g[:, _Inner.SLACK] = _SLACK_PRICE
         self._high[:, _Inner.MARGINS] = np.inf
+        self._lower0[_INPUTS:] = 0.0
+        self._h0[2 * _INPUTS :] = _SLACK_CURVATURE
+        self._g0[_INPUTS:] = _SLACK_PRICE
+        self._high0[_Inner.MARGINS] = np.inf
 
     def _divide(
         self,
@@ -268,20 +295,25 @@ class HorizonQp:
         high: np.ndarray,
         z: np.ndarray,
         n: int,
-        m: int,
+        matrix: _Matrix,
     ) -> None:
         """Views of the solver's arrays stage by stage. The constants of the constraints' matrix are put in here."""
-        at, matrix, variables = _Inner, _Matrix(m), _Inner.VARIABLES
-        self._g0, self._g, self._g_end = _stages(g, 2, n - 1, variables)
-        self._z0, self._z, self._z_end = _stages(z, 2, n - 1, variables)
-        self._lower0, self._lower_stages, _ = _stages(self._lower, 2, n - 1, variables)
-        self._upper0, self._upper_stages, _ = _stages(self._upper, 2, n - 1, variables)
-        self._h0, self._h, self._h_end = _stages(h, 2 * 2, n - 1, at.HESSIAN)
-        self._low0, self._low, _ = _stages(low, 8, n - 1, 8 + m)
-        self._high0, self._high, _ = _stages(high, 8, n - 1, 8 + m)
-        self._a0, a_stages, a_end = _stages(a, 2 * 8, n - 1, matrix.slack.stop)
+        at, variables, rows, grips = _Inner, _Inner.VARIABLES, matrix.rows, matrix.grips
+        slack = 1 if grips else 0  # of the first stage
+        self._g0, self._g, self._g_end = _stages(g, _INPUTS + slack, n - 1, variables)
+        self._z0, self._z, self._z_end = _stages(z, _INPUTS + slack, n - 1, variables)
+        self._lower0, self._lower_stages, _ = _stages(self._lower, _INPUTS + slack, n - 1, variables)
+        self._upper0, self._upper_stages, _ = _stages(self._upper, _INPUTS + slack, n - 1, variables)
+        self._h0, self._h, self._h_end = _stages(h, 2 * 2 + slack, n - 1, at.HESSIAN)
+        self._low0, self._low, _ = _stages(low, 8 + grips, n - 1, 8 + rows)
+        self._high0, self._high, _ = _stages(high, 8 + grips, n - 1, 8 + rows)
+        first = _INPUTS * matrix.input_column
+        a0, a_stages, a_end = _stages(a, first + grips, n - 1, matrix.slack.stop)
+        self._a0 = a0[:first].reshape(_INPUTS, matrix.input_column)
+        a0[first:] = 1.0
+        self._margins = slice(at.MARGINS.start, at.MARGINS.start + matrix.margins)
         self._a_x = a_stages[:, matrix.states].reshape(n - 1, 8, matrix.state_column)
-        self._a_u = a_stages[:, matrix.inputs].reshape(n - 1, 2, 8)
+        self._a_u = a_stages[:, matrix.inputs].reshape(n - 1, _INPUTS, matrix.input_column)
         self._a_x[:, :, at.BEFORE], a_end[:] = -1.0, -1.0
         a_stages[:, matrix.slack] = 1.0
 
@@ -296,7 +328,7 @@ class HorizonQp:
             target: (8,) state.
         """
         r = r + _LEAST_CURVATURE * np.eye(2)
-        self._h0[:] = r[0].ravel()
+        self._h0[: _INPUTS * _INPUTS] = r[0].ravel()
         self._h[:, _Inner.Q] = q[1:].reshape(-1, 64)
         self._h[:, _Inner.R] = r[1:].reshape(-1, 4)
         self._h_end[:] = 2 * p.ravel()
@@ -318,13 +350,13 @@ class HorizonQp:
             return False
         self._set_constraints(margin)
         p, slope, target = self._beyond
-        self._g0[:], self._g[:, : _Inner.SLACK] = self._gradient[0, _Inner.A], self._gradient[1:-1]
+        self._g0[:_INPUTS], self._g[:, : _Inner.SLACK] = self._gradient[0, _Inner.A], self._gradient[1:-1]
         self._g_end[:] = slope + 2 * p @ (x[-1] - target)
-        self._lower0[:], self._upper0[:] = -1 - a[0], 1 - a[0]
+        self._lower0[:_INPUTS], self._upper0[:_INPUTS] = -1 - a[0], 1 - a[0]
         self._lower_stages[:, _Inner.A], self._upper_stages[:, _Inner.A] = -1 - a[1:-1], 1 - a[1:-1]
         if not (self._program() and self._program.solved and np.isfinite(self._cost[0])):
             return False
-        a[0] += self._z0
+        a[0] += self._z0[:_INPUTS]
         a[1:-1] += self._z[:, _Inner.A]
         x[1:-1] += self._z[:, _Inner.X]
         x[-1] += self._z_end
@@ -335,17 +367,23 @@ class HorizonQp:
         gaps = self.x[1:] - self._next[:-1]
         margins, slopes = self._nearest_margins()
         at = _Inner
-        self._a0[:] = jacobian[0, at.A].ravel()
-        self._a_x[:, :, at.NEXT], self._a_u[:] = jacobian[1:-1, at.X], jacobian[1:-1, at.A]
-        self._a_x[:, :, at.SLOPES] = slopes
-        self._low0[:] = self._high0[:] = gaps[0]
+        self._a0[:, at.GAP] = jacobian[0, at.A]
+        self._a_x[:, :, at.NEXT], self._a_u[:, :, at.GAP] = jacobian[1:-1, at.X], jacobian[1:-1, at.A]
+        self._a_x[:, :, at.SLOPES][:, :, : margins.shape[1]] = slopes
+        self._low0[at.GAP] = self._high0[at.GAP] = gaps[0]
         self._low[:, at.GAP] = self._high[:, at.GAP] = gaps[1:]
-        self._low[:, at.MARGINS] = margin - margins
+        self._low[:, self._margins] = margin - margins
+        if self._grip.shape[1]:
+            grip, rows = self._grip_jacobian, slice(self._margins.stop, None)
+            self._a0[:, at.GAP.stop :] = grip[0, at.A]
+            self._a_u[:, :, at.GAP.stop :] = grip[1:-1, at.A]
+            self._a_x[:, :, at.SLOPES][:, :, margins.shape[1] :] = grip[1:-1, at.X]
+            self._low0[at.GAP.stop :], self._low[:, rows] = -self._grip[0], -self._grip[1:-1]
 
     def _nearest_margins(self) -> tuple[np.ndarray, np.ndarray]:
         """(N−1, m) the least of the inner nodes' distinct margins, and their slopes (N−1, 8, m)."""
         margins, slopes = self._margin[1:-1, self.distinct], self._margin_jacobian[1:-1][:, :, self.distinct]
-        rows = self._low[:, _Inner.MARGINS].shape[1]
+        rows = self._margins.stop - self._margins.start
         if margins.shape[1] == rows:
             return margins, slopes
         least = np.argpartition(margins, rows - 1, axis=1)[:, :rows]
@@ -390,7 +428,7 @@ def prepared_plan(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarra
     Raises:
         PlanError: there is no plan.
     """
-    return Prepared.make(task, params, find_optimum(task, params, x, c, backoff), c)
+    return Prepared.make(task, params, plan_to_track(task, params, x, c, backoff), c)
 
 
 class NmpcController:
@@ -464,7 +502,7 @@ class NmpcController:
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         """Plans from the state that the first force will meet."""
         self._begin(t, c)
-        self.follow(find_optimum(self._task, self._params, self._predicted(x), self._c, self._backoff))
+        self.follow(plan_to_track(self._task, self._params, self._predicted(x), self._c, self._backoff))
 
     def start(self, t: float, c: np.ndarray, prepared: Prepared) -> None:
         """As `reset`, with a plan that `prepared_plan` has made before, for instance in another process."""
@@ -543,7 +581,7 @@ class NmpcController:
             return False
         self.counts.replans += 1
         try:
-            plan = find_optimum(self._task, self._params, x, self._c, self._backoff)
+            plan = plan_to_track(self._task, self._params, x, self._c, self._backoff)
         except PlanError:
             self.counts.unplanned += 1
             self._lost = True
@@ -708,26 +746,38 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
         margins,
         casadi.densify(casadi.jacobian(margins, x)),
     ]
+    if params.grips:
+        grip = casadi.vertcat(*dynamics.limits(params, x, u, _GRIP_RESERVE)) / _GRIP_UNIT
+        outputs += [grip, casadi.densify(casadi.jacobian(grip, z))]
     function = casadi.Function("stage", [x, a, h, c], outputs, {"cse": True})
     return compiled(f"{task.id}-nmpc", (function,))[0]
 
 
-def _patterns(n: int, m: int) -> tuple[casadi.Sparsity, casadi.Sparsity]:
+def _grips(params: BallbotParams) -> int:
+    """How many limits of its grip a robot has."""
+    return len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0)))
+
+
+def _patterns(n: int, m: int, grips: int) -> tuple[casadi.Sparsity, casadi.Sparsity]:
     """Sparsity of the program's Hessian and of its constraints' matrix; `_Inner` and `_Matrix` say the order of entries."""
     state, inputs, slack = casadi.Sparsity.dense(8, 8), casadi.Sparsity.dense(2, 2), casadi.Sparsity.dense(1, 1)
-    hessian = casadi.diagcat(inputs, *[state, inputs, slack] * (n - 1), state)
-    width, height = _Inner.VARIABLES, 8 + m
-    entries = [(i, j) for j in range(2) for i in range(8)]
+    first_slack = [slack] if grips else []
+    hessian = casadi.diagcat(inputs, *first_slack, *[state, inputs, slack] * (n - 1), state)
+    width, height = _Inner.VARIABLES, 8 + m + grips
+    first_rows, first_columns = 8 + grips, _INPUTS + len(first_slack)
+    entries = [(i, j) for j in range(_INPUTS) for i in range(first_rows)]
+    entries += [(i, _INPUTS) for i in range(8, first_rows)]
     for k in range(1, n + 1):
-        row, column = 8 + (k - 1) * height, 2 + (k - 1) * width
+        row, column = first_rows + (k - 1) * height, first_columns + (k - 1) * width
         before = row - height if k > 1 else 0
         own = range(row, row + height if k < n else row)  # the last stage has no constraints of its own
         for j in range(8):
             entries += [(before + j, column + j), *((i, column + j) for i in own)]
-        entries += [(i, column + j) for j in (8, 9) for i in own[_Inner.GAP]]
+        of_inputs = [*own[_Inner.GAP], *own[8 + m :]]
+        entries += [(i, column + j) for j in (8, 9) for i in of_inputs]
         entries += [(i, column + _Inner.SLACK) for i in own[_Inner.MARGINS]]
     rows, columns = zip(*entries, strict=True)
-    shape = (8 + (n - 1) * height, 2 + (n - 1) * width + 8)
+    shape = (first_rows + (n - 1) * height, first_columns + (n - 1) * width + 8)
     return hessian, casadi.Sparsity.triplet(*shape, list(rows), list(columns))
 
 

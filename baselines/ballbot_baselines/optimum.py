@@ -80,8 +80,8 @@ class Backoff:
     """How far a plan stays from its limits, so that a controller that tracks it stays within them.
 
     `margin` is in the unit of the task's margins (obstacles: m). `goal` is the fraction of the goal's tolerance that the plan
-    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback, and `grip` the fraction of the
-    friction, for robots whose friction is limited.
+    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback. `grip` is the fraction of the
+    friction that it leaves, where friction is limited.
 
     Raises:
         ValueError: a field is negative or not finite, or a fraction is not below 1.

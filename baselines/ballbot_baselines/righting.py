@@ -125,11 +125,9 @@ def _simulate(
         acceleration = -(bandwidth**2) * (leans - wanted) - 2 * bandwidth * rate
         # of a body in a vertical plane: inertia · lean acceleration = h g sin(lean) − (h/M) F cos(lean)
         moment = h * params.gravity * np.sin(leans) - inertia * acceleration
-        if params.rolls:
-            # the torque that drives the ball turns the body too
+        u = moment * mass / (h * np.cos(leans))
+        if params.rolls:  # the torque that drives the ball turns the body too
             u = moment / (h * np.cos(leans) / mass + params.ball_radius)
-        else:
-            u = moment * mass / (h * np.cos(leans))
         u = np.clip(u, -force, force)
         forces.append(u)
         x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))

@@ -28,6 +28,9 @@ except ModuleNotFoundError as error:
 Physics = Literal["bullet", "rk4"]
 """What options called --physics take."""
 
+RobotName = Literal["paper", "rolling", "kugle"]
+"""What options called --robot take: the names in `ROBOTS`."""
+
 # A file or pipe has no width of its own: give it one that holds the widest table.
 # Names and paths are data: a "[b]" or ":x:" in them is printed as it is.
 console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)

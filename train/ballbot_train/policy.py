@@ -17,6 +17,7 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.robots import PAPER, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
@@ -135,11 +136,11 @@ def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[s
     return files.write(description_path, json.dumps({"spec": asdict(network.spec), **description}, indent=1) + "\n")
 
 
-def load_network(path: str | Path, task: Task) -> PolicyNetwork:
-    """The network of a policy file made for this very task.
+def load_network(path: str | Path, task: Task, robot: str = PAPER) -> PolicyNetwork:
+    """The network of a policy file made for this very task and robot.
 
     Raises:
-        PolicyError: a file is missing or damaged, or made for another task, observation or shape.
+        PolicyError: a file is missing or damaged, or made for another task, robot, observation or shape.
     """
     weights_path, description_path = paths_of(path)
     described = read_description(path)["spec"]
@@ -151,6 +152,8 @@ def load_network(path: str | Path, task: Task) -> PolicyNetwork:
         raise PolicyError(f"{description_path} is not a policy: {error}") from error
     if spec.task != task.problem():
         raise PolicyError(f"{description_path} was trained on {spec.task}, not on {task.problem()}")
+    if spec.robot != robot:
+        raise PolicyError(f"{description_path} was trained on the robot {spec.robot!r}, not on {robot!r}")
     if spec.observation_version != OBSERVATION_VERSION:
         raise PolicyError(
             f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
@@ -212,4 +215,5 @@ def load_policy(
         if task is None:
             raise PolicyError(f"{path} was trained on {trained_on}: give that Task as load_policy(path, task)")
     task = make_task(task)
-    return PolicyController(task, default_params() if params is None else params, load_network(path, task))
+    params = default_params() if params is None else params
+    return PolicyController(task, params, load_network(path, task, robot_name(params)))

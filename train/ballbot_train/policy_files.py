@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
+from ballbot_gym.robots import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
 
@@ -17,7 +18,7 @@ OBSERVATION_VERSION = 1
 """Raised whenever what any task observes changes, so that older policies are refused instead of misled."""
 
 SHIPPED = Path(__file__).parent / "policies"
-"""Policies that come with the package, as TASK-LEARNER.json and .safetensors."""
+"""Policies that come with the package, as TASK-LEARNER.json and .safetensors, or TASK-ROBOT-LEARNER for other robots."""
 
 
 _MOST_LAYERS = 64
@@ -58,10 +59,14 @@ class PolicySpec:
     squash: Literal["tanh", "clip"] = "tanh"
     """How the sum is brought into [−1, 1]."""
     observation_version: int = OBSERVATION_VERSION
+    robot: str = PAPER
+    """Name in `ROBOTS` of the robot it was trained on."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.task, str):
             raise ValueError(f"task must be text, not {self.task!r}")
+        if self.robot not in ROBOTS:
+            raise ValueError(f"robot must be one of {', '.join(ROBOTS)}, not {self.robot!r:.200}")
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
         if not isinstance(self.hidden, tuple) or len(self.hidden) > _MOST_LAYERS:
@@ -127,12 +132,14 @@ def read_description(path: str | Path) -> dict[str, Any]:
     return read
 
 
-def shipped_policies(task: Task) -> dict[str, Path]:
-    """The policies of a task that come with the package: the paths of their .json by the learner's name."""
+def shipped_policies(task: Task, robot: str = PAPER) -> dict[str, Path]:
+    """The policies of a task and robot that come with the package: the paths of their .json by the learner's name."""
     name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
     if name is None:
         return {}
-    return {path.stem.removeprefix(f"{name}-"): path for path in sorted(SHIPPED.glob(f"{name}-*.json"))}
+    start = f"{name}-" if robot == PAPER else f"{name}-{robot}-"
+    found = {path.stem.removeprefix(start): path for path in sorted(SHIPPED.glob(f"{start}*.json"))}
+    return {learner: path for learner, path in found.items() if learner.partition("-")[0] not in ROBOTS}
 
 
 def weights_digest(path: str | Path) -> str:

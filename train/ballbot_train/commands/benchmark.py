@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from ballbot_gym import certified, files
-from ballbot_gym.env import make_task
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import Physics, console, markdown, physics_or_default, print_table, progress_bars
+from ballbot_train.console import Physics, RobotName, console, markdown, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import basins
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
@@ -31,6 +31,7 @@ def benchmark(
     runs: Path = Path("runs"),
     out: Path = Path("runs/benchmark"),
     workers: int = os.cpu_count() or 1,
+    robot: RobotName = PAPER,
 ) -> None:
     """Compares controllers by their regret on the certified episodes, and writes a leaderboard with figures.
 
@@ -46,17 +47,18 @@ def benchmark(
             basins, robustness, training and the paper's figures join the report.
         out: folder of the results; an interrupted run continues here.
         workers: processes; 1 gives the cleanest times per control step.
+        robot: whose episodes and controllers.
     """
-    chosen = controllers_of(tasks, controllers)
+    chosen = controllers_of(tasks, controllers, robot)
     physics = physics_or_default(physics)
     episodes = checked_episodes(episodes, quick, few=8)
-    facts = open_run(out, chosen, workers, physics, seed, episodes=episodes)
+    facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
     loads = LoadRecord(out, workers)
     with progress_bars({task: episodes * len(group) for task, group in chosen.items()}) as bars:
-        done = run_benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance), seed)
+        done = run_benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance), seed, robot)
     facts |= loads.facts()
     busy = bool(facts["busy"])
-    recovered, damaged = basins.recovered_fractions(runs / "basins")
+    recovered, damaged = basins.recovered_fractions(runs / "basins") if robot == PAPER else ({}, "")
     if damaged:
         console.print(f"skipped: {damaged}")
     rows = [
@@ -65,11 +67,12 @@ def benchmark(
     ]
     write_leaderboard(rows, done, facts, out)
     figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
-    pictures = [_episode_figure(task, group, physics, out) for task, group in chosen.items()]
+    pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
     table = [cells(row, busy) for row in rows]
     files.write(out / "leaderboard.md", markdown(HEADER, table) + (f"\n{BUSY_NOTE}\n" if busy else ""))
     sections = leaderboard_sections(HEADER, table, done, chosen, pictures, physics, runs, BUSY_NOTE if busy else "")
-    page = write_report("ballbot-gym: leaderboard", sections, facts, out / "report.html")
+    title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
+    page = write_report(title, sections, facts, out / "report.html")
     jobs.release(out)
     print_table(f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
     if busy:
@@ -80,10 +83,10 @@ def benchmark(
     console.print(f"report: {page}")
 
 
-def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path) -> Path:
+def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path, robot: str) -> Path:
     """The first certified episode of a task under every controller, with its optimum."""
-    replay = certified_replay(task, controllers, 0, physics, skip_planless=True)
-    optimum = certified.load(make_task(task)).trajectories[0]
+    replay = certified_replay(task, controllers, 0, physics, skip_planless=True, robot=robot)
+    optimum = certified.load(task, robot=robot).trajectories[0]
     curves = [figures.Curve("optimum", optimum, "0.35", "--")]
     curves += [figures.Curve(f"{take.label}, {take.note}", take.trajectory, take.color) for take in replay.takes]
     figure = figures.trajectory_figure(replay.title, curves, figures.marker_circles(replay.markers))

@@ -4,13 +4,14 @@ import os
 from pathlib import Path
 
 from ballbot_baselines import certification
+from ballbot_baselines.optimum import ALL_GUESSES
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import check_least, check_some, console, progress_bars
+from ballbot_train.console import RobotName, check_least, check_some, console, progress_bars
 from ballbot_train.provenance import provenance
 
 _MOST_EPISODES = 100_000
@@ -23,6 +24,8 @@ def certify(
     install: bool = False,
     out: Path = Path("runs/certify"),
     workers: int = os.cpu_count() or 1,
+    robot: RobotName = PAPER,
+    guesses: int = ALL_GUESSES,
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
 
@@ -32,17 +35,20 @@ def certify(
         install: puts the finished sets into the package too, in place of those that all evaluation reads.
         out: folder of the .npz files; an interrupted run continues here.
         workers: processes.
+        robot: whose sets.
+        guesses: most guessed paths per episode; default all. With fewer, those of a slalom that are predicted to be the best.
     """
     check_some("task", tasks, TASKS)
-    check_least(1, episodes=episodes, workers=workers)
+    check_least(1, episodes=episodes, workers=workers, guesses=guesses)
     if episodes > _MOST_EPISODES:
         raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}")
     if install and episodes < certified.EPISODES:
         raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
     facts = provenance()
-    jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], "tasks": tasks, "episodes": episodes})
+    settings = {"tasks": tasks, "episodes": episodes, "robot": robot, "guesses": guesses}
+    jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], **settings})
     work = [
-        jobs.Job(f"{task}-{start:04d}", certification.entries, (task,), items, task)
+        jobs.Job(f"{task}-{start:04d}", certification.entries, (task, robot, guesses), items, task)
         for task in tasks
         for start in range(0, episodes, _CHUNK)
         for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
@@ -55,14 +61,14 @@ def certify(
         errors = [f"{name} episode {i}: {entry['error']}" for i, entry in enumerate(found) if "error" in entry]
         failures += errors
         if not errors:
-            task = make_task(name)
-            sets[name] = certification.evaluation_set(task, default_params(), found)
-            path = sets[name].save(task, out / certified.path_of(task).name)
+            task = make_task(name, robot)
+            sets[name] = certification.evaluation_set(task, named_robot(robot), found)
+            path = sets[name].save(task, out / certified.path_of(task, robot).name, robot)
             console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     jobs.release(out)
     if failures:
         raise PlanError("no optimum for\n" + "\n".join(failures))
     if install:
         for name, evaluation_set in sets.items():
-            task = make_task(name)
-            console.print(f"installed: {evaluation_set.save(task, certified.path_of(task))}")
+            task = make_task(name, robot)
+            console.print(f"installed: {evaluation_set.save(task, certified.path_of(task, robot), robot)}")

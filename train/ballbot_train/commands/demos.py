@@ -8,8 +8,9 @@ import numpy as np
 
 from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import Physics, check_names, console, physics_or_default, progress_bar
+from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
 
@@ -24,6 +25,7 @@ def demos(
     seed: int = 0,
     out: Path | None = None,
     workers: int = os.cpu_count() or 1,
+    robot: RobotName = PAPER,
 ) -> None:
     """Records episodes of an expert with exploration as a Minari dataset; a killed run continues when started again.
 
@@ -39,11 +41,13 @@ def demos(
         seed: seed of the dataset.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
         workers: number of processes.
+        robot: the robot that is shown.
     """
     check_names("task", [task], TASKS)
     physics = physics_or_default(physics)
-    config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed)
-    out = Path("runs") / "demos" / f"{task}-{expert}-v0" if out is None else out
+    config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed, robot)
+    kind = task if robot == PAPER else f"{task}-{robot}"
+    out = Path("runs") / "demos" / f"{kind}-{expert}-v0" if out is None else out
     with progress_bar() as progress:
         bar = progress.add_task(f"{task} {expert}", total=episodes)
         folder = write_demos(config, out, workers, lambda count: progress.advance(bar, count))

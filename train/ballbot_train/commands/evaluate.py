@@ -9,10 +9,12 @@ from typing import Any
 
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
 from ballbot_train.console import (
     Physics,
+    RobotName,
     check_least,
     console,
     physics_or_default,
@@ -43,6 +45,7 @@ def evaluate(
     physics: Physics | None = None,
     out: Path | None = None,
     workers: int = os.cpu_count() or 1,
+    robot: RobotName = PAPER,
 ) -> None:
     """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
 
@@ -61,9 +64,10 @@ def evaluate(
         physics: of the certified episodes, "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         out: folder of the results; default runs/evaluate/TASK-POLICY. An interrupted run continues here.
         workers: processes, for optima and certified episodes.
+        robot: whose episodes.
     """
-    task = task_name(policy, task)
-    chosen = controllers_of([task], [policy])
+    task = task_name(policy, task, robot)
+    chosen = controllers_of([task], [policy], robot)
     check_least(0, seed=seed, optima=optima, episodes=episodes)
     check_least(1, workers=workers, **({} if bins is None else {"bins": bins}))
     if bins is not None and bins > _MOST_BINS:
@@ -83,13 +87,21 @@ def evaluate(
         )
     out = Path("runs") / "evaluate" / f"{task}-{Path(policy).stem}" if out is None else out
     if fresh:
-        _fresh(policy, task, fresh, seed, bins, optima, out, workers)
+        _fresh(policy, task, fresh, seed, bins, optima, out, workers, robot)
     if episodes:
-        _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers)
+        _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers, robot)
 
 
 def _fresh(
-    policy: str, task: str, episodes: int, seed: int, count: int | None, optima: int, out: Path, workers: int
+    policy: str,
+    task: str,
+    episodes: int,
+    seed: int,
+    count: int | None,
+    optima: int,
+    out: Path,
+    workers: int,
+    robot: str,
 ) -> None:
     from ballbot_train.evaluation import fresh  # it imports torch
     from ballbot_train.report import figures
@@ -99,32 +111,33 @@ def _fresh(
     facts = provenance() | {
         "task": task,
         "policy": policy,
-        "policies": policy_digests({task: [policy]}),
+        "robot": robot,
+        "policies": policy_digests({task: [policy]}, robot),
         "seed": seed,
         "episodes": episodes,
         "physics": "closed form, batched, float64",
     }
     with progress_bars({"episodes": episodes}) as bars:
         result = fresh.evaluate_fresh(
-            policy, task, episodes, seed, on_progress=lambda number: bars.advance("episodes", number)
+            policy, task, episodes, seed, on_progress=lambda number: bars.advance("episodes", number), robot=robot
         )
     if optima:
         with progress_bars({task: optima}) as bars:
-            found = fresh.find_optima(
-                task, optima, seed, out.parent / "optima" / f"{task}-{seed}", workers, bars.advance
-            )
+            kind = task if robot == PAPER else f"{task}-{robot}"
+            folder = out.parent / "optima" / f"{kind}-{seed}"
+            found = fresh.find_optima(task, optima, seed, folder, workers, bars.advance, robot)
         result = replace(result, optima=found)
     binned = result.bins(count)
-    worst = _worst(result, policy, task, out / "worst")
+    worst = _worst(result, policy, task, out / "worst", robot)
     fresh.write(result, binned, worst, facts, out)
     picture = figures.save(figures.fresh_figure(result, binned), out / "fresh.png")
     _print(result, binned, worst)
     console.print(f"figure: {picture}\nall episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
 
 
-def _worst(result: Any, policy: str, task: str, folder: Path) -> list[dict[str, Any]]:
+def _worst(result: Any, policy: str, task: str, folder: Path, robot: str) -> list[dict[str, Any]]:
     """The worst episodes, each with its trajectory in a file that `ballbot replay` draws."""
-    env = BallbotEnv(task, physics="rk4")
+    env = BallbotEnv(task, physics="rk4", robot=robot)
     controller = make_controller(policy, env.task, env.params)
     for stale in folder.glob("episode-*.npz"):  # of an earlier evaluation
         stale.unlink()
@@ -181,11 +194,11 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
     print_table("", ["worst", "look at it with", "failed", "cost"], rows)
 
 
-def _certified(chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: int) -> None:
-    facts = open_run(out, chosen, workers, physics, 0, episodes=episodes)
+def _certified(chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: int, robot: str) -> None:
+    facts = open_run(out, chosen, workers, physics, 0, robot, episodes=episodes)
     loads = LoadRecord(out, workers)
     with progress_bars(dict.fromkeys(chosen, episodes)) as bars:
-        results = benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance))
+        results = benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance), robot=robot)
     facts |= loads.facts()
     rows = leaderboard(results)
     write_leaderboard(rows, results, facts, out)

@@ -8,9 +8,9 @@ import numpy as np
 
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_least, check_names, console, print_table
+from ballbot_train.console import RobotName, check_least, check_names, console, print_table
 from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
 
@@ -27,6 +27,8 @@ def optimize(
     max_tilt: float | None = None,
     force_limit: float | None = None,
     out: Path = Path("runs/optimize"),
+    robot: RobotName = PAPER,
+    friction: float | None = None,
 ) -> None:
     """Finds the optimum of one episode, and writes its trajectory and figure.
 
@@ -39,14 +41,18 @@ def optimize(
         max_tilt: degrees.
         force_limit: N.
         out: folder of trajectory.npz and figure.png.
+        robot: by name.
+        friction: coefficient of friction between ball and floor; default the robot's.
     """
     check_names("task", [task], TASKS)
     fields = {"duration": duration, "max_tilt": None if max_tilt is None else math.radians(max_tilt)}
-    params = default_params()
+    params = named_robot(robot)
     check_least(0, seed=seed)
     if force_limit is not None:
         params = replace(params, force_limit=force_limit)
-    problem = make_task(task, **{key: value for key, value in fields.items() if value is not None})
+    if friction is not None:
+        params = replace(params, friction=friction)
+    problem = make_task(task, robot, **{key: value for key, value in fields.items() if value is not None})
     if problem.steps > _MOST_STEPS:
         raise ValueError(
             f"duration {duration:g} s is too long to optimize; give at most {_MOST_STEPS * problem.control_dt:g} s"

@@ -4,8 +4,9 @@ import math
 from pathlib import Path
 
 from ballbot_baselines import CONTROLLERS
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import Physics, check_names, console, physics_or_default, progress_bar
+from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
 from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_companions, with_ghosts
 
@@ -29,6 +30,7 @@ def replay(
     ghost_at: float | None = None,
     ghost_by: str = "trajopt",
     out: Path = Path("runs/replay"),
+    robot: RobotName = PAPER,
 ) -> None:
     """Draws a certified episode under controllers, or trajectory files: a strip of pictures, or a film.
 
@@ -47,6 +49,7 @@ def replay(
         ghost_at: time from which a ghost shows what an expert would do, s.
         ghost_by: name of that expert.
         out: folder of the file. The file is named after task, controllers and episode.
+        robot: whose episode; a trajectory file is drawn with the paper's.
     """
     _check(1 <= fps <= 1000, f"fps must be 1 to 1000, not {fps}")
     _check(1 <= frames <= 100, f"frames must be 1 to 100, not {frames}")
@@ -54,7 +57,7 @@ def replay(
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
     physics = physics_or_default(physics)
-    shown, name = _read(source, controllers, episode, physics, ghosts, ghost_at, ghost_by)
+    shown, name = _read(source, controllers, episode, physics, ghosts, ghost_at, ghost_by, robot)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":
@@ -76,6 +79,7 @@ def _read(
     ghosts: tuple[str, ...],
     ghost_at: float | None,
     ghost_by: str,
+    robot: str,
 ) -> tuple[Replay, str]:
     """The replay to draw, and the name of its file."""
     if all(Path(entry).suffix == ".npz" for entry in source):
@@ -89,14 +93,15 @@ def _read(
     check_names("task", [task], TASKS)
     check_names("expert", [ghost_by], CONTROLLERS)
     _check(bool(controllers), "give at least one controller")
-    shown = certified_replay(task, controllers, episode, physics)
-    name = f"{task}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
+    shown = certified_replay(task, controllers, episode, physics, robot=robot)
+    made = task if robot == PAPER else f"{task}-{robot}"
+    name = f"{made}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
     if ghosts:
-        shown = with_companions(shown, certified_replay(task, ghosts, episode, physics))
+        shown = with_companions(shown, certified_replay(task, ghosts, episode, physics, robot=robot))
         name = f"{name}-beside-{'-'.join(Path(ghost).stem for ghost in ghosts)}"
     if ghost_at is None:
         return shown, name
-    return with_ghosts(shown, task, episode, ghost_at, ghost_by, physics), f"{name}-ghost"
+    return with_ghosts(shown, task, episode, ghost_at, ghost_by, physics, robot), f"{name}-ghost"
 
 
 def _check(right: bool, message: str) -> None:

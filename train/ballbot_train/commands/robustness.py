@@ -6,9 +6,19 @@ from pathlib import Path
 
 from ballbot_baselines import VARIANTS
 from ballbot_gym import files
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import Physics, check_some, console, markdown, physics_or_default, print_table, progress_bars
+from ballbot_train.console import (
+    Physics,
+    RobotName,
+    check_some,
+    console,
+    markdown,
+    physics_or_default,
+    print_table,
+    progress_bars,
+)
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
 from ballbot_train.provenance import LoadRecord
@@ -29,6 +39,7 @@ def robustness(
     seed: int = 0,
     out: Path = Path("runs/robustness"),
     workers: int = os.cpu_count() or 1,
+    robot: RobotName = PAPER,
 ) -> None:
     """Runs the certified episodes under pushes, noise, delay, lag and other robots, and draws success and regret by severity.
 
@@ -42,17 +53,20 @@ def robustness(
         seed: of pushes, noise and the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
         workers: processes.
+        robot: whose episodes and controllers.
     """
-    chosen = controllers_of(tasks, controllers)
+    chosen = controllers_of(tasks, controllers, robot)
     if not controllers:
         chosen = {task: [*group, *VARIANTS] for task, group in chosen.items()}
     physics = physics_or_default(physics)
     check_some("stress", stresses, stressed.STRESSES)
     episodes = checked_episodes(episodes, quick, few=3)
-    facts = open_run(out, chosen, workers, physics, seed, episodes=episodes)
+    facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
     loads = LoadRecord(out, workers)
     with progress_bars(stressed.episodes_to_run(chosen, stresses, episodes)) as bars:
-        results = stressed.run(chosen, stresses, episodes, physics, out, workers, loads.watched(bars.advance), seed)
+        results = stressed.run(
+            chosen, stresses, episodes, physics, out, workers, loads.watched(bars.advance), seed, robot
+        )
     facts |= loads.facts()
     rows = stressed.rows_of(results, seed)
     stressed.write(rows, results, facts, out)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import check_names, console, physics_or_default, print_table, progress_bar
+from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
 from ballbot_train.learning.learners import LEARNERS, check_settings
 
 _MOST_THREADS = 1024
@@ -21,6 +21,8 @@ class Run:
 
     task: str = "stabilize"
     """Name of a task."""
+    robot: RobotName = "paper"
+    """Name of a robot."""
     demos: Path | None = None
     """Folder of a demonstration dataset, made by `ballbot demos`."""
     start: Path | None = None
@@ -54,6 +56,7 @@ def train(
     command: str | None = None,
     seeds: str | None = None,
     workers: int = 1,
+    robot: RobotName = "paper",
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
@@ -70,6 +73,7 @@ def train(
         command: the command that was typed, for the record; default, one with all settings.
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
         workers: how many runs of `seeds` go on at once.
+        robot: name of a robot.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
@@ -83,13 +87,13 @@ def train(
     if workers < 1:
         raise ValueError(f"workers must be at least 1, not {workers}")
     if seeds is not None:
-        _train_seeds(learner, Run(task, demos, start, threads=threads, out=out), settings, seeds, workers)
+        _train_seeds(learner, Run(task, robot, demos, start, threads=threads, out=out), settings, seeds, workers)
         return
 
     import torch
 
     from ballbot_gym.env import make_task
-    from ballbot_gym.params import default_params
+    from ballbot_gym.robots import PAPER, named_robot
     from ballbot_gym.simulator import PHYSICS_NAMES
     from ballbot_train.learning import training
     from ballbot_train.learning.demonstrations import command_of
@@ -97,12 +101,13 @@ def train(
 
     if threads is not None:
         torch.set_num_threads(threads)
-    problem = make_task(task)
+    problem = make_task(task, robot)
     settings = algorithm.settings(task) if settings is None else settings
     check_settings(settings)
-    out = Path("runs") / "train" / f"{task}-{learner}" if out is None else out
+    kind = task if robot == PAPER else f"{task}-{robot}"
+    out = Path("runs") / "train" / f"{kind}-{learner}" if out is None else out
     if command is None:
-        command = command_with(learner, Run(task, demos, start, seed, threads=threads, out=out), settings)
+        command = command_with(learner, Run(task, robot, demos, start, seed, threads=threads, out=out), settings)
     # the record also says how the demonstrations, or the policy to start from, were made
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
@@ -119,12 +124,13 @@ def train(
         "settings": asdict(settings),
         "start": None if start is None else str(start),
         "command": command,
+        **({} if robot == PAPER else {"robot": robot}),
     }
-    made = algorithm.make(problem, default_params(), settings, seed, demos)
+    made = algorithm.make(problem, named_robot(robot), settings, seed, demos)
     if start is not None:
         if not isinstance(made, training.Finetunable):
             raise ValueError(f"{learner} cannot start from a policy")
-        made.start_from(load_network(start, problem))
+        made.start_from(load_network(start, problem, robot))
     physics = physics_or_default(None)
     row = training.train(made, problem, config, out, resume)
     console.print(
@@ -140,12 +146,15 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int
     seeds = queue.parse_seeds(named)
     settings = LEARNERS[learner].settings(run.task) if settings is None else settings
     check_settings(settings)
-    out = Path("runs") / "train" / f"{run.task}-{learner}" if run.out is None else run.out
+    kind = run.task if run.robot == "paper" else f"{run.task}-{run.robot}"
+    out = Path("runs") / "train" / f"{kind}-{learner}" if run.out is None else run.out
 
     def command_of(seed: int) -> str:
         return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
 
     expected = {"learner": learner, "task": run.task, "settings": asdict(settings)}
+    if run.robot != "paper":
+        expected["robot"] = run.robot
     with progress_bar() as progress:
         bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
         trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar))
@@ -213,7 +222,7 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
     for name, value in _shallow(run).items():
-        if value is not None and name not in ("resume", "seeds", "workers"):
+        if value is not None and name not in ("resume", "seeds", "workers") and (name, value) != ("robot", "paper"):
             words += [f"--{name}", str(value)]
     for name, value in asdict(settings).items():
         words += _option(name.replace("_", "-"), value)

@@ -10,6 +10,7 @@ from ballbot_baselines import VARIANTS
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, check_some
@@ -22,7 +23,7 @@ from ballbot_train.provenance import provenance
 _CHUNK = 5  # episodes of a job
 
 
-def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str, list[str]]:
+def controllers_of(tasks: Sequence[str], names: Sequence[str] = (), robot: str = PAPER) -> dict[str, list[str]]:
     """The controllers to run on each task: those named that the task has; without names, all it has but for variants.
 
     A policy is made for one task, and is left out for the others; tasks left without a controller are left out too.
@@ -32,7 +33,7 @@ def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str,
         PolicyError: a policy file that is missing or damaged.
     """
     check_some("task", tasks, TASKS)
-    known = {task: registry.names(make_task(task)) for task in tasks}
+    known = {task: registry.names(make_task(task, robot), robot) for task in tasks}
     if not names:
         return known
     known = {task: [*group, *VARIANTS] for task, group in known.items()}
@@ -46,7 +47,9 @@ def controllers_of(tasks: Sequence[str], names: Sequence[str] = ()) -> dict[str,
         task: [
             name
             for name in names
-            if (registry.is_made_for(name, make_task(task)) if name in from_files else name in known[task])
+            if (
+                registry.is_made_for(name, make_task(task, robot), robot) if name in from_files else name in known[task]
+            )
         ]
         for task in tasks
     }
@@ -65,11 +68,11 @@ def _identity(name: str) -> str:
     return str((Path(name) if registry.is_saved_model(name) else paths_of(name)[1]).resolve())
 
 
-def policy_digests(controllers: Mapping[str, Sequence[str]]) -> dict[str, str]:
+def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
     """SHA-256 of the weights of every learned policy among controllers by task, under "TASK/NAME"."""
     digests = {}
     for task, group in controllers.items():
-        shipped = shipped_policies(make_task(task))
+        shipped = shipped_policies(make_task(task, robot), robot)
         for name in group:
             if not registry.is_expert(name):
                 digests[f"{task}/{name}"] = registry.digest_of(str(shipped.get(name, name)))
@@ -82,6 +85,7 @@ def open_run(
     workers: int,
     physics: str,
     seed: int | None = None,
+    robot: str = PAPER,
     **settings: Any,
 ) -> dict[str, Any]:
     """Claims a folder for a run of controllers by task with some settings; `jobs.release` ends the run.
@@ -92,6 +96,7 @@ def open_run(
         workers: processes; they change no result.
         physics: "bullet" or "rk4".
         seed: of whatever is drawn, if anything is.
+        robot: by name.
         settings: whatever else decides the results.
 
     Returns:
@@ -106,7 +111,9 @@ def open_run(
     if seed is not None:
         check_least(0, seed=seed)
         settings["seed"] = seed
-    settings["policies"] = policy_digests(controllers)
+    if robot != PAPER:
+        settings["robot"] = robot
+    settings["policies"] = policy_digests(controllers, robot)
     facts = provenance() | settings | {"workers": workers}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
     return facts
@@ -131,6 +138,7 @@ def benchmark(
     workers: int,
     on_progress: Callable[[str, int], None],
     seed: int = 0,
+    robot: str = PAPER,
 ) -> list[Result]:
     """Runs the controllers of every task, in parallel processes; what an interrupted run finished is not run again.
 
@@ -142,9 +150,10 @@ def benchmark(
         workers: processes.
         on_progress: called with a task and a number of finished episodes.
         seed: of whatever is drawn.
+        robot: by name.
     """
     work = [
-        episode_job(task, name, physics, range(start, min(start + _CHUNK, episodes)), seed)
+        episode_job(task, name, physics, range(start, min(start + _CHUNK, episodes)), seed, robot=robot)
         for task, group in controllers.items()
         for name in group
         for start in range(0, episodes, _CHUNK)
@@ -161,6 +170,7 @@ def episode_job(
     randomization: Randomization | None = None,
     label: str = "",
     group: str = "",
+    robot: str = PAPER,
 ) -> jobs.Job:
     """Some certified episodes under a controller by name, as a job whose entries are the fields of Results.
 
@@ -171,16 +181,22 @@ def episode_job(
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(task, controller, physics, seed, randomization),
+        arguments=(task, controller, physics, seed, randomization, robot),
         items=tuple(episodes),
         group=group or task,
     )
 
 
 def _episode_entries(
-    task: str, controller: str, physics: str, seed: int, randomization: Randomization | None, episodes: Sequence[int]
+    task: str,
+    controller: str,
+    physics: str,
+    seed: int,
+    randomization: Randomization | None,
+    robot: str,
+    episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
-    env = BallbotEnv(task, physics=physics, randomization=randomization)
+    env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     made = registry.make_controller(controller, env.task, env.params)
     for result in iterate_episodes(env, made, controller, task, episodes, seed):
         yield asdict(result)

@@ -5,6 +5,7 @@ from pathlib import Path
 from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import PAPER, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
@@ -13,9 +14,9 @@ from ballbot_train.policy_files import read_description, shipped_policies, weigh
 _SAVED_MODELS = (".zip", ".pt", ".pth")
 
 
-def names(task: Task) -> list[str]:
-    """The controllers that a task has, experts first."""
-    return [*CONTROLLERS, *shipped_policies(task)]
+def names(task: Task, robot: str = PAPER) -> list[str]:
+    """The controllers that a task has for a robot, experts first."""
+    return [*CONTROLLERS, *shipped_policies(task, robot)]
 
 
 def is_expert(name: str) -> bool:
@@ -33,8 +34,8 @@ def is_saved_model(name: str) -> bool:
     return Path(name).suffix in _SAVED_MODELS
 
 
-def is_made_for(name: str, task: Task) -> bool:
-    """Whether the policy of a file is one for a task. A saved model says no more than the size of its observations.
+def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
+    """Whether the policy of a file is one for a task and a robot. A saved model tells only the size of its observations.
 
     Raises:
         PolicyError: the file is missing or damaged.
@@ -43,7 +44,8 @@ def is_made_for(name: str, task: Task) -> bool:
         from ballbot_train.saved_models import observations_of  # it imports torch
 
         return observations_of(name) == len(task.observation_scale)
-    return read_description(name)["spec"]["task"] == task.problem()
+    spec = read_description(name)["spec"]
+    return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
 
 def made_for(name: str) -> str:
@@ -56,7 +58,9 @@ def made_for(name: str) -> str:
         from ballbot_train.saved_models import observations_of
 
         return f"a task with {observations_of(name)} observations"
-    return read_description(name)["spec"]["task"]
+    spec = read_description(name)["spec"]
+    robot = spec.get("robot", PAPER)
+    return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
 
 def digest_of(name: str) -> str:
@@ -68,7 +72,7 @@ def digest_of(name: str) -> str:
     return weights_digest(name)
 
 
-def task_name(policy: str, task: str | None) -> str:
+def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
     """The task that is named, or the registered one that a policy file names, or stabilize.
 
     Raises:
@@ -80,7 +84,7 @@ def task_name(policy: str, task: str | None) -> str:
         return task
     if not is_file(policy):
         return "stabilize"
-    named = next((name for name in TASKS if is_made_for(policy, make_task(name))), None)
+    named = next((name for name in TASKS if is_made_for(policy, make_task(name, robot), robot)), None)
     if named is None:
         raise ValueError(
             f"{policy} was made for {made_for(policy)}, which is none of {', '.join(TASKS)} with its default fields"
@@ -123,10 +127,11 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
     """
     if is_expert(name):
         return (CONTROLLERS | VARIANTS)[name](task, params)
-    shipped = shipped_policies(task)
+    robot = robot_name(params)
+    shipped = shipped_policies(task, robot)
     if name not in shipped and not is_file(name):
         raise ValueError(
-            f"unknown controller {name!r}; {task.id} has {', '.join(names(task))}, or give a policy's .json"
+            f"unknown controller {name!r}; {task.id} has {', '.join(names(task, robot))}, or give a policy's .json"
         )
     if is_saved_model(name):
         from ballbot_train.policy import PolicyController  # it imports torch

@@ -16,6 +16,7 @@ from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.evaluation.controllers import make_controller
@@ -77,6 +78,7 @@ def evaluate(
     physics: str | None = None,
     name: str | None = None,
     randomization: Randomization | None = None,
+    robot: str | BallbotParams = PAPER,
 ) -> Row:
     """The leaderboard row of anything that acts.
 
@@ -88,14 +90,15 @@ def evaluate(
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed, else "rk4" with a warning.
         name: of the row; default, the policy's own.
         randomization: what disturbs it; default, nothing.
+        robot: a name in `ROBOTS`, or a variant of one, with the certified episodes of that.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes.
         CertificateError: the task has no certified set.
     """
-    env = BallbotEnv(task, physics=physics, randomization=randomization)
+    env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
-        indices = episode_indices(episodes, len(certified.load(env.task)))
+        indices = episode_indices(episodes, len(certified.load(env.task, robot=env.params)))
         controller = as_controller(policy, env.task, env.params)
         results = run_episodes(env, controller, name or _name(policy), task_name(env.task), indices)
         return summarize(results)
@@ -167,7 +170,7 @@ def iterate_episodes(
     env: BallbotEnv, controller: Controller, name: str, task: str, episodes: Iterable[int], seed: int
 ) -> Iterator[Result]:
     """As `run_episodes`, one by one."""
-    episode_set = certified.load(env.task)
+    episode_set = certified.load(env.task, robot=env.params)
     for i in episodes:
         optimum = float(episode_set.costs[i])
         common: dict[str, Any] = {

@@ -20,9 +20,9 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, run_episodes
-from ballbot_gym.env import make_task
+from ballbot_gym.env import limit_names, make_task
 from ballbot_gym.lazy import missing
-from ballbot_gym.params import default_params
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
@@ -237,6 +237,7 @@ def draw(
     episodes: Iterable[int],
     seed: int,
     purpose: Literal["evaluation", "validation", "training"] = "evaluation",
+    robot: str = PAPER,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Initial states (n, 8) and constants (n, nc) of fresh episodes.
 
@@ -245,20 +246,22 @@ def draw(
         episodes: their numbers.
         seed: of the set.
         purpose: what the set is for; sets for different purposes share no episode.
+        robot: by name.
     """
-    entropy, params = zlib.crc32(task.id.encode()), default_params()
+    entropy, params = zlib.crc32(task.id.encode()), named_robot(robot)
     sequences = (np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, i)) for i in episodes)
     drawn = [task.sample(np.random.default_rng(sequence), params) for sequence in sequences]
     return np.array([x for x, _ in drawn]), np.array([c for _, c in drawn])
 
 
-def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.Tensor]:
+def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[torch.Tensor], torch.Tensor]:
     """A policy as a function from observations (B, no) to actions (B, 2), for one episode of each of B environments.
 
     Args:
         policy: a policy file, a saved model, the name of a shipped policy, a model with Stable-Baselines3's `predict`, or a
             function of tensors such as a `PolicyNetwork`. It is given float32.
         task: what it is to do.
+        robot: by name, of a policy by name or file.
 
     Raises:
         ValueError: nothing of that name, or a controller that does not run in the batch.
@@ -266,7 +269,7 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
         TypeError: it is none of these.
     """
     if isinstance(policy, str | Path):
-        name, shipped = str(policy), shipped_policies(task)
+        name, shipped = str(policy), shipped_policies(task, robot)
         if is_expert(name):
             raise ValueError(
                 f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
@@ -275,7 +278,7 @@ def as_batch_policy(policy: Any, task: Task) -> Callable[[torch.Tensor], torch.T
         if name not in shipped and not is_file(name):
             raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
         network = (
-            load_actor(name, task) if is_saved_model(name) else load_network(shipped.get(name, name), task)
+            load_actor(name, task) if is_saved_model(name) else load_network(shipped.get(name, name), task, robot)
         ).eval()
         return lambda observation: network(observation.float())
     if callable(getattr(policy, "predict", None)):
@@ -294,6 +297,7 @@ def evaluate_fresh(
     seed: int = 0,
     name: str | None = None,
     on_progress: Callable[[int], None] = lambda count: None,
+    robot: str = PAPER,
 ) -> FreshResult:
     """Runs a policy on fresh episodes.
 
@@ -304,20 +308,22 @@ def evaluate_fresh(
         seed: of the episodes.
         name: of the policy in the result; default, its own.
         on_progress: called with a number of finished episodes.
+        robot: by name.
 
     Raises:
         TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.
     """
-    task = make_task(task)
+    task, params = make_task(task, robot), named_robot(robot)
     check_fresh(episodes, seed)
-    states, constants = draw(task, range(episodes), seed)
+    states, constants = draw(task, range(episodes), seed, robot=robot)
     runs = []
     for start in range(0, episodes, _BATCH):
         x, c = states[start : start + _BATCH], constants[start : start + _BATCH]
-        batch = BallbotBatch(task, len(x), compile=False, dtype=torch.float64)
-        runs.append(run_episodes(batch, as_batch_policy(policy, task), x, c))
+        batch = BallbotBatch(task, len(x), compile=False, dtype=torch.float64, robot=robot)
+        runs.append(run_episodes(batch, as_batch_policy(policy, task, robot), x, c))
         on_progress(len(x))
-    described = [task.measures(x, c, default_params()) for x, c in zip(states, constants, strict=True)]
+    described = [task.measures(x, c, params) for x, c in zip(states, constants, strict=True)]
+    names = limit_names(task, params)
     numbers = torch.cat([run.violated for run in runs]).tolist()
     return FreshResult(
         task=task,
@@ -328,7 +334,7 @@ def evaluate_fresh(
         costs=torch.cat([run.cost for run in runs]).numpy(),
         success=torch.cat([run.success for run in runs]).numpy(),
         failure=torch.cat([run.failure for run in runs]).numpy(),
-        violated=tuple(task.limit_names[number] if number >= 0 else "" for number in numbers),
+        violated=tuple(names[number] if number >= 0 else "" for number in numbers),
         durations=torch.cat([run.steps for run in runs]).numpy() * task.control_dt,
         measures={key: np.array([entry[key] for entry in described]) for key in described[0]},
         optima=np.zeros(0),
@@ -344,7 +350,13 @@ def check_fresh(episodes: int, seed: int) -> None:
 
 
 def find_optima(
-    task: str, episodes: int, seed: int, out: Path, workers: int, on_progress: Callable[[str, int], None]
+    task: str,
+    episodes: int,
+    seed: int,
+    out: Path,
+    workers: int,
+    on_progress: Callable[[str, int], None],
+    robot: str = PAPER,
 ) -> np.ndarray:
     """(n,) optimal costs of the first fresh episodes of a seed, NaN where none was found.
 
@@ -355,11 +367,13 @@ def find_optima(
         out: folder in which the optima stay, so that a later call finds only those that are missing.
         workers: processes.
         on_progress: called with the task's name and a number of optima that are there.
+        robot: by name.
     """
-    jobs.claim(out, {"task": make_task(task).problem(), "seed": seed})
+    named = {} if robot == PAPER else {"robot": robot}
+    jobs.claim(out, {"task": make_task(task, robot).problem(), "seed": seed, **named})
     try:
         work = [
-            jobs.Job(f"optima-{start:06d}", _optima, (task, seed), items, task)
+            jobs.Job(f"optima-{start:06d}", _optima, (task, seed, robot), items, task)
             for start in range(0, episodes, _CHUNK)
             for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
         ]
@@ -369,13 +383,13 @@ def find_optima(
     return np.array([entry.get("cost", math.nan) for entries in done for entry in entries])
 
 
-def _optima(task_name: str, seed: int, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
+def _optima(task_name: str, seed: int, robot: str, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
     from ballbot_baselines.optimum import find_optimum  # it imports CasADi
 
-    task = make_task(task_name)
-    for i, x, c in zip(episodes, *draw(task, episodes, seed), strict=True):
+    task = make_task(task_name, robot)
+    for i, x, c in zip(episodes, *draw(task, episodes, seed, robot=robot), strict=True):
         try:
-            optimum = find_optimum(task, default_params(), x, c)
+            optimum = find_optimum(task, named_robot(robot), x, c)
         except PlanError as error:
             yield {"episode": i, "error": str(error)}
             continue

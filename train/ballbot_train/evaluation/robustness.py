@@ -11,6 +11,7 @@ from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import PAPER
 from ballbot_train import jobs
 from ballbot_train.evaluation.benchmark import episode_job
 from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
@@ -107,6 +108,7 @@ def run(
     workers: int,
     on_progress: Callable[[str, int], None],
     seed: int = 0,
+    robot: str = PAPER,
 ) -> list[StressResult]:
     """Runs everything, resumably.
 
@@ -119,13 +121,22 @@ def run(
         workers: processes.
         on_progress: called with a stress and a number of finished episodes.
         seed: of the draws: episode i draws the same with every controller.
+        robot: by name.
     """
     work = [
         (
             stress,
             level,
             episode_job(
-                task, name, physics, range(episodes), seed, _randomization(stress, level), f"{stress}-{level:g}", stress
+                task,
+                name,
+                physics,
+                range(episodes),
+                seed,
+                _randomization(stress, level),
+                f"{stress}-{level:g}",
+                stress,
+                robot,
             ),
         )
         for stress, level in conditions(stresses)

@@ -41,6 +41,7 @@ from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
@@ -71,9 +72,11 @@ class DemoConfig:
     """What the expert's plans keep from their limits; experts that take no back-off ignore it."""
     seed: int = 0
     """Seed of the dataset."""
+    robot: str = PAPER
+    """Name of a robot in `ROBOTS`."""
 
     def __post_init__(self) -> None:
-        make_task(self.task)
+        make_task(self.task, self.robot)
         check_names("expert", [self.expert], CONTROLLERS)
         if not 1 <= self.episodes <= _SEEDS:
             raise ValueError(f"episodes must be 1 to {_SEEDS}, not {self.episodes}")
@@ -82,7 +85,7 @@ class DemoConfig:
         for name in ("noise", "pushes"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and at least 0, not {getattr(self, name)}")
-        most = round(1 / make_task(self.task).control_dt)
+        most = round(1 / make_task(self.task, self.robot).control_dt)
         if self.pushes > most:
             raise ValueError(f"pushes must be at most {most} per second, one in every control step, not {self.pushes}")
 
@@ -414,7 +417,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
     """Writes the arrays of each episode to a file, and yields its metadata."""
-    env = BallbotEnv(config.task, physics=config.physics)
+    env = BallbotEnv(config.task, physics=config.physics, robot=config.robot)
     expert = Expert(config.expert, env.task, env.params, config.backoff)
     for i in episodes:
         rng = np.random.default_rng([config.episode_seed(i), 1])  # other numbers than the env's
@@ -457,8 +460,8 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
         raise PlanError(f"the expert found no plan in any of {len(entries)} episodes: {entries[0]['note']}")
     root = unfinished / "datasets"
     shutil.rmtree(root, ignore_errors=True)
-    task = make_task(config.task)
-    env = gymnasium.make(task.id, physics=config.physics)
+    task = make_task(config.task, config.robot)
+    env = gymnasium.make(task.id, physics=config.physics, robot=config.robot)
     before = os.environ.get("MINARI_DATASETS_PATH")
     os.environ["MINARI_DATASETS_PATH"] = str(root)  # Minari offers no other way to choose the folder
     try:

@@ -36,7 +36,7 @@ import signal
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -47,7 +47,7 @@ from torch.utils.tensorboard import SummaryWriter
 from ballbot_gym import certified, files
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import default_params
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
@@ -129,10 +129,10 @@ class Score:
     """Number of episodes that failed."""
 
 
-def score(network: PolicyNetwork, task: Task) -> Score:
+def score(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Score:
     """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
-    episodes = certified.load(task)
-    batch = BallbotBatch(task, len(episodes), compile=False)
+    episodes = certified.load(task, robot=robot)
+    batch = BallbotBatch(task, len(episodes), compile=False, robot=robot)
     run = run_episodes(batch, network, episodes.states, episodes.constants)
     ratio = run.cost.numpy() / episodes.costs
     priced = fresh.priced(run.cost.numpy(), run.success.numpy(), task) / episodes.costs
@@ -168,10 +168,11 @@ _COLUMNS = (
 """Of evaluations.csv."""
 
 
-def validate(network: PolicyNetwork, task: Task) -> Validation:
+def validate(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Validation:
     """Measures a policy on the validation set, which shares no episode with the certified ones nor with `evaluate_fresh`."""
-    states, constants = fresh.draw(task, range(VALIDATION_EPISODES), _VALIDATION_SEED, "validation")
-    run = run_episodes(BallbotBatch(task, VALIDATION_EPISODES, compile=False), network, states, constants)
+    states, constants = fresh.draw(task, range(VALIDATION_EPISODES), _VALIDATION_SEED, "validation", robot)
+    batch = BallbotBatch(task, VALIDATION_EPISODES, compile=False, robot=robot)
+    run = run_episodes(batch, network, states, constants)
     return Validation(
         cost=float(fresh.priced(run.cost.numpy(), run.success.numpy(), task).mean()),
         success=float(run.success.double().mean()),
@@ -186,7 +187,8 @@ def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, re
     Args:
         learner: before its first iteration.
         task: the task; it needs certified episodes.
-        config: contents of config.json; a run resumes only with the same.
+        config: contents of config.json; a run resumes only with the same. Its "robot" names the robot, if it is not the
+            paper's.
         out: folder of the run.
         resume: continue the run in `out`, if there is one.
 
@@ -246,6 +248,7 @@ class _Run:
         self.learner, self.task, self.config, self.out = learner, task, dict(config), out
         self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
         self.best, self.rows = math.inf, []
+        self.robot = self.config.get("robot", PAPER)
         if (out / _CONFIG).exists() and not resume:
             raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
         jobs.claim(out, self.config, _CONFIG, {"about": provenance()})
@@ -271,12 +274,12 @@ class _Run:
             if "best_validation" in state:
                 self.best = float(state["best_validation"])
             else:  # of an earlier version, which chose the best policy on the certified episodes
-                self.best = validate(best, self.task).cost
+                self.best = validate(best, self.task, self.robot).cost
         except MemoryError:
             raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
             raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error!r})") from error
-        save_policy(self.out / "policy", best, self._about())
+        self._save_policy(best)
         self._write_rows()
 
     def score(self) -> dict[str, float]:
@@ -286,7 +289,8 @@ class _Run:
             The figures by their name in TensorBoard.
         """
         network = self.learner.network
-        certified_score, validation = asdict(score(network, self.task)), validate(network, self.task)
+        certified_score = asdict(score(network, self.task, self.robot))
+        validation = validate(network, self.task, self.robot)
         named = {f"validation_{name}": value for name, value in asdict(validation).items()}
         self.rows.append(
             {
@@ -301,7 +305,7 @@ class _Run:
         self._write_rows()
         if validation.cost < self.best:
             self.best = validation.cost
-            save_policy(self.out / "policy", network, self._about())
+            self._save_policy(network)
         certified_figures = {f"certified/{name}": value for name, value in certified_score.items()}
         return certified_figures | {f"validation/{name}": value for name, value in asdict(validation).items()}
 
@@ -320,7 +324,7 @@ class _Run:
             "cpu_seconds": self.cpu_seconds,
             "best_validation": self.best,
             "rows": self.rows,
-            "policy": load_network(self.out / "policy", self.task).state_dict(),
+            "policy": load_network(self.out / "policy", self.task, self.robot).state_dict(),
         }
         buffer = io.BytesIO()
         torch.save(state, buffer)
@@ -328,10 +332,10 @@ class _Run:
 
     def measure(self) -> evaluate.Row:
         """Measures the best policy on the certified episodes in PyBullet, and adds the result to its JSON file."""
-        network = load_network(self.out / "policy", self.task)
-        env = BallbotEnv(self.task)
-        controller = PolicyController(self.task, default_params(), network)
-        episodes = range(len(certified.load(self.task)))
+        network = load_network(self.out / "policy", self.task, self.robot)
+        env = BallbotEnv(self.task, robot=self.robot)
+        controller = PolicyController(self.task, named_robot(self.robot), network)
+        episodes = range(len(certified.load(self.task, robot=self.robot)))
         results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], episodes)
         env.close()
         row = evaluate.summarize(results)
@@ -344,13 +348,17 @@ class _Run:
             "regret_mean": row.regret_mean,
             "regret_median": row.regret_median,
         }
-        save_policy(self.out / "policy", network, self._about() | {"measured": measured})
+        self._save_policy(network, measured=measured)
         return row
 
     def _restored(self, weights: Mapping[str, torch.Tensor]) -> PolicyNetwork:
         network = PolicyNetwork(self.learner.network.spec)
         network.load_state_dict(weights)
         return network
+
+    def _save_policy(self, network: PolicyNetwork, **more: Any) -> None:
+        network.spec = replace(network.spec, robot=self.robot)
+        save_policy(self.out / "policy", network, self._about() | more)
 
     def _about(self) -> dict[str, Any]:
         reached = self.learner.difficulty if isinstance(self.learner, Staged) else {}

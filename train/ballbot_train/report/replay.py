@@ -11,6 +11,7 @@ from ballbot_gym import certified
 from ballbot_gym.drawing import GHOST, GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
@@ -93,7 +94,12 @@ def _driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
 
 
 def certified_replay(
-    task: str, controllers: Sequence[str], episode: int, physics: str = "bullet", skip_planless: bool = False
+    task: str,
+    controllers: Sequence[str],
+    episode: int,
+    physics: str = "bullet",
+    skip_planless: bool = False,
+    robot: str = PAPER,
 ) -> Replay:
     """A certified episode under controllers by name.
 
@@ -103,14 +109,15 @@ def certified_replay(
         episode: index of the episode.
         physics: "bullet" or "rk4".
         skip_planless: leave out controllers that find no plan.
+        robot: by name.
 
     Raises:
         ValueError: an unknown task, controller or episode.
         PlanError: a controller finds no plan, unless `skip_planless`.
     """
-    env = BallbotEnv(task, physics=physics)
+    env = BallbotEnv(task, physics=physics, robot=robot)
     try:
-        episode_set = certified.load(env.task)
+        episode_set = certified.load(env.task, robot=robot)
         if not 0 <= episode < len(episode_set):
             raise ValueError(f"episode must be 0 to {len(episode_set) - 1}, not {episode}")
         takes = []
@@ -156,7 +163,9 @@ def with_companions(replay: Replay, others: Replay) -> Replay:
     return replace(replay, takes=takes)
 
 
-def with_ghosts(replay: Replay, task: str, episode: int, at: float, expert: str, physics: str) -> Replay:
+def with_ghosts(
+    replay: Replay, task: str, episode: int, at: float, expert: str, physics: str, robot: str = PAPER
+) -> Replay:
     """Adds a ghost to every take of a certified episode: the expert's trajectory from the take's state at time `at`, s.
 
     The ghost lasts a whole episode, under the same physics. A take from which the expert finds no plan gets no ghost, and
@@ -166,9 +175,9 @@ def with_ghosts(replay: Replay, task: str, episode: int, at: float, expert: str,
         ValueError: a take has ended before `at`, or the task does not allow its state.
         PlanError: the expert finds no plan from any take.
     """
-    env = BallbotEnv(task, physics=physics)
+    env = BallbotEnv(task, physics=physics, robot=robot)
     try:
-        c = certified.load(env.task).constants[episode]
+        c = certified.load(env.task, robot=robot).constants[episode]
         controller = CONTROLLERS[expert](env.task, env.params)
         takes = []
         for take in replay.takes:
