@@ -100,9 +100,9 @@ class BatchStep(NamedTuple):
     """(B,) rad, of `final_x`; carries no gradient."""
     tilt: torch.Tensor
     """(B,) rad, of `final_x`, or where an episode ended of the next one's initial state; carries no gradient."""
-    grip: torch.Tensor | None = None
-    """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction it needs. It carries no
-    gradient, and is None where friction is unlimited."""
+    grip: torch.Tensor
+    """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction it needs; (0, B) where
+    friction is unlimited. It carries no gradient."""
 
 
 class BatchEpisodes(NamedTuple):
@@ -369,7 +369,8 @@ class BallbotBatch:
 
         rate = task.cost(x, force, c)
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
-        limits, grip = task.limits(end, c), None
+        limits = task.limits(end, c)
+        grip = torch.zeros(0, *rate.shape, dtype=self.dtype, device=rate.device)
         if self.params.grips:
             asked = dynamics.contact(robot, x, total)
             limits = (*limits, torch.minimum(*dynamics.grip_limits(robot, asked)))

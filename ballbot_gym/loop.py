@@ -156,7 +156,7 @@ class BallbotLoop:
             "clipped": np.array(clipped),
             "final_tilt": final_tilt,
             "tilt": tilt,
-            "grip": np.array(grip, self.dtype).T if self.params.grips else None,
+            "grip": np.array(grip, self.dtype).T if self.params.grips else np.zeros((0, self.num_envs), self.dtype),
         }
         return BatchStep(**fields)
 

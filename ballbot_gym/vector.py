@@ -257,7 +257,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         result = self._advance(actions, waiting, restart)
         reward, cost, terminated, truncated = result.reward, result.cost, result.terminated, result.truncated
         success, violated, force, clipped = result.success, result.violated, result.force.T, result.clipped
-        grip = None if result.grip is None else result.grip.T
+        grip = result.grip.T if self.params.grips else None
         done = terminated | truncated
         ended = done.nonzero()[0]
         parts = np.zeros((3, self.num_envs))
@@ -382,9 +382,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             return self.batch.step(actions, waiting, restart)
         with torch.no_grad():
             result = _advance(self.batch, self._to_batch(actions), waiting, restart)
-        arrays = {
-            name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items() if part is not None
-        }
+        arrays = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
         return result._replace(**arrays)
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
@@ -490,7 +488,7 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
             violated=torch.where(wait, -1, result.violated),
             force=result.force * no,
             clipped=result.clipped & no,
-            grip=None if result.grip is None else torch.where(no, result.grip, 0.0),
+            grip=torch.where(no, result.grip, 0.0),
         )
     held = ended if wait is None else ended | wait
     if not held.any():

@@ -12,6 +12,7 @@ COMMANDS: dict[str, str] = {
     "evaluate": "ballbot_train.commands.evaluate:evaluate",
     "compare": "ballbot_train.commands.compare:compare",
     "robustness": "ballbot_train.commands.robustness:robustness",
+    "transfer": "ballbot_train.commands.transfer:transfer",
     "basins": "ballbot_train.commands.basins:basins",
     "paper": "ballbot_train.commands.paper:paper",
     "optimize": "ballbot_train.commands.optimize:optimize",

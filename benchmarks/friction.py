@@ -1,0 +1,123 @@
+"""What the floor must give: friction and normal force along the paper's optima, and what a limit of friction costs."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from ballbot_gym import certified, dynamics, files
+from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.robots import named_robot
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.trajectory import Trajectory
+
+_SHOWN = 2.0  # greatest coefficient of friction in the figure
+_SWEPT = (1.2, 1.0, 0.9, 0.8, 0.7, 0.6)
+_STARTS = {  # task: the paper's start and constants
+    "stabilize": (np.array([-1.0, 0, 0, 0, 0, 5.0, 0, 0]), np.zeros(0)),
+    "turn": (np.array([0.0, -1.0, 0, 0, 0, 10.0, 0, 0]), np.array([10.0])),
+}
+
+
+def floor_force(params: BallbotParams, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Normal force (n,) as a fraction of the weight, and needed friction (n,), inf where the floor would have to pull."""
+    fx, fy, normal = dynamics.contact(params, trajectory.x[:-1], trajectory.u)
+    needed = np.where(normal > 0, np.hypot(fx, fy) / np.where(normal > 0, normal, 1), math.inf)
+    return normal / params.weight, needed
+
+
+def demand(out: Path) -> None:
+    """What the paper's stored optima ask of the floor."""
+    params, rows = default_params(), []
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    axes = figure.subplots(2, 2, sharey=True)
+    for name, axis in zip(TASKS, axes.flat, strict=True):
+        for i, trajectory in enumerate(certified.load(name).trajectories):
+            load, needed = floor_force(params, trajectory)
+            rows.append(
+                {
+                    "task": name,
+                    "episode": i,
+                    "least_normal_force": load.min(),
+                    "greatest_friction": needed.max(),
+                    "share_beyond_1": np.mean(needed > 1),
+                }
+            )
+            axis.plot(trajectory.t[:-1], np.minimum(needed, _SHOWN * 1.05), color="C0", alpha=0.35, lw=1)
+        axis.axhline(0.8, color="C3", lw=1, ls="--")
+        axis.set(title=name, xlabel="time, s", ylim=(0, _SHOWN), xlim=(0, None))
+    for axis in axes[:, 0]:
+        axis.set_ylabel("friction needed")
+    figure.suptitle("Friction that the optima of the paper's robot need; dashed: 0.8, the rolling robot's floor")
+    path = out / "friction.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    files.write_csv(out / "demand.csv", rows)
+    for name in TASKS:
+        of = [row for row in rows if row["task"] == name]
+        pulls = sum(row["least_normal_force"] < 0 for row in of)
+        within = sum(row["greatest_friction"] <= 1 for row in of)
+        print(f"{name}: {pulls} of {len(of)} optima need a floor that pulls; {within} stay within a friction of 1")
+
+
+def sweep(out: Path) -> None:
+    """Cost and lean of the rolling robot's optima against friction."""
+    from ballbot_baselines.optimum import Backoff, find_optimum
+
+    grippy, rows = dataclasses.replace(named_robot("rolling"), friction=max(_SWEPT)), []
+    free = dataclasses.replace(grippy, friction=math.inf)
+    for name, (x, c) in _STARTS.items():
+        task = make_task(name, "rolling")
+        best = find_optimum(task, free, x, c)
+        found = [(math.inf, best)]
+        for friction in _SWEPT:
+            # A reserve of friction is a smaller friction, and needs no other compiled functions.
+            try:
+                found.append(
+                    (friction, find_optimum(task, grippy, x, c, Backoff(grip=1e-5 + 1 - friction / max(_SWEPT))))
+                )
+            except PlanError:
+                print(f"{name}: no way at a friction of {friction}")
+        for friction, optimum in found:
+            lean = math.degrees(optimum.trajectory.tilt.max())
+            rows.append({"task": name, "friction": friction, "cost": optimum.cost, "lean": lean})
+            print(f"{name}: friction {friction:g}: {optimum.cost / best.cost - 1:+.1%}, lean {lean:.1f}°", flush=True)
+    files.write_csv(out / "sweep.csv", rows)
+    figure = Figure(figsize=(10, 3.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name in _STARTS:
+        of = [row for row in rows if row["task"] == name]
+        bound = [row for row in of if math.isfinite(row["friction"])]
+        left.plot(
+            [row["friction"] for row in bound],
+            [100 * (row["cost"] / of[0]["cost"] - 1) for row in bound],
+            "o-",
+            label=name,
+        )
+        right.plot([row["friction"] for row in bound], [row["lean"] for row in bound], "o-", label=name)
+    left.set(xlabel="coefficient of friction", ylabel="cost over unlimited friction, %")
+    right.set(xlabel="coefficient of friction", ylabel="greatest lean, degrees")
+    left.legend()
+    figure.savefig(out / "sweep.png", dpi=110)
+
+
+def main(out: Path = Path("runs/friction"), costs: bool = False) -> None:
+    """Measures what the stored optima of the paper's robot need, and writes demand.csv and friction.png.
+
+    Args:
+        out: folder of the results.
+        costs: also find optima of the rolling robot at several coefficients of friction, which takes minutes, and write
+            sweep.csv and sweep.png with their cost and greatest lean.
+    """
+    demand(out)
+    if costs:
+        sweep(out)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

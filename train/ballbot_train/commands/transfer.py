@@ -1,0 +1,86 @@
+"""`ballbot transfer`: controllers made for one robot, run on another."""
+
+import os
+from pathlib import Path
+
+from ballbot_gym import files
+from ballbot_gym.robots import PAPER, ROBOTS
+from ballbot_gym.tasks import TASKS
+from ballbot_train import jobs
+from ballbot_train.console import (
+    Physics,
+    RobotName,
+    check_least,
+    check_some,
+    console,
+    markdown,
+    physics_or_default,
+    print_table,
+    progress_bars,
+)
+from ballbot_train.evaluation import transfer as matrix
+from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, policy_digests
+from ballbot_train.provenance import provenance
+
+
+def transfer(
+    tasks: tuple[str, ...] = tuple(TASKS),
+    controllers: tuple[str, ...] = (),
+    made_for: tuple[RobotName, ...] = (PAPER, "rolling"),
+    robot: RobotName = "rolling",
+    frictions: tuple[float, ...] = (),
+    episodes: int = 20,
+    quick: bool = False,
+    physics: Physics | None = None,
+    seed: int = 0,
+    out: Path = Path("runs/transfer"),
+    workers: int = os.cpu_count() or 1,
+) -> None:
+    """Runs controllers that were made for one robot on another: success, falls and cost over that robot's optimum.
+
+    Args:
+        tasks: names of tasks.
+        controllers: names of experts and policies; default all that the robots have.
+        made_for: names of the robots that they were made for: what they plan for, and what policies learnt on.
+        robot: what they run on, with its certified episodes.
+        frictions: coefficients of friction of the floor, for a robot whose ball rolls; default, the robot's own.
+        episodes: how many of each task's certified episodes.
+        quick: only 3 episodes of each task.
+        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed, with contact where the ball rolls.
+        seed: of the bootstrap intervals.
+        out: folder of the results; an interrupted run continues here.
+        workers: processes.
+    """
+    check_some("robot", made_for, ROBOTS)
+    check_least(1, workers=workers)
+    check_least(0, seed=seed)
+    floors = frictions or (None,)
+    for friction in floors:
+        matrix.floor(robot, friction)
+    chosen = {name: controllers_of(tasks, controllers, name) for name in made_for}
+    physics = physics_or_default(physics)
+    episodes = checked_episodes(episodes, quick, few=3)
+    settings = {
+        "controllers": chosen,
+        "policies": {name: policy_digests(group, name) for name, group in chosen.items()},
+        "robot": robot,
+        "frictions": frictions,
+        "episodes": episodes,
+        "physics": physics,
+        "seed": seed,
+    }
+    facts = provenance() | settings | {"workers": workers}
+    jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
+    totals = dict.fromkeys(tasks, 0)
+    for group in chosen.values():
+        for task, names in group.items():
+            totals[task] += len(names) * len(floors) * matrix.episodes_of(task, robot, episodes)
+    with progress_bars(totals) as bars:
+        results = matrix.run(chosen, robot, floors, episodes, physics, out, workers, bars.advance, seed)
+    rows = matrix.rows_of(results, seed)
+    matrix.write(rows, results, facts, out)
+    table = [matrix.cells(row) for row in rows]
+    files.write(out / "transfer.md", markdown(matrix.HEADER, table))
+    jobs.release(out)
+    print_table(f"{episodes} certified episodes of {robot} per task, physics={physics}", matrix.HEADER, table)
+    console.print(f"matrix: {out / 'transfer.csv'}")

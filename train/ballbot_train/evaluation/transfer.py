@@ -1,0 +1,165 @@
+"""Sim-to-sim transfer: controllers that were made for one robot, run on another.
+
+The controller plans and observes as for its own robot. It meets the certified episodes of the robot that it runs on, and its
+cost is compared with that robot's optimum. In PyBullet a rolling robot's contact is simulated, and its friction may differ
+from what the controller was made for.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ballbot_gym import certified, files
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import named_robot
+from ballbot_train import jobs
+from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.evaluate import iterate_episodes
+from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
+
+_CHUNK = 5  # episodes of a job
+
+
+@dataclass(frozen=True)
+class TransferResult(Result):
+    """An episode of a controller on a robot that it may not have been made for."""
+
+    made_for: str = ""
+    robot: str = ""
+    friction: float = math.nan
+
+
+@dataclass(frozen=True)
+class TransferRow(Row):
+    """A row of the matrix."""
+
+    made_for: str = ""
+    robot: str = ""
+    friction: float = math.nan
+    """Of the floor that it ran on; infinite for the paper's."""
+
+
+def floor(robot: str, friction: float | None) -> BallbotParams:
+    """A robot by name on a floor with this friction; None is the robot's own.
+
+    Raises:
+        ValueError: a friction for a robot whose ball does not roll.
+    """
+    params = named_robot(robot)
+    if friction is None:
+        return params
+    if not params.rolls:
+        raise ValueError(f"the ball of {robot!r} does not roll, so its floor has no friction; give a rolling robot")
+    return replace(params, friction=friction)
+
+
+def episodes_of(task: str, robot: str, episodes: int) -> int:
+    """How many certified episodes to run: at most as many as there are."""
+    return min(episodes, len(certified.load(task, robot=robot)))
+
+
+def run(
+    controllers: Mapping[str, Mapping[str, Sequence[str]]],
+    robot: str,
+    frictions: Sequence[float | None],
+    episodes: int,
+    physics: str,
+    out: Path,
+    workers: int,
+    on_progress: Callable[[str, int], None],
+    seed: int = 0,
+) -> list[TransferResult]:
+    """Runs everything, resumably.
+
+    Args:
+        controllers: names by task, by the robot that they were made for.
+        robot: what they run on, by name.
+        frictions: of the floors; None is the robot's own.
+        episodes: certified episodes of each task, from the first.
+        physics: "bullet" or "rk4".
+        out: folder of the results.
+        workers: processes.
+        on_progress: called with a task and a number of finished episodes.
+        seed: of whatever is drawn.
+    """
+    work = []
+    for made_for, by_task in controllers.items():
+        for task, names in by_task.items():
+            count = episodes_of(task, robot, episodes)
+            for name in names:
+                for friction in frictions:
+                    value = floor(robot, friction).friction
+                    for start in range(0, count, _CHUNK):
+                        items = tuple(range(start, min(start + _CHUNK, count)))
+                        slug = "".join(sign if sign.isalnum() else "-" for sign in f"{task}-{made_for}-{name}-{robot}")
+                        job = jobs.Job(
+                            name=f"{slug}-{value:g}-{physics}-{start:03d}",
+                            function=_entries,
+                            arguments=(task, name, made_for, robot, friction, physics, seed),
+                            items=items,
+                            group=task,
+                        )
+                        work.append((job, {"made_for": made_for, "robot": robot, "friction": value}))
+    done = jobs.run([job for job, _ in work], out, workers, on_progress)
+    return [TransferResult(**entry, **of) for (_, of), entries in zip(work, done, strict=True) for entry in entries]
+
+
+def _entries(
+    task: str,
+    controller: str,
+    made_for: str,
+    robot: str,
+    friction: float | None,
+    physics: str,
+    seed: int,
+    episodes: Sequence[int],
+) -> Iterator[jobs.Entry]:
+    env = BallbotEnv(task, physics=physics, robot=floor(robot, friction))
+    made = make_controller(controller, make_task(task, made_for), named_robot(made_for))
+    for result in iterate_episodes(env, made, controller, task, episodes, seed):
+        yield asdict(result)
+    env.close()
+
+
+def rows_of(results: Sequence[TransferResult], seed: int = 0) -> list[TransferRow]:
+    """One row per task, controller, robot that it was made for, and floor; seed is of the bootstrap."""
+    groups: dict[tuple[str, str, str, str, float], list[TransferResult]] = {}
+    for result in results:
+        key = (result.task, result.made_for, result.controller, result.robot, result.friction)
+        groups.setdefault(key, []).append(result)
+    return [
+        TransferRow(**asdict(summarize(group, seed)), made_for=made_for, robot=robot, friction=friction)
+        for (_, made_for, _, robot, friction), group in groups.items()
+    ]
+
+
+def write(rows: Sequence[TransferRow], results: Sequence[TransferResult], facts: Mapping[str, Any], out: Path) -> None:
+    """Writes transfer.csv, episodes.csv and transfer.json, which holds the facts as "about" and the rows."""
+    write_csv(out / "transfer.csv", rows)
+    write_csv(out / "episodes.csv", results)
+    files.write(out / "transfer.json", to_json({"about": facts, "rows": rows}))
+
+
+HEADER = ["task", "made for", "controller", "runs on", "friction", "success", "falls", "regret mean", "peak tilt"]
+
+
+def cells(row: TransferRow) -> list[str]:
+    """A row as text, under `HEADER`; what does not exist is a dash."""
+
+    def shown(value: float, form: str, unit: str = "") -> str:
+        return format(value, form) + unit if math.isfinite(value) else "–"
+
+    return [
+        row.task,
+        row.made_for,
+        row.controller,
+        row.robot,
+        shown(row.friction, "g"),
+        f"{100 * row.success:.1f} %",
+        f"{row.falls}/{row.episodes}",
+        shown(row.regret_mean, ".2%"),
+        shown(row.peak_tilt_median, ".1f", "°"),
+    ]
