@@ -101,8 +101,8 @@ class BatchStep(NamedTuple):
     tilt: torch.Tensor
     """(B,) rad, of `final_x`, or where an episode ended of the next one's initial state; carries no gradient."""
     grip: torch.Tensor
-    """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction it needs; (0, B) where
-    friction is unlimited. It carries no gradient."""
+    """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction that the step needs; (0, B)
+    where friction is unlimited. It carries no gradient."""
 
 
 class BatchEpisodes(NamedTuple):
@@ -372,9 +372,12 @@ class BallbotBatch:
         limits = task.limits(end, c)
         grip = torch.zeros(0, *rate.shape, dtype=self.dtype, device=rate.device)
         if self.params.grips:
-            asked = dynamics.contact(robot, x, total)
-            limits = (*limits, torch.minimum(*dynamics.grip_limits(robot, asked)))
-            grip = torch.stack(dynamics.grip(tuple(part.detach() for part in asked)))
+            floor = dynamics.held_contact(robot, x, total, task.control_dt)
+            first, second = (torch.minimum(*dynamics.grip_limits(robot, part)) for part in floor)
+            limits = (*limits, torch.minimum(first, second))
+            at_begin, at_end = (tuple(part.detach() for part in parts) for parts in floor)
+            needed = torch.maximum(dynamics.needed_friction(at_begin), dynamics.needed_friction(at_end))
+            grip = torch.stack((*at_begin, needed))
         violated = first_below_zero(limits)
         failure, reached = violated >= 0, all_of(g <= 0 for g in task.goal(end, c))
         safe = ~failure

@@ -95,9 +95,15 @@ def contact(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any, Any]
     A floor pushes only, N ≥ 0, and a coefficient of friction µ gives |f| ≤ µN. The paper's model asks of its floor whatever
     this says. So does a rolling robot's, which rolls without slipping in this model; see `limits`.
     """
+    return _contact(params, x, u, accelerations(params, x, u))
+
+
+def _contact(
+    params: BallbotParams, x: Vector, u: Vector, acceleration: tuple[Any, Any, Any, Any]
+) -> tuple[Any, Any, Any]:
     _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)
     fx, fy = ops.components(u)
-    ax, ay, gamma_ddot, theta_ddot = accelerations(params, x, u)
+    ax, ay, gamma_ddot, theta_ddot = acceleration
     sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
     n_z_ddot = (
         2 * sin_g * sin_t * gamma_dot * theta_dot
@@ -112,9 +118,46 @@ def contact(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any, Any]
     return fx - rolling * ax, fy - rolling * ay, normal
 
 
-def limits(params: BallbotParams, x: Vector, u: Vector, backoff: Any = 0.0) -> tuple[Any, ...]:
-    """The robot grips the floor iff every entry is ≥ 0; () where friction is unlimited. See `grip_limits`."""
-    return grip_limits(params, contact(params, x, u), backoff) if params.grips else ()
+def held_contact(
+    params: BallbotParams, x: Vector, u: Vector, hold: float
+) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+    """The floor's force, as `contact`, when force u begins in state x and after it was held for so many seconds.
+
+    The leans at the end are extrapolated with their accelerations, so that nothing is integrated for them. In between, a
+    force that is held while the robot falls or rises needs up to twice the friction that it needs at first.
+    """
+    _, _, gamma, theta, vx, vy, gamma_dot, theta_dot = parts = ops.components(x)
+    acceleration = accelerations(params, x, u)
+    *_, gamma_ddot, theta_ddot = acceleration
+    end = ops.stack(
+        (
+            *parts[:2],
+            gamma + hold * (gamma_dot + 0.5 * hold * gamma_ddot),
+            theta + hold * (theta_dot + 0.5 * hold * theta_ddot),
+            vx,
+            vy,
+            gamma_dot + hold * gamma_ddot,
+            theta_dot + hold * theta_ddot,
+        ),
+        like=x,
+    )
+    return _contact(params, x, u, acceleration), contact(params, end, u)
+
+
+def limits(params: BallbotParams, x: Vector, u: Vector, backoff: Any = 0.0, hold: float = 0.0) -> tuple[Any, ...]:
+    """The robot grips the floor iff every entry is ≥ 0; () where friction is unlimited. See `grip_limits`.
+
+    Args:
+        params: the robot.
+        x: (..., 8) state.
+        u: (..., 2) force, N.
+        backoff: as of `grip_limits`.
+        hold: s that the force is held: then the robot must grip at the end of this time too, see `held_contact`.
+    """
+    if not params.grips:
+        return ()
+    forces = held_contact(params, x, u, hold) if hold else (contact(params, x, u),)
+    return tuple([limit for force in forces for limit in grip_limits(params, force, backoff)])
 
 
 def grip_limits(params: BallbotParams, force: tuple[Any, Any, Any], backoff: Any = 0.0) -> tuple[Any, Any]:
@@ -126,20 +169,19 @@ def grip_limits(params: BallbotParams, force: tuple[Any, Any, Any], backoff: Any
     Args:
         params: the robot.
         force: as `contact` gives it.
-        backoff: fraction of the normal force, and so of the friction, that is kept in reserve.
+        backoff: reserve of normal force, as a fraction of the weight: the floor counts as if it pressed less by this.
     """
     fx, fy, normal = force
     weight = params.weight
-    load = (1 - backoff) * normal / weight
+    load = normal / weight - backoff
     slip = ops.squared(fx, fy) / (weight * params.friction) ** 2
     return load - LEAST_NORMAL_FORCE, ops.squared(load) - slip
 
 
-def grip(force: tuple[Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """The floor's force (f_x, f_y, N), and the coefficient of friction that it needs: |f|/N, and inf where N ≤ 0."""
+def needed_friction(force: tuple[Any, Any, Any]) -> Any:
+    """The coefficient of friction that the floor's force (f_x, f_y, N) needs: |f|/N, and inf where N ≤ 0."""
     fx, fy, normal = force
-    needed = ops.where(normal > 0, ops.sqrt(ops.squared(fx, fy)) / ops.where(normal > 0, normal, 1.0), math.inf)
-    return fx, fy, normal, needed
+    return ops.where(normal > 0, ops.sqrt(ops.squared(fx, fy)) / ops.where(normal > 0, normal, 1.0), math.inf)
 
 
 def derivative(params: BallbotParams, x: Vector, u: Vector) -> Vector:

@@ -80,13 +80,12 @@ class BallbotEnv(gymnasium.Env):
     | force | (2,) N, applied in this step (0 after `reset`) |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
-    | grip | (4,) the floor's force on the ball when the step began, f_x, f_y and N, and the coefficient of friction that it \
-needs (0 after `reset`); only of robots whose friction is limited |
+    | grip | (4,) f_x, f_y, N of the floor on the ball as the step began, and the friction it needs (0 after `reset`) |
 
-    A robot with limited friction that needs more than it has, or a floor that pulls, has lost its grip. The closed form
-    cannot say how it slips, so with physics="rk4" that is a failure, and `violated` is "grip". PyBullet simulates the contact
-    of a rolling ball: it slips or leaves the floor, and that by itself is no failure. `grip` is then the force at the end of
-    the step.
+    Only robots whose friction is limited have `grip`. Such a robot has lost its grip if it needs more friction, or a floor
+    that pulls, when a step begins or at its end. The closed form cannot say how it slips, so with physics="rk4" that is a
+    failure, and `violated` is "grip". PyBullet simulates the contact of a rolling ball: it slips or leaves the floor, and
+    that by itself is no failure. `grip` is then the force at the end of the step.
 
     `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
     copy of a Bullet env has a physics client of its own. The window is not copied.
@@ -359,10 +358,12 @@ needs (0 after `reset`); only of robots whose friction is limited |
         """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
         simulated = self._simulator.floor_force()
         if simulated is not None:
-            return dynamics.grip(simulated), False
+            return (*simulated, dynamics.needed_friction(simulated)), False
         robot = self.episode_params
-        asked = dynamics.contact(robot, x, total)
-        return dynamics.grip(asked), not all(limit >= 0 for limit in dynamics.grip_limits(robot, asked))
+        asked = dynamics.held_contact(robot, x, total, self.task.control_dt)
+        needed = max(map(dynamics.needed_friction, asked))
+        lost = not all(limit >= 0 for force in asked for limit in dynamics.grip_limits(robot, force))
+        return (*asked[0], needed), lost
 
     def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Initial state and constants. Those that the options do not give are drawn."""

@@ -67,20 +67,17 @@ def demand(out: Path) -> None:
 
 def sweep(out: Path) -> None:
     """Cost and lean of the rolling robot's optima against friction."""
-    from ballbot_baselines.optimum import Backoff, find_optimum
+    from ballbot_baselines.optimum import find_optimum
 
-    grippy, rows = dataclasses.replace(named_robot("rolling"), friction=max(_SWEPT)), []
-    free = dataclasses.replace(grippy, friction=math.inf)
+    rolling, rows = named_robot("rolling"), []
+    free = dataclasses.replace(rolling, friction=math.inf)
     for name, (x, c) in _STARTS.items():
         task = make_task(name, "rolling")
         best = find_optimum(task, free, x, c)
         found = [(math.inf, best)]
         for friction in _SWEPT:
-            # A reserve of friction is a smaller friction, and needs no other compiled functions.
             try:
-                found.append(
-                    (friction, find_optimum(task, grippy, x, c, Backoff(grip=1e-5 + 1 - friction / max(_SWEPT))))
-                )
+                found.append((friction, find_optimum(task, dataclasses.replace(rolling, friction=friction), x, c)))
             except PlanError:
                 print(f"{name}: no way at a friction of {friction}")
         for friction, optimum in found:

@@ -49,7 +49,7 @@ _OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05, grip=0.1)  # w
 _SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
 _MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
-_GRIP_RESERVE = 0.05  # of the friction, kept by the horizon: half of what plans keep
+_GRIP_RESERVE = 0.1  # of the weight, as plans keep
 _GRIP_UNIT = 0.1  # of `dynamics.limits`, that costs as much as a unit of a margin
 _LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
@@ -747,7 +747,7 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
         casadi.densify(casadi.jacobian(margins, x)),
     ]
     if params.grips:
-        grip = casadi.vertcat(*dynamics.limits(params, x, u, _GRIP_RESERVE)) / _GRIP_UNIT
+        grip = casadi.vertcat(*dynamics.limits(params, x, u, _GRIP_RESERVE, task.control_dt)) / _GRIP_UNIT
         outputs += [grip, casadi.densify(casadi.jacobian(grip, z))]
     function = casadi.Function("stage", [x, a, h, c], outputs, {"cse": True})
     return compiled(f"{task.id}-nmpc", (function,))[0]
@@ -755,7 +755,7 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
 
 def _grips(params: BallbotParams) -> int:
     """How many limits of its grip a robot has."""
-    return len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0)))
+    return len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0), hold=1.0))
 
 
 def _patterns(n: int, m: int, grips: int) -> tuple[casadi.Sparsity, casadi.Sparsity]:

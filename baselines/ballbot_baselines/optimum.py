@@ -2,7 +2,7 @@
 
     minimize   Σ_k cost(x_k, u_k, c)·control_dt        over forces u_k, |u_k| ≤ limit, held for control_dt
     subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n,
-               limits(x_k, u_k) ≥ 0 where the robot's friction is limited (`dynamics.limits`).
+               limits(x_k, u_k) ≥ 0 at both ends of each step, where the robot's friction is limited (`dynamics.limits`).
 
 So an episode under physics="rk4" that follows the optimal trajectory returns minus this cost. The problem is solved by
 multiple shooting from each of the task's guessed paths, and the best solution is kept. If no path leads to a solution, the
@@ -80,8 +80,8 @@ class Backoff:
     """How far a plan stays from its limits, so that a controller that tracks it stays within them.
 
     `margin` is in the unit of the task's margins (obstacles: m). `goal` is the fraction of the goal's tolerance that the plan
-    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback. `grip` is the fraction of the
-    friction that it leaves, where friction is limited.
+    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback. `grip` is the fraction
+    of the robot's weight that it leaves of the normal force, and so of the friction, where friction is limited.
 
     Raises:
         ValueError: a field is negative or not finite, or a fraction is not below 1.
@@ -219,7 +219,7 @@ def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
         return casadi.vertcat(*task.margins(x, p[:nc])) - p[nc]
 
     def path(x: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[nc + 2]))
+        return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[nc + 2], dt))
 
     def final(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not task.first_exit:
@@ -373,7 +373,7 @@ def _simulated(
         return []
     room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(member.x[-1], c)]
     room += [np.asarray(margin) - backoff.margin for margin in task.margins(member.x, c)]
-    room += dynamics.limits(params, member.x[:-1], member.u, backoff.grip)
+    room += dynamics.limits(params, member.x[:-1], member.u, backoff.grip, task.control_dt)
     return [
         OcpSolution(
             success=False,

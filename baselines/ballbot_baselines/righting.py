@@ -66,7 +66,7 @@ def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, fo
         margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in _margins(task, x, c)], axis=0)
         safe = np.logical_and.accumulate(margins >= 0, axis=0)
         if params.grips:
-            safe[1:] &= np.logical_and.accumulate(_gripping(params, x[:-1], u), axis=0)
+            safe[1:] &= np.logical_and.accumulate(_gripping(params, x[:-1], u, task.control_dt), axis=0)
         costs = np.asarray(task.cost(x[:-1], u, c))
         upright = (np.abs(x[..., 2:4]).max(-1) < _UPRIGHT) & (np.abs(x[..., 6:8]).max(-1) < _STEADY) & safe
     found = []
@@ -135,9 +135,9 @@ def _simulate(
     return np.array(states), np.array(forces)
 
 
-def _gripping(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _gripping(params: BallbotParams, x: np.ndarray, u: np.ndarray, hold: float) -> np.ndarray:
     """(n, k) whether members grip in each step."""
-    return np.logical_and.reduce([limit >= 0 for limit in dynamics.limits(params, x, u)])
+    return np.logical_and.reduce([limit >= 0 for limit in dynamics.limits(params, x, u, hold=hold)])
 
 
 def _has_point(task: Task, x0: np.ndarray, c: np.ndarray, params: BallbotParams) -> bool:

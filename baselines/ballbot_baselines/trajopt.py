@@ -9,7 +9,7 @@ from ballbot_gym.tasks import Task
 
 EXECUTED = Backoff(margin=0.01, goal=0.1, force=0.02, grip=0.1)
 """How far plans for execution stay from their limits: 1 cm from obstacles, a tenth of the goal's tolerance, 2 % of the
-force, a tenth of the friction where it is limited."""
+force, a tenth of the weight in normal force, where friction is limited."""
 
 
 class TrajoptController:
