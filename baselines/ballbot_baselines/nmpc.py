@@ -11,7 +11,9 @@ along the plan. So a robot on the plan stays on it, and a robot off the plan tak
 Every iteration linearizes dynamics and margins about the last solution, shifted by one control step, and solves one
 quadratic program by HPIPM: the sequential quadratic programming of Diehl et al., "A real-time iteration scheme for nonlinear
 optimization in optimal feedback control" (2005). One iteration per step is that scheme; more iterate to convergence. The
-Hessian is the cost's along the plan, so a converged solution is a stationary point of the nonlinear problem.
+Hessian is the cost's along the plan, so a converged solution is a stationary point of the nonlinear problem. Where friction
+is limited, the friction cone curves more than the cost does: its curvature across the force is added, weighted with the
+multipliers of the last program. Without it the iteration diverges along the cone.
 
 `offset_free` makes up for a robot that differs from the model: what the model mispredicts of the accelerations from step to
 step is fitted by recursive least squares, and added to the model over the horizon. As in Pannocchia and Rawlings,
@@ -47,6 +49,7 @@ _BACKOFF = Backoff(
 )  # of the plan; for the goal it is half of TrajoptController's
 _OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05, grip=0.1)  # what is left of a wrong model
 _SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
+_NODES = 40
 _MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
 _GRIP_RESERVE = 0.1  # of the weight, as plans keep
@@ -223,6 +226,8 @@ class HorizonQp:
         """Indices of the task's margins that are considered."""
         self.disturbance: Disturbance | None = None
         grips = _grips(params)
+        # of the cone in an input, per multiplier
+        self._cone_curvature = 2 * (params.force_limit / (params.friction * params.weight)) ** 2 / _GRIP_UNIT
         self._make_stage(task, params, nodes, count, grips)
         self._make_program(nodes, min(count, _MARGINS), grips)
 
@@ -276,6 +281,9 @@ class HorizonQp:
             [z, self._cost, *duals],
         )
         self._divide(h, g, a, low, high, z, n, _Matrix(m, grips))
+        first, inner, _ = _stages(self._unused[3], 8 + grips, n - 1, 8 + m + grips)
+        self._grip_multipliers = first[8:], inner[:, 8 + m :]  # of the last program, ≤ 0
+        self._curvature = np.zeros(n)
         # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
         self._lower_stages[:, _Inner.SLACK] = 0.0
         self._h[:, _Inner.SLACK_CURVATURE] = _SLACK_CURVATURE
@@ -327,10 +335,8 @@ class HorizonQp:
             slope: (8,) of V at the target.
             target: (8,) state.
         """
-        r = r + _LEAST_CURVATURE * np.eye(2)
-        self._h0[: _INPUTS * _INPUTS] = r[0].ravel()
+        self._r = r + _LEAST_CURVATURE * np.eye(2)
         self._h[:, _Inner.Q] = q[1:].reshape(-1, 64)
-        self._h[:, _Inner.R] = r[1:].reshape(-1, 4)
         self._h_end[:] = 2 * p.ravel()
         self._beyond = p, slope, target
 
@@ -349,6 +355,9 @@ class HorizonQp:
         if not np.isfinite(self._next).all():
             return False
         self._set_constraints(margin)
+        r = self._r if not self._curvature.any() else self._r + self._curvature[:, None, None] * np.eye(_INPUTS)
+        self._h0[: _INPUTS * _INPUTS] = r[0].ravel()
+        self._h[:, _Inner.R] = r[1:].reshape(-1, 4)
         p, slope, target = self._beyond
         self._g0[:_INPUTS], self._g[:, : _Inner.SLACK] = self._gradient[0, _Inner.A], self._gradient[1:-1]
         self._g_end[:] = slope + 2 * p @ (x[-1] - target)
@@ -360,7 +369,17 @@ class HorizonQp:
         a[1:-1] += self._z[:, _Inner.A]
         x[1:-1] += self._z[:, _Inner.X]
         x[-1] += self._z_end
+        if self._grip.shape[1]:
+            first, inner = self._grip_multipliers
+            cones = np.concatenate([first[None], inner])[:, 1::2]
+            self._curvature = self._cone_curvature * np.maximum(-cones, 0.0).sum(1)
         return True
+
+    def shift(self, steps: int) -> None:
+        """Shifts what the last program says of the friction cone by some intervals."""
+        if self._grip.shape[1]:
+            kept = self._curvature[steps:]
+            self._curvature = np.concatenate([kept, np.zeros(len(self._curvature) - len(kept))])
 
     def _set_constraints(self, margin: float) -> None:
         jacobian = self._jacobian
@@ -445,7 +464,7 @@ class NmpcController:
         self,
         task: Task,
         params: BallbotParams,
-        nodes: int = 40,
+        nodes: int | None = None,
         horizon: float = 1.0,
         iterations: int = 1,
         tolerance: float = 1e-4,
@@ -462,7 +481,8 @@ class NmpcController:
         Args:
             task: the problem.
             params: the robot.
-            nodes: intervals of the horizon, at most one per control step.
+            nodes: intervals of the horizon, at most one per control step; default 40, or one per control step where friction
+                is limited, because forces follow the friction cone from step to step.
             horizon: s, whole control steps.
             iterations: most iterations per step: 1 is the real-time iteration, some 20 converge.
             tolerance: largest change of an input, as a fraction of the force limit, that counts as converged.
@@ -489,7 +509,7 @@ class NmpcController:
         self._rng = np.random.default_rng(seed)
         self._delay = _whole_steps(delay, task.control_dt, "delay")
         steps = _whole_steps(horizon, task.control_dt, "horizon")
-        nodes = min(nodes, steps)
+        nodes = min(nodes or (steps if params.grips else _NODES), steps)
         self._grid = Grid.make(steps, nodes)
         self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
         self._qp = _horizon_qp(task, params, nodes)
@@ -536,6 +556,7 @@ class NmpcController:
         self._step = 0
         nodes = len(self._grid.lengths)
         self._dx, self._da = np.zeros((nodes + 1, 8)), np.zeros((nodes, 2))
+        self._qp.shift(nodes)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         began = time.perf_counter()
@@ -643,6 +664,7 @@ class NmpcController:
         """Shifts the last solution to now. It is stored as its deviation from the plan, which is small and smooth."""
         for _ in range(elapsed - self._step):
             self._dx, self._da = self._shift_states @ self._dx, self._shift_inputs @ self._da
+        self._qp.shift(elapsed - self._step)
         self._step = elapsed
         n, grid = self._length, self._grid
         at = np.minimum(elapsed + grid.offsets, n)
