@@ -397,12 +397,12 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
         )  # fmt: skip
 
     monkeypatch.setattr(certification, "find_optimum", found)
-    entries = list(certification.entries("stabilize", "rolling", 5, range(2)))
+    entries = list(certification.entries("stabilize", range(2), "rolling", 5))
     assert [entry.get("draw") for entry in entries] == [None, 2]
     made = certification.evaluation_set(task, rolling, entries)
     np.testing.assert_array_equal(made.states[1], certification.episode(task, rolling, 1, 2)[0])
     refused.append(certification.episode(task, default_params(), 0)[0])
-    assert "error" in next(certification.entries("stabilize", "paper", 5, [0]))
+    assert "error" in next(certification.entries("stabilize", [0], "paper", 5))
 
 
 def test_a_certified_set_is_of_one_robot(tmp_path):

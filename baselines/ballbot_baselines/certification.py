@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import Optimum, find_optimum
+from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -36,7 +36,7 @@ def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tup
     return task.sample(np.random.default_rng(seed), params)
 
 
-def entries(task_name: str, robot: str, guesses: int, indices: Iterable[int]) -> Iterator[Entry]:
+def entries(task_name: str, indices: Iterable[int], robot: str = PAPER, guesses: int = ALL_GUESSES) -> Iterator[Entry]:
     """Solves episodes of a task with default settings for a robot by name, and yields one entry for each, in order.
 
     An episode without an optimum is drawn again where the robot's friction is limited: there is none where it cannot but
@@ -44,9 +44,9 @@ def entries(task_name: str, robot: str, guesses: int, indices: Iterable[int]) ->
 
     Args:
         task_name: in `TASKS`.
+        indices: of the episodes.
         robot: in `ROBOTS`.
         guesses: see `find_optimum`.
-        indices: of the episodes.
 
     Raises:
         ValueError: no task or robot of that name.
@@ -58,6 +58,11 @@ def entries(task_name: str, robot: str, guesses: int, indices: Iterable[int]) ->
             if "error" not in entry:
                 break
         yield entry
+
+
+def robots_entries(task_name: str, robot: str, guesses: int, indices: Iterable[int]) -> Iterator[Entry]:
+    """`entries` as a job calls it, with the indices last."""
+    return entries(task_name, indices, robot, guesses)
 
 
 def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: int) -> Entry:

@@ -48,7 +48,7 @@ def certify(
     settings = {"tasks": tasks, "episodes": episodes, "robot": robot, "guesses": guesses}
     jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], **settings})
     work = [
-        jobs.Job(f"{task}-{start:04d}", certification.entries, (task, robot, guesses), items, task)
+        jobs.Job(f"{task}-{start:04d}", certification.robots_entries, (task, robot, guesses), items, task)
         for task in tasks
         for start in range(0, episodes, _CHUNK)
         for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
