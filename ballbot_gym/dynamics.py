@@ -178,6 +178,12 @@ def grip_limits(params: BallbotParams, force: tuple[Any, Any, Any], backoff: Any
     return load - LEAST_NORMAL_FORCE, ops.squared(load) - slip
 
 
+def grip_reserve(params: BallbotParams, force: tuple[Any, Any, Any]) -> Any:
+    """The greatest `backoff` of `grip_limits` with which the floor's force (f_x, f_y, N) keeps the cone: (N − |f|/µ)/W."""
+    fx, fy, normal = force
+    return (normal - ops.sqrt(ops.squared(fx, fy)) / params.friction) / params.weight
+
+
 def needed_friction(force: tuple[Any, Any, Any]) -> Any:
     """The coefficient of friction that the floor's force (f_x, f_y, N) needs: |f|/N, and inf where N ≤ 0."""
     fx, fy, normal = force

@@ -52,7 +52,6 @@ _SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than a
 _NODES = 40
 _MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
 _SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
-_GRIP_RESERVE = 0.1  # of the weight, as plans keep
 _GRIP_UNIT = 0.1  # of `dynamics.limits`, that costs as much as a unit of a margin
 _LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
@@ -239,10 +238,13 @@ class HorizonQp:
         self._gradient = np.zeros((n + 1, 10))
         self._margin, self._margin_jacobian = np.zeros((n + 1, m)), np.zeros((n + 1, 8, m))
         self._grip, self._grip_jacobian = np.zeros((n + 1, grips)), np.zeros((n + 1, 10, grips))
+        self.reserve = np.zeros(n + 1)
+        """(nodes + 1,) of normal force, as a fraction of the weight, where the robot's grip is limited."""
+        inputs = [self.x, self.a, self.h, self.c]
         outputs = [self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian]
         self._stage = _InPlace(
             _stage_function(task, params).map(n + 1),
-            [self.x, self.a, self.h, self.c],
+            [*inputs, self.reserve] if grips else inputs,
             [*outputs, self._grip, self._grip_jacobian] if grips else outputs,
         )
 
@@ -557,6 +559,7 @@ class NmpcController:
         nodes = len(self._grid.lengths)
         self._dx, self._da = np.zeros((nodes + 1, 8)), np.zeros((nodes, 2))
         self._qp.shift(nodes)
+        self._reserve = self._reserve_of(plan)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         began = time.perf_counter()
@@ -584,6 +587,15 @@ class NmpcController:
         self._commanded = self._commanded[1:] if self._delay else []
         self._before = measured, acting
         return u
+
+    def _reserve_of(self, plan: Optimum) -> float:
+        """The reserve of grip that the horizon keeps: the back-off, or what the plan keeps if that is less."""
+        if not self._params.grips:
+            return 0.0
+        trajectory = plan.trajectory
+        forces = dynamics.held_contact(self._params, trajectory.x[:-1], trajectory.u, self._task.control_dt)
+        least = min(np.min(dynamics.grip_reserve(self._params, force)) for force in forces)
+        return float(np.clip(least, 0.0, self._backoff.grip))
 
     def _elapsed(self, t: float) -> int:
         return round((t - self._start) / self._task.control_dt)
@@ -712,7 +724,7 @@ class NmpcController:
         qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
         qp.x[0] = x
         qp.distinct, qp.disturbance = self._distinct, self._disturbance
-        qp.h[:-1], qp.c[:] = dt * self._lengths, self._c
+        qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._c, self._reserve
         weight = (dt * self._lengths)[:, None, None]
         end = self._nodes[-1]
         qp.set_weights(
@@ -755,7 +767,10 @@ def _horizon_qp(task: Task, params: BallbotParams, nodes: int) -> HorizonQp:
 
 @lru_cache(maxsize=16)
 def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
-    """(x, a, h, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian."""
+    """(x, a, h, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
+
+    Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
+    """
     x, a, h = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("h")
     c = casadi.SX.sym("c", len(task.constant_names))
     z, u = casadi.vertcat(x, a), params.force_limit * a
@@ -768,10 +783,13 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
         margins,
         casadi.densify(casadi.jacobian(margins, x)),
     ]
+    inputs = [x, a, h, c]
     if params.grips:
-        grip = casadi.vertcat(*dynamics.limits(params, x, u, _GRIP_RESERVE, task.control_dt)) / _GRIP_UNIT
+        reserve = casadi.SX.sym("reserve")
+        inputs.append(reserve)
+        grip = casadi.vertcat(*dynamics.limits(params, x, u, reserve, task.control_dt)) / _GRIP_UNIT
         outputs += [grip, casadi.densify(casadi.jacobian(grip, z))]
-    function = casadi.Function("stage", [x, a, h, c], outputs, {"cse": True})
+    function = casadi.Function("stage", inputs, outputs, {"cse": True})
     return compiled(f"{task.id}-nmpc", (function,))[0]
 
 
