@@ -285,7 +285,8 @@ class HorizonQp:
         self._divide(h, g, a, low, high, z, n, _Matrix(m, grips))
         first, inner, _ = _stages(self._unused[3], 8 + grips, n - 1, 8 + m + grips)
         self._grip_multipliers = first[8:], inner[:, 8 + m :]  # of the last program, ≤ 0
-        self._curvature = np.zeros(n)
+        self.curvature = np.zeros(n)
+        """(nodes,) of the friction cone in the inputs, by the multipliers of the last program; before the first, 0."""
         # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
         self._lower_stages[:, _Inner.SLACK] = 0.0
         self._h[:, _Inner.SLACK_CURVATURE] = _SLACK_CURVATURE
@@ -357,7 +358,7 @@ class HorizonQp:
         if not np.isfinite(self._next).all():
             return False
         self._set_constraints(margin)
-        r = self._r if not self._curvature.any() else self._r + self._curvature[:, None, None] * np.eye(_INPUTS)
+        r = self._r if not self.curvature.any() else self._r + self.curvature[:, None, None] * np.eye(_INPUTS)
         self._h0[: _INPUTS * _INPUTS] = r[0].ravel()
         self._h[:, _Inner.R] = r[1:].reshape(-1, 4)
         p, slope, target = self._beyond
@@ -374,14 +375,8 @@ class HorizonQp:
         if self._grip.shape[1]:
             first, inner = self._grip_multipliers
             cones = np.concatenate([first[None], inner])[:, 1::2]
-            self._curvature = self._cone_curvature * np.maximum(-cones, 0.0).sum(1)
+            self.curvature = self._cone_curvature * np.maximum(-cones, 0.0).sum(1)
         return True
-
-    def shift(self, steps: int) -> None:
-        """Shifts what the last program says of the friction cone by some intervals."""
-        if self._grip.shape[1]:
-            kept = self._curvature[steps:]
-            self._curvature = np.concatenate([kept, np.zeros(len(self._curvature) - len(kept))])
 
     def _set_constraints(self, margin: float) -> None:
         jacobian = self._jacobian
@@ -558,7 +553,7 @@ class NmpcController:
         self._step = 0
         nodes = len(self._grid.lengths)
         self._dx, self._da = np.zeros((nodes + 1, 8)), np.zeros((nodes, 2))
-        self._qp.shift(nodes)
+        self._curvature = np.zeros(nodes)
         self._reserve = self._reserve_of(plan)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -676,7 +671,8 @@ class NmpcController:
         """Shifts the last solution to now. It is stored as its deviation from the plan, which is small and smooth."""
         for _ in range(elapsed - self._step):
             self._dx, self._da = self._shift_states @ self._dx, self._shift_inputs @ self._da
-        self._qp.shift(elapsed - self._step)
+        passed = self._curvature[elapsed - self._step :]
+        self._curvature = np.concatenate([passed, np.zeros(len(self._curvature) - len(passed))])
         self._step = elapsed
         n, grid = self._length, self._grid
         at = np.minimum(elapsed + grid.offsets, n)
@@ -713,6 +709,7 @@ class NmpcController:
             return False
         # A late solution is not used in this step, but the next step starts from it.
         self._dx, self._da = qp.x - self._x_plan, qp.a[:-1] - self._a_plan
+        self._curvature = qp.curvature
         if self._deadline is not None and time.perf_counter() - began > self._deadline:
             counts.late += 1
             return False
@@ -723,7 +720,7 @@ class NmpcController:
         self._guess_x, self._guess_a = self._x_plan + self._dx, self._a_plan + self._da
         qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
         qp.x[0] = x
-        qp.distinct, qp.disturbance = self._distinct, self._disturbance
+        qp.distinct, qp.disturbance, qp.curvature = self._distinct, self._disturbance, self._curvature
         qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._c, self._reserve
         weight = (dt * self._lengths)[:, None, None]
         end = self._nodes[-1]
