@@ -1,6 +1,5 @@
 """`ballbot certify`: the certified evaluation sets anew."""
 
-import os
 from pathlib import Path
 
 from ballbot_baselines import certification
@@ -10,7 +9,9 @@ from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import check_least, check_some, console, progress_bars
+from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
 _MOST_EPISODES = 100_000
@@ -22,7 +23,7 @@ def certify(
     episodes: int = certified.EPISODES,
     install: bool = False,
     out: Path = Path("runs/certify"),
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
 
@@ -31,10 +32,11 @@ def certify(
         episodes: how many, from the first.
         install: puts the finished sets into the package too, in place of those that all evaluation reads.
         out: folder of the .npz files; an interrupted run continues here.
-        workers: processes.
+        workers: who does the work.
     """
     check_some("task", tasks, TASKS)
-    check_least(1, episodes=episodes, workers=workers)
+    check_least(1, episodes=episodes)
+    Workers.of(workers)
     if episodes > _MOST_EPISODES:
         raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}")
     if install and episodes < certified.EPISODES:

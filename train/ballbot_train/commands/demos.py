@@ -1,6 +1,5 @@
 """`ballbot demos`: demonstrations of an expert as a Minari dataset."""
 
-import os
 import shlex
 from pathlib import Path
 
@@ -9,7 +8,9 @@ import numpy as np
 from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, check_names, console, physics_or_default, progress_bar
+from ballbot_train.executors import Workers
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
 
@@ -23,7 +24,7 @@ def demos(
     backoff: Backoff = EXECUTED,
     seed: int = 0,
     out: Path | None = None,
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
 ) -> None:
     """Records episodes of an expert with exploration as a Minari dataset; a killed run continues when started again.
 
@@ -38,7 +39,7 @@ def demos(
             and of the force. Experts that take no back-off ignore it.
         seed: seed of the dataset.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
-        workers: number of processes.
+        workers: who does the work.
     """
     check_names("task", [task], TASKS)
     physics = physics_or_default(physics)

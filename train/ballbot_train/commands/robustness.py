@@ -8,9 +8,11 @@ from ballbot_baselines import VARIANTS
 from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, check_some, console, markdown, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.executors import Workers
 from ballbot_train.provenance import LoadRecord
 from ballbot_train.report import figures
 
@@ -28,7 +30,7 @@ def robustness(
     physics: Physics | None = None,
     seed: int = 0,
     out: Path = Path("runs/robustness"),
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
 ) -> None:
     """Runs the certified episodes under pushes, noise, delay, lag and other robots, and draws success and regret by severity.
 
@@ -41,7 +43,7 @@ def robustness(
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         seed: of pushes, noise and the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
-        workers: processes.
+        workers: who does the work.
     """
     chosen = controllers_of(tasks, controllers)
     if not controllers:

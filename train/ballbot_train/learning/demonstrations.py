@@ -17,6 +17,7 @@ dataset shows recoveries too.
 `load_demos` reads a dataset for learners.
 """
 
+import base64
 import importlib.metadata
 import inspect
 import math
@@ -45,9 +46,11 @@ from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import check_names
+from ballbot_train.executors import Workers
 from ballbot_train.policy import OBSERVATION_VERSION
 
 _CHUNK = 5  # episodes of a job
+_ARRAYS = "npz"  # where an entry holds the arrays of its episode
 _SEEDS = 1_000_000  # episode seeds per dataset seed, so that datasets of different seeds share none
 
 
@@ -253,13 +256,13 @@ def record(
     return recording, info
 
 
-def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callable[[int], None]) -> Path:
+def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progress: Callable[[int], None]) -> Path:
     """Makes a dataset in parallel processes. A killed run continues when it is started again.
 
     Args:
         config: settings of the dataset.
         out: folder of the dataset, named by its id, NAME-vNUMBER. It appears when the dataset is complete.
-        workers: number of processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with the number of episodes that have been added.
 
     Returns:
@@ -277,16 +280,13 @@ def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callab
         shutil.rmtree(unfinished, ignore_errors=True)  # a kill may have left it
         on_progress(config.episodes)
         return out
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
-    jobs.claim(unfinished, described)
+    Workers.of(workers)
+    jobs.claim(unfinished, described | {"arrays": _ARRAYS})  # earlier versions kept them in files of their own
     try:
         chunks = [
             tuple(range(start, min(start + _CHUNK, config.episodes))) for start in range(0, config.episodes, _CHUNK)
         ]
-        work = [
-            jobs.Job(f"{chunk[0]:06d}", _record_episodes, (config, unfinished / "episodes"), chunk) for chunk in chunks
-        ]
+        work = [jobs.Job(f"{chunk[0]:06d}", _record_episodes, (config,), chunk) for chunk in chunks]
         done = jobs.run(work, unfinished, workers, lambda group, count: on_progress(count))
         _assemble(config, [entry for entries in done for entry in entries], unfinished, out)
         jobs.release(unfinished)
@@ -412,8 +412,8 @@ def _metadata(path: Path) -> dict[str, Any]:
     return metadata
 
 
-def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
-    """Writes the arrays of each episode to a file, and yields its metadata."""
+def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
+    """Yields the metadata of each episode, and its arrays as an .npz in base64."""
     env = BallbotEnv(config.task, physics=config.physics)
     expert = Expert(config.expert, env.task, env.params, config.backoff)
     for i in episodes:
@@ -423,7 +423,6 @@ def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) 
         except PlanError as error:
             yield {"seed": config.episode_seed(i), "note": str(error)}  # the expert has no plan from this start
             continue
-        files.write_npz(folder / f"{i:06d}.npz", asdict(recording))
         yield {
             "seed": config.episode_seed(i),
             "expert": config.expert,
@@ -434,6 +433,7 @@ def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) 
             "failure": bool(info["failure"]),
             "plans": expert.plans,
             "plans_failed": expert.plans_failed,
+            _ARRAYS: base64.b64encode(files.npz(asdict(recording))).decode(),
         }
     env.close()
 
@@ -466,7 +466,7 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
             warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
             dataset = minari.create_dataset_from_buffers(
                 dataset_id=out.name,
-                buffer=[_buffer(unfinished / "episodes" / f"{i:06d}.npz", entries[i]["seed"]) for i in made],
+                buffer=[_buffer(entries[i]) for i in made],
                 env=env,
                 algorithm_name=config.expert,
                 description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
@@ -479,17 +479,23 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
         else:
             os.environ["MINARI_DATASETS_PATH"] = before
         env.close()
-    dataset.storage.update_episode_metadata([entries[i] for i in made])
+    dataset.storage.update_episode_metadata([_about(entries[i]) for i in made])
     dataset.storage.update_metadata(
         {"task": repr(task), "observation_version": OBSERVATION_VERSION, "demos": asdict(config)}
     )
     (root / out.name).rename(out)
 
 
-def _buffer(path: Path, seed: int) -> EpisodeBuffer:
-    arrays: dict[str, Any] = dict(files.read_npz(path))  # Minari's annotations say lists
+def _about(entry: jobs.Entry) -> dict[str, Any]:
+    """The metadata of an episode."""
+    return {name: value for name, value in entry.items() if name != _ARRAYS}
+
+
+def _buffer(entry: jobs.Entry) -> EpisodeBuffer:
+    content = base64.b64decode(entry[_ARRAYS])
+    arrays: dict[str, Any] = files.arrays_of(content, "an episode")  # Minari's annotations say lists
     return EpisodeBuffer(
-        seed=seed,
+        seed=entry["seed"],
         observations=arrays["observations"],
         actions=arrays["actions"],
         rewards=arrays["rewards"],
