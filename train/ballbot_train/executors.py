@@ -25,7 +25,6 @@ from typing import Any, Literal, Protocol
 from ballbot_train.console import console
 
 _NODE_SECONDS = 5.0  # how often the nodes of a cluster are counted
-_QUEUED = 2  # tasks given to Ray for every core, so that no core waits for the next one
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
 _INSTALL = 'pip install "ballbot-gym[ray]"'
 
@@ -100,12 +99,13 @@ class Pool(Protocol):
 
 
 @contextmanager
-def open_pool(workers: int | Workers, serial: bool = False) -> Iterator[Pool]:
+def open_pool(workers: int | Workers, serial: bool = False, per_core: int = 2) -> Iterator[Pool]:
     """The pool of some workers. At the end of the block whatever still runs is stopped.
 
     Args:
         workers: a number of processes of this machine, or `Workers`.
         serial: do everything in this process.
+        per_core: tasks in flight for every core of a cluster; with two, no core waits for its next task.
     """
     workers = Workers.of(workers)
     with ExitStack() as stack:
@@ -116,7 +116,7 @@ def open_pool(workers: int | Workers, serial: bool = False) -> Iterator[Pool]:
             stack.callback(pool.close)
             yield pool
         else:
-            yield stack.enter_context(_cluster(workers))
+            yield stack.enter_context(_cluster(workers, per_core))
 
 
 class _Serial:
@@ -233,7 +233,7 @@ def _sendable(error: Exception) -> Exception:
 
 
 @contextmanager
-def _cluster(workers: Workers) -> Iterator[Pool]:
+def _cluster(workers: Workers, per_core: int) -> Iterator[Pool]:
     """A pool of tasks on a Ray cluster. Connects to the cluster, unless this process is connected to one already.
 
     Raises:
@@ -262,7 +262,7 @@ def _cluster(workers: Workers) -> Iterator[Pool]:
                     f"no Ray cluster can be used at {workers.ray} ({error}); `ray start --head` starts one, and --ray local "
                     "starts one for this run alone"
                 ) from error
-        pool = _Ray(ray, workers.workers)
+        pool = _Ray(ray, workers.workers, per_core)
         try:
             yield pool
         finally:
@@ -296,8 +296,8 @@ class _Ray:
     task hears that its worker or node died, and starts what is left.
     """
 
-    def __init__(self, ray: Any, workers: int | None):
-        self._ray, self._workers = ray, workers
+    def __init__(self, ray: Any, workers: int | None, per_core: int):
+        self._ray, self._workers, self._per_core = ray, workers, per_core
         # a name with a module, so that nodes import the function rather than unpickle it
         self._task = ray.remote(num_cpus=1, max_retries=0, num_returns="streaming")(_stream)
         self._running: dict[Any, Hashable] = {}
@@ -306,7 +306,7 @@ class _Ray:
 
     def has_room(self) -> bool:
         self._count_nodes()
-        most = self._workers or max(1, _QUEUED * self._cores)
+        most = self._workers or max(1, self._per_core * self._cores)
         return len(self._running) < most
 
     def start(self, key: Hashable, function: Callable[..., Iterator[Any]], *arguments: Any) -> None:
@@ -361,4 +361,5 @@ class _Ray:
 
 
 def _stream(function: Callable[..., Iterator[Any]], arguments: tuple[Any, ...]) -> Iterator[Any]:
-    yield from function(*arguments)
+    for value in function(*arguments):  # noqa: UP028  # `yield from` hands on what Ray sends, which few iterators take
+        yield value

@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import check_names, console, physics_or_default, print_table, progress_bar
+from ballbot_train.executors import Workers
 from ballbot_train.learning.learners import LEARNERS, check_settings
+from ballbot_train.policy_files import paths_of
 
 _MOST_THREADS = 1024
 
@@ -30,8 +33,8 @@ class Run:
     seeds: str | None = None
     """Several seeds in place of one, as 0:5 (0 to 4) or 0,3,7: a queue of one-core runs, each in a folder in --out. The same
     command continues a queue that was stopped."""
-    workers: int = 1
-    """How many runs of --seeds go on at once, each on one core."""
+    workers: WorkersOption = Workers()
+    """Who does the runs of --seeds, each on one core; by default one after another here, and all cores of a cluster."""
     threads: int | None = None
     """Threads of torch; default, torch's own choice. Another number changes the last digits."""
     out: Path | None = None
@@ -53,7 +56,7 @@ def train(
     resume: bool = False,
     command: str | None = None,
     seeds: str | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
@@ -69,7 +72,7 @@ def train(
         resume: continue the run in this folder, if there is one.
         command: the command that was typed, for the record; default, one with all settings.
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
-        workers: how many runs of `seeds` go on at once.
+        workers: how many runs of `seeds` go on at once, or `Workers`.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
@@ -80,8 +83,9 @@ def train(
         raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
+    workers = Workers.of(workers)
+    if workers.ray is not None and seeds is None:
+        raise ValueError("--ray does the runs of --seeds; a single training runs here")
     if seeds is not None:
         _train_seeds(learner, Run(task, demos, start, threads=threads, out=out), settings, seeds, workers)
         return
@@ -133,7 +137,7 @@ def train(
     )
 
 
-def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int) -> None:
+def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Workers) -> None:
     """Trains on several seeds, and prints what each reached."""
     from ballbot_train.learning import seeds as queue
 
@@ -146,9 +150,10 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int
         return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
 
     expected = {"learner": learner, "task": run.task, "settings": asdict(settings)}
+    inputs = [*([run.demos] if run.demos else []), *(paths_of(run.start) if run.start else [])]
     with progress_bar() as progress:
         bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
-        trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar))
+        trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar), inputs)
     header = ["seed", "", "success", "failures", "mean regret", "minutes"]
     rows = [_row(str(each.seed), vars(each)) for each in trained]
     middle, worst = queue.middle_and_worst(trained)
