@@ -5,7 +5,7 @@
 
 | part | measures |
 |---|---|
-| overhead | time from item to item less that in the item, on one worker: items that sleep 1 ms to 1 s, in jobs of 1 and 10 |
+| overhead | time from item to item less that in the item, on one worker: items that sleep 1 ms to 1 s, in jobs of 1 and 5 |
 | throughput | items a second with 1, 2 and 4 workers: items that compute, and items that sleep |
 | kill | two Ray nodes on this machine, one killed after a quarter of the items: all arrive once, as one process makes them |
 
@@ -39,6 +39,7 @@ from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_
 
 _NODE = {"object_store_memory": 100 * 2**20}
 _LOOPS = 1_000_000  # of a computing item, some tenths of a second
+_WARM_SECONDS = 5.0  # of a first item, in which all workers start
 _PARTS = ("overhead", "throughput", "kill")
 Row = dict[str, Any]
 
@@ -75,22 +76,23 @@ def cluster(*cores: int) -> Iterator[Cluster]:
 def timed(
     function: Callable[..., Any], argument: float, n: int, batch: int, workers: Workers, at_once: int
 ) -> tuple[float, float]:
-    """Mean time from item to item, and in an item, s. The first two jobs per worker, which start the workers, do not count."""
-    warm = 2 * at_once
-    work = [jobs.Job(f"warm-{i}", function, (argument,), (0,), "warm") for i in range(warm)]
+    """Mean time from item to item, and in an item, s, once every worker has done a first item, which does not count."""
+    work = [jobs.Job(f"warm-{i}", sleeping, (_WARM_SECONDS,), (0,), "warm") for i in range(at_once)]
     starts = range(0, n, batch)
     work += [
         jobs.Job(f"{start}", function, (argument,), tuple(range(start, start + batch)), "item") for start in starts
     ]
-    times: list[float] = []
+    times: dict[str, list[float]] = {"warm": [], "item": []}
 
     def on_progress(group: str, count: int) -> None:
-        times.extend([time.perf_counter()] * count)
+        times[group].extend([time.perf_counter()] * count)
 
     with tempfile.TemporaryDirectory() as folder:
         done = jobs.run(work, Path(folder), workers, on_progress)
-    inside = [entry["seconds"] for entries in done[warm:] for entry in entries]
-    return (times[-1] - times[warm]) / (len(times) - warm - 1), float(np.mean(inside))
+    inside = [entry["seconds"] for entries in done[at_once:] for entry in entries]
+    began = times["warm"][-1]
+    counted = [each for each in times["item"] if each > began]
+    return (counted[-1] - began) / len(counted), float(np.mean(inside))
 
 
 def executors(address: str, count: int) -> dict[str, Workers]:
@@ -103,7 +105,7 @@ def overhead() -> list[Row]:
         ray.init(made.address, logging_level="ERROR", log_to_driver=False)
         for seconds in (0.001, 0.01, 0.1, 1.0):
             n = int(np.clip(4 / seconds, 5, 200) // 10 * 10) or 10
-            for batch in (1, 10):
+            for batch in (1, 5):
                 for name, workers in {"serial": Workers(1), **executors(made.address, 1)}.items():
                     if name == "serial":
                         os.environ["BALLBOT_IN_PROCESS"] = "1"

@@ -69,6 +69,10 @@ def unfinished(out: Path) -> Path:
     return out / _FOLDER
 
 
+def _path_of(out: Path, name: str) -> Path:
+    return unfinished(out) / f"{name}.jsonl"
+
+
 def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Mapping[str, Any] | None = None) -> None:
     """Marks a folder as belonging to one configuration, and locks it for this process until `release` or `unlock`.
 
@@ -129,6 +133,11 @@ def release(out: Path, marker: str = MARKER) -> None:
     shutil.rmtree(unfinished(out), ignore_errors=True)
     (out / marker).unlink(missing_ok=True)
     unlock(out)
+
+
+def forget(out: Path, name: str) -> None:
+    """Deletes the entries of a job, which are kept elsewhere now."""
+    _path_of(out, name).unlink(missing_ok=True)
 
 
 def unlock(out: Path) -> None:
@@ -261,7 +270,7 @@ def _begun(jobs: Iterable[Job], out: Path, on_progress: Callable[[str, int], Non
     """Every job with what an earlier run did of it."""
     unfinished(out).mkdir(parents=True, exist_ok=True)
     for number, job in enumerate(jobs):
-        progress = _Progress(number, job, unfinished(out) / f"{job.name}.jsonl")
+        progress = _Progress(number, job, _path_of(out, job.name))
         on_progress(job.group, len(job.items) - len(progress.missing))
         yield progress
 

@@ -1,5 +1,6 @@
 """`ballbot certify`: the certified evaluation sets anew."""
 
+from functools import partial
 from pathlib import Path
 
 from ballbot_baselines import certification
@@ -15,6 +16,7 @@ from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
 _MOST_EPISODES = 100_000
+_MOST_IN_SHARDS = 100_000_000
 _CHUNK = 5  # episodes of a job
 
 
@@ -22,6 +24,7 @@ def certify(
     tasks: tuple[str, ...] = tuple(TASKS),
     episodes: int = certified.EPISODES,
     install: bool = False,
+    shards: str | None = None,
     out: Path = Path("runs/certify"),
     workers: WorkersOption = Workers(),
 ) -> None:
@@ -31,16 +34,26 @@ def certify(
         tasks: names of tasks.
         episodes: how many, from the first.
         install: puts the finished sets into the package too, in place of those that all evaluation reads.
+        shards: URL or folder for a set of shards, SHARDS/TASK, in place of the .npz files; for more episodes than fit into
+            memory. See `ballbot_train.shards`.
         out: folder of the .npz files; an interrupted run continues here.
         workers: who does the work.
     """
     check_some("task", tasks, TASKS)
     check_least(1, episodes=episodes)
     Workers.of(workers)
-    if episodes > _MOST_EPISODES:
-        raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}")
+    most = _MOST_EPISODES if shards is None else _MOST_IN_SHARDS
+    if episodes > most:
+        raise ValueError(
+            f"episodes must be at most {most}, not {episodes}" + (most < _MOST_IN_SHARDS) * "; or give --shards"
+        )
     if install and episodes < certified.EPISODES:
         raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
+    if shards is not None:
+        if install:
+            raise ValueError("the package holds no shards; give --install without --shards")
+        _certify_shards(tasks, episodes, shards, out, workers)
+        return
     facts = provenance()
     jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], "tasks": tasks, "episodes": episodes})
     work = [
@@ -68,3 +81,23 @@ def certify(
         for name, evaluation_set in sets.items():
             task = make_task(name)
             console.print(f"installed: {evaluation_set.save(task, certified.path_of(task))}")
+
+
+def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers) -> None:
+    from ballbot_train.shards import make
+
+    with progress_bars(dict.fromkeys(tasks, episodes)) as bars:
+        for name in tasks:
+            task, params = make_task(name), default_params()
+            made = make(
+                f"{url.rstrip('/')}/{name}",
+                {"certified": task.problem(), "version": provenance()["version"]},
+                episodes,
+                certification.entries,
+                (name,),
+                partial(certification.arrays, task=task, params=params),
+                out / name,
+                workers,
+                partial(bars.advance, name),
+            )
+            console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")

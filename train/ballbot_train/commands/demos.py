@@ -11,7 +11,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, check_names, console, physics_or_default, progress_bar
 from ballbot_train.executors import Workers
-from ballbot_train.learning.demonstrations import DemoConfig, write_demos
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
 
 
 def demos(
@@ -23,6 +23,7 @@ def demos(
     pushes: float = 0.5,
     backoff: Backoff = EXECUTED,
     seed: int = 0,
+    shards: str | None = None,
     out: Path | None = None,
     workers: WorkersOption = Workers(),
 ) -> None:
@@ -38,15 +39,23 @@ def demos(
         backoff: what the expert's plans keep from their limits: margins in their units, shares of the goal's tolerance
             and of the force. Experts that take no back-off ignore it.
         seed: seed of the dataset.
+        shards: URL or folder for a set of shards in place of a Minari dataset, for more episodes than fit into memory; see
+            `ballbot_train.shards`.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
         workers: who does the work.
     """
     check_names("task", [task], TASKS)
     physics = physics_or_default(physics)
     config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed)
+    named = out
     out = Path("runs") / "demos" / f"{task}-{expert}-v0" if out is None else out
     with progress_bar() as progress:
         bar = progress.add_task(f"{task} {expert}", total=episodes)
+        if shards is not None:
+            unfinished = Path("runs") / "demos" / f".{task}-{expert}.shards" if named is None else named
+            made = write_shards(config, shards, unfinished, workers, lambda count: progress.advance(bar, count))
+            console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards", markup=False)
+            return
         folder = write_demos(config, out, workers, lambda count: progress.advance(bar, count))
     import minari
 

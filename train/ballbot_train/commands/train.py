@@ -24,8 +24,8 @@ class Run:
 
     task: str = "stabilize"
     """Name of a task."""
-    demos: Path | None = None
-    """Folder of a demonstration dataset, made by `ballbot demos`."""
+    demos: str | None = None
+    """Folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards."""
     start: Path | None = None
     """Policy file whose weights training starts from; only for shac."""
     seed: int = 0
@@ -47,7 +47,7 @@ def train(
     learner: str,
     /,
     task: str = "stabilize",
-    demos: Path | None = None,
+    demos: str | Path | None = None,
     start: Path | None = None,
     seed: int = 0,
     settings: Any = None,
@@ -63,7 +63,7 @@ def train(
     Args:
         learner: name of a learner in `LEARNERS`.
         task: name of a task.
-        demos: folder of a demonstration dataset, made by `ballbot demos`.
+        demos: folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards.
         start: policy file whose weights training starts from; only for shac.
         seed: seed of everything that is drawn.
         settings: the learner's settings; default, those tuned for the task.
@@ -87,7 +87,7 @@ def train(
     if workers.ray is not None and seeds is None:
         raise ValueError("--ray does the runs of --seeds; a single training runs here")
     if seeds is not None:
-        _train_seeds(learner, Run(task, demos, start, threads=threads, out=out), settings, seeds, workers)
+        _train_seeds(learner, Run(task, _text(demos), start, threads=threads, out=out), settings, seeds, workers)
         return
 
     import torch
@@ -106,7 +106,7 @@ def train(
     check_settings(settings)
     out = Path("runs") / "train" / f"{task}-{learner}" if out is None else out
     if command is None:
-        command = command_with(learner, Run(task, demos, start, seed, threads=threads, out=out), settings)
+        command = command_with(learner, Run(task, _text(demos), start, seed, threads=threads, out=out), settings)
     # the record also says how the demonstrations, or the policy to start from, were made
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
@@ -150,7 +150,10 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Wor
         return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
 
     expected = {"learner": learner, "task": run.task, "settings": asdict(settings)}
-    inputs = [*([run.demos] if run.demos else []), *(paths_of(run.start) if run.start else [])]
+    inputs = [
+        *([Path(run.demos)] if run.demos and "://" not in run.demos else []),
+        *(paths_of(run.start) if run.start else []),
+    ]
     with progress_bar() as progress:
         bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
         trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar), inputs)
@@ -161,6 +164,10 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Wor
         f"{learner} on {run.task}, certified episodes", header, [*rows, _row("median", middle), _row("worst", worst)]
     )
     console.print(f"learning curves: ballbot curves {shlex.quote(str(out))}")
+
+
+def _text(path: str | Path | None) -> str | None:
+    return None if path is None else str(path)
 
 
 def _row(name: str, values: Mapping[str, Any]) -> list[str]:

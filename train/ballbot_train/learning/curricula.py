@@ -143,7 +143,7 @@ class CurriculumBatch(BallbotBatch):
         params: BallbotParams,
         curriculum: Curriculum,
         gamma: float,
-        demos: Path | None = None,
+        demos: str | Path | None = None,
         full: Task | None = None,
         pay: bool = True,
         failure_price: float = 0.0,
