@@ -181,7 +181,7 @@ def make(
         episodes: how many, from number 0.
         function: called as function(*arguments, numbers); yields an entry for every episode, see `jobs.Job`.
         arguments: of the function.
-        arrays_of: the arrays of some episodes by name, or none. Those of consecutive episodes are joined along their first axis.
+        arrays_of: the arrays of some episodes by name, or none. They are joined along their first axis.
         out: folder of this machine for what is unfinished, by which a killed run continues.
         workers: a number of processes, or `Workers`.
         on_progress: called with a number of episodes that are there.

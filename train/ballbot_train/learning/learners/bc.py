@@ -41,8 +41,9 @@ TUNED: dict[str, BcConfig] = {"weave": BcConfig(hidden=(256, 256))}
 
 
 class BehaviourCloning:
-    """The learner; see `training.Learner`. Of demonstrations in shards, an iteration reads one shard. An iteration's random numbers depend on seed and iteration alone."""
+    """The learner; see `training.Learner`. An iteration's random numbers depend on seed and iteration alone."""
 
+    # an iteration reads one shard of demonstrations that are shards
     def __init__(
         self, task: Task, params: BallbotParams, config: BcConfig, seed: int, samples: "Samples | StreamedDemos"
     ):
