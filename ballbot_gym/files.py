@@ -135,10 +135,10 @@ def write(path: str | Path, content: bytes | str) -> Path:
     return path
 
 
-def npz(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Arrays as a compressed .npz, the same bytes for the same arrays."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]  # no array is called allow_pickle
+def npz(arrays: Mapping[str, np.ndarray], compressed: bool = True) -> bytes:
+    """Arrays as an .npz, the same bytes for the same arrays."""
+    buffer, save = io.BytesIO(), np.savez_compressed if compressed else np.savez
+    save(buffer, **arrays)  # pyright: ignore[reportArgumentType]  # no array is called allow_pickle
     return buffer.getvalue()
 
 

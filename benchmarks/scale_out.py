@@ -7,6 +7,7 @@
 |---|---|
 | overhead | time from item to item less that in the item, on one worker: items that sleep 1 ms to 1 s, in jobs of 1 and 5 |
 | throughput | items a second with 1, 2 and 4 workers: items that compute, and items that sleep |
+| driver | CPU time of this process per item, and the items a second that it takes: entries of 40 kB, as of an optimum |
 | kill | two Ray nodes on this machine, one killed after a quarter of the items: all arrive once, as one process makes them |
 
 Items that sleep measure the executor alone, also on a machine with few cores or much else to do.
@@ -40,7 +41,7 @@ from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_
 _NODE = {"object_store_memory": 100 * 2**20}
 _LOOPS = 1_000_000  # of a computing item, some tenths of a second
 _WARM_SECONDS = 5.0  # of a first item, in which all workers start
-_PARTS = ("overhead", "throughput", "kill")
+_PARTS = ("overhead", "throughput", "driver", "kill")
 Row = dict[str, Any]
 
 
@@ -146,6 +147,31 @@ def throughput() -> list[Row]:
     return rows
 
 
+def heavy(kilobytes: int, items: Sequence[int]) -> Iterator[jobs.Entry]:
+    for _ in items:
+        yield {"seconds": 0.0, "text": "x" * 1000 * kilobytes}
+
+
+def driver() -> list[Row]:
+    rows = []
+    with cluster(1, 1) as made:
+        ray.init(made.address, logging_level="ERROR", log_to_driver=False)
+        for name, workers in executors(made.address, 2).items():
+            began, spent = time.perf_counter(), time.process_time()
+            period, _ = timed(heavy, 40, 1000, 5, workers, 2)
+            spent, total = time.process_time() - spent, time.perf_counter() - began
+            rows.append(
+                {
+                    "executor": name,
+                    "items_per_second": round(1 / period),
+                    "driver_cpu_ms_per_item": round(1e3 * spent / 1002, 2),
+                    "seconds": round(total, 1),
+                }
+            )
+            print(rows[-1], flush=True)
+    return rows
+
+
 def certified_set(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
     certify(("stabilize",), episodes, out=out, workers=workers)
     return files.read_npz(out / "BallbotStabilize-v0.npz")
@@ -154,12 +180,15 @@ def certified_set(out: Path, workers: Workers, episodes: int) -> dict[str, np.nd
 def leaderboard(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
     controllers = {task: ["lqr"] for task in ("stabilize", "turn")}
     done = benchmark(controllers, episodes // 2, "rk4", out, workers, lambda task, count: None)
-    return {name: np.array([getattr(row, name) for row in done]) for name in ("cost", "regret", "success", "failed")}
+    return {
+        name: np.array([getattr(row, name) for row in done])
+        for name in ("cost", "optimum", "success", "failure", "settle_time")
+    }
 
 
 def dataset(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
-    config = DemoConfig("turn", "lqr", episodes=episodes, physics="rk4")
-    return vars(load_demos(write_demos(config, out / "demos-v0", workers, lambda count: None), make_task("turn")))
+    config = DemoConfig("stabilize", "lqr", episodes=episodes, physics="rk4")
+    return vars(load_demos(write_demos(config, out / "demos-v0", workers, lambda count: None), make_task("stabilize")))
 
 
 def kill(episodes: int) -> list[Row]:
@@ -217,14 +246,14 @@ def _with_a_kill(
 
 
 def main(out: Path = Path("runs/scale_out"), parts: tuple[str, ...] = _PARTS, episodes: int = 400) -> None:
-    """Measures, and writes overhead.csv, throughput.csv and kill.csv.
+    """Measures, and writes a CSV file for each part.
 
     Args:
         out: folder of the results.
         parts: what to measure.
         episodes: of the part that kills a node; an even number.
     """
-    measures = {"overhead": overhead, "throughput": throughput, "kill": lambda: kill(episodes)}
+    measures = {"overhead": overhead, "throughput": throughput, "driver": driver, "kill": lambda: kill(episodes)}
     for part in parts:
         files.write_csv(out / f"{part}.csv", measures[part]())
     print(f"written to {out}")

@@ -62,7 +62,7 @@ def test_a_killed_run_goes_on_and_writes_no_shard_twice(tmp_path):
 
     def killed(count):
         counted.append(count)
-        if sum(counted) == 11:
+        if sum(counted) >= 11:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -51,7 +51,7 @@ class Workers:
             raise ValueError(f"workers must be at least 1, not {workers.workers}")
         if workers.ray is not None and workers.ray.startswith("ray://"):
             raise ValueError(
-                f"{workers.ray} is the address of a Ray client, through which results cannot stream; run the command on a "
+                f"{workers.ray} is the address of a Ray client, which is not supported; run the command on a "
                 "node of the cluster with --ray auto, for example by `ray job submit`"
             )
         return workers
@@ -165,6 +165,7 @@ class _Processes:
             process = self._context.Process(target=_serve, args=(theirs,))
             process.start()
             theirs.close()  # so that the pipe ends with the process
+        assert isinstance(ours, Connection)
         self._busy[ours] = key, process
         try:
             ours.send((function, arguments))
@@ -182,8 +183,8 @@ class _Processes:
                 kind, value = "worker died", None
                 process.join()
             if kind == "raised":
-                error, text = value
-                raise error from WorkerError(f"in a worker:\n{text}")
+                assert value is not None
+                raise value[0] from WorkerError(f"in a worker:\n{value[1]}")
             if kind != "yielded":
                 del self._busy[ours]
                 if kind == "ended":
@@ -241,7 +242,7 @@ def _cluster(workers: Workers, per_core: int) -> Iterator[Pool]:
         WorkerError: there is no cluster at the address.
     """
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"--ray needs ray, which is not installed: {_INSTALL}", name="ray") from error
     connected = ray.is_initialized()

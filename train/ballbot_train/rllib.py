@@ -15,8 +15,8 @@ from ballbot_gym.tasks import TASKS
 try:
     import gymnasium
     import torch
-    from ray.rllib.core.columns import Columns
-    from ray.tune.registry import register_env
+    from ray.rllib.core.columns import Columns  # pyright: ignore[reportMissingImports]
+    from ray.tune.registry import register_env  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise ImportError(f'{error}; pip install "ballbot-gym[rllib]" installs what ballbot_train.rllib needs') from error
 

@@ -11,6 +11,7 @@ The manifest names a shard after its file is there. So whoever reads the manifes
 killed makes those that it does not name. A reader holds one shard in memory, and checks its digest.
 """
 
+import base64
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,7 +35,8 @@ EPISODES = 500
 """Episodes of a shard."""
 
 MANIFEST = "manifest.json"
-_CHUNK = 5  # episodes of a job
+_CHUNK = 5  # episodes of a job, and of its only item: workers send arrays, so that little is left to do here
+_ARRAYS = "npz"
 _LIMIT = 2**32  # bytes of a shard, unpacked
 _VERSION = 1
 
@@ -129,7 +131,7 @@ class Shards:
 
     def write(self, number: int, arrays: Arrays, episodes: int) -> None:
         """Adds a shard."""
-        content = files.npz(arrays)
+        content = files.npz(arrays, compressed=False)  # trajectories hardly shrink, and one process writes all shards
         self._write(_name(number), content)
         digest = hashlib.sha256(content).hexdigest()
         self._shards[number] = {
@@ -179,9 +181,9 @@ def make(
         url: of the set.
         about: what decides the episodes besides their numbers; anything that JSON holds.
         episodes: how many, from number 0.
-        function: called as function(*arguments, numbers); yields an entry for every episode, see `jobs.Job`.
+        function: called as function(*arguments, numbers) on a worker; yields an entry for every episode.
         arguments: of the function.
-        arrays_of: the arrays of some episodes by name, or none. They are joined along their first axis.
+        arrays_of: gives the arrays of some episodes by name, or none, on the worker. They are joined along their first axis.
         out: folder of this machine for what is unfinished, by which a killed run continues.
         workers: a number of processes, or `Workers`.
         on_progress: called with a number of episodes that are there.
@@ -215,12 +217,14 @@ def make(
             for part in ranges(shard):
                 where[number] = shard, part.start
                 number += 1
-                yield jobs.Job(_job_name(part.start), function, arguments, tuple(part))
+                item = part.start, part.stop
+                yield jobs.Job(_job_name(part.start), _made, (function, arguments, arrays_of), (item,))
 
-    for number, entries in jobs.stream(work(), out, workers, lambda group, count: on_progress(count)):
+    for number, (entry,) in jobs.stream(work(), out, workers, lambda group, count: None):
         shard, start = where.pop(number)
-        parts.setdefault(shard, {})[start] = arrays_of(entries)
+        parts.setdefault(shard, {})[start] = files.arrays_of(base64.b64decode(entry[_ARRAYS]), "what a worker sent")
         wanted = ranges(shard)
+        on_progress(next(len(part) for part in wanted if part.start == start))
         if len(parts[shard]) == len(wanted):
             made = parts.pop(shard)
             in_order = [made[part.start] for part in wanted if made[part.start]]
@@ -231,6 +235,18 @@ def make(
                 jobs.forget(out, _job_name(part.start))
     jobs.release(out)
     return shards
+
+
+def _made(
+    function: Callable[..., Iterator[jobs.Entry]],
+    arguments: tuple[Any, ...],
+    arrays_of: Callable[[Sequence[jobs.Entry]], Arrays],
+    items: Sequence[tuple[int, int]],
+) -> Iterator[jobs.Entry]:
+    """The arrays of some ranges of episodes, on a worker."""
+    for start, stop in items:
+        arrays = arrays_of(list(function(*arguments, range(start, stop))))
+        yield {_ARRAYS: base64.b64encode(files.npz(arrays, compressed=False)).decode()}
 
 
 def _job_name(start: int) -> str:

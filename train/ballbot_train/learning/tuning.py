@@ -289,7 +289,7 @@ def _end(study: "optuna.Study", trial: "optuna.Trial", outcome: Outcome | str, m
     study.tell(trial, float(np.mean(outcome.costs)))
 
 
-def _attempt(search: Search, settings: Any) -> Iterator[float | tuple[Outcome | str, float]]:
+def _attempt(search: Search, settings: Any) -> Iterator[float | tuple[Any, float]]:
     """A trial, on a worker: as `outcome_of`, with the CPU time of it all, min. A failure is given in words."""
     began = time.process_time()
     try:
