@@ -61,8 +61,8 @@ def results(out, workers):
 
 
 def demonstrations(out, workers):
-    config = DemoConfig("turn", "lqr", episodes=16, physics="rk4")
-    return vars(load_demos(write_demos(config, out / "demos-v0", workers, lambda count: None), make_task("turn")))
+    config = DemoConfig("stabilize", "lqr", episodes=16, physics="rk4")
+    return vars(load_demos(write_demos(config, out / "demos-v0", workers, lambda count: None), make_task("stabilize")))
 
 
 @pytest.mark.parametrize(
