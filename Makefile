@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TRIALS := benchmarks/soak.py benchmarks/faults.py benchmarks/fuzz.py
 
-.PHONY: demo test test-slow bench soak faults fuzz docs certify clients clean
+.PHONY: demo test test-slow bench soak faults fuzz docs certify clients ray clean
 
 demo: $(VENV)/installed
 	$(BIN)/ballbot benchmark --episodes 25 --out runs/demo
@@ -50,6 +50,11 @@ clients: $(VENV)/installed
 	.venv-clients/bin/pip install -c .venv-clients/constraints.txt "torch==2.13.0"
 	.venv-clients/bin/pip install -c .venv-clients/constraints.txt -e ".[all]" pytest $(patsubst %,"%",$(CLIENTS))
 	.venv-clients/bin/python -m pytest -rs tests/test_clients.py
+
+# Ray clusters of two nodes on this machine, with nodes that are killed
+ray: $(VENV)/installed
+	$(BIN)/pip install -c constraints.txt -e ".[ray,tune]"
+	$(BIN)/pytest tests/test_ray.py
 
 # the optima that the package ships, computed anew
 certify: $(VENV)/installed

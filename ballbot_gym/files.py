@@ -78,7 +78,11 @@ def read_npz(path: str | Path, limit: int = READ_LIMIT) -> dict[str, np.ndarray]
     Raises:
         FileError: as `read`; or it is no .npz file, is damaged or encrypted, or its arrays are larger than `limit`.
     """
-    content = read(path, limit)
+    return arrays_of(read(path, limit), path, limit)
+
+
+def arrays_of(content: bytes, path: str | Path, limit: int = READ_LIMIT) -> dict[str, np.ndarray]:
+    """As `read_npz`, of content that was read already; errors name the path."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = archive.infolist()
@@ -131,11 +135,16 @@ def write(path: str | Path, content: bytes | str) -> Path:
     return path
 
 
+def npz(arrays: Mapping[str, np.ndarray], compressed: bool = True) -> bytes:
+    """Arrays as an .npz, the same bytes for the same arrays."""
+    buffer, save = io.BytesIO(), np.savez_compressed if compressed else np.savez
+    save(buffer, **arrays)  # pyright: ignore[reportArgumentType]  # no array is called allow_pickle
+    return buffer.getvalue()
+
+
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
     """Writes arrays as a compressed .npz, the same bytes for the same arrays."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]  # no array is called allow_pickle
-    return write(path, buffer.getvalue())
+    return write(path, npz(arrays))
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> Path:

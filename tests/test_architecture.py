@@ -178,7 +178,7 @@ def test_no_file_names_a_place_on_the_developers_machine():
 def test_urdf_travels_with_the_package():
     assert URDF_PATH.is_file()
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert wheel["force-include"] == {"urdf/ballbot.urdf": "ballbot_gym/urdf/ballbot.urdf"}
+    assert wheel["force-include"] == {"urdf": "ballbot_gym/urdf"}
 
 
 def test_the_cubic_hermite_basis_and_the_angle_of_tilt_each_have_one_place():

@@ -1,6 +1,7 @@
 import csv
 import json
 import math
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,10 +15,12 @@ from builders import result
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import default_params
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import FunctionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import benchmark, evaluate
+from ballbot_train.evaluation.controllers import make_controller, make_packed, packed
 from ballbot_train.evaluation.results import leaderboard, read_results, summarize, write_leaderboard
 from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy, shipped_policies
 
@@ -286,3 +289,20 @@ def test_the_short_paths_are_the_same_functions():
     assert set(ballbot_train.__all__) <= set(dir(ballbot_train))
     with pytest.raises(AttributeError, match="no attribute 'evaluat'"):
         ballbot_train.evaluat  # noqa: B018
+
+
+def test_the_files_of_a_policy_are_all_that_a_worker_needs(tmp_path):
+    source = shipped_policies(make_task("turn"))["dagger"]
+    for ending in (".json", ".safetensors"):
+        shutil.copy(source.with_suffix(ending), tmp_path / f"mine{ending}")
+    path, task, params = str(tmp_path / "mine.json"), make_task("turn"), default_params()
+    files = packed(path)
+    expected = make_controller(path, task, params)
+    for each in tmp_path.iterdir():
+        each.unlink()
+    controller = make_packed(path, files, task, params)
+    x, c = np.zeros(8), np.array([3.0])
+    for made in (expected, controller):
+        made.reset(0.0, x, c)
+    assert np.array_equal(controller.act(0.0, x), expected.act(0.0, x))
+    assert packed("lqr") == packed("dagger") == {}

@@ -29,6 +29,12 @@ def run(code, *blocked):
         ("from ballbot_train import load_policy", "safetensors", "train"),
         ("from ballbot_train.cli import main", "rich", "train"),
         ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
+        (
+            "from ballbot_train.executors import Workers, open_pool; open_pool(Workers(ray='local')).__enter__()",
+            "ray",
+            "ray",
+        ),
+        ("import ballbot_train.rllib", "ray", "rllib"),
         ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
     ],
 )

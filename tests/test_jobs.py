@@ -268,3 +268,32 @@ def test_provenance_says_none_for_what_is_not_installed(monkeypatch):
     assert facts["numpy"] == np.__version__
     assert facts["no-such-package"] == "none"
     assert list(facts)[:3] == ["version", "commit", "python"]
+
+
+def test_jobs_are_taken_only_when_there_is_room_for_them(tmp_path):
+    taken = []
+
+    def many():
+        for i in range(50):
+            taken.append(i)
+            yield job(squares, tmp_path / "log", [i], f"job{i}")
+
+    for done, (number, entries) in enumerate(jobs.stream(many(), tmp_path, 1, ignore)):
+        assert entries == [{"square": number**2}]
+        assert len(taken) <= done + 2
+    assert len(taken) == 50
+
+
+def unpicklable(items):
+    yield {"item": 0}
+    raise Unpicklable(lambda: None)
+
+
+class Unpicklable(ValueError):
+    pass
+
+
+def test_an_error_of_a_worker_is_the_error_of_the_run_whatever_it_holds(tmp_path, monkeypatch):
+    monkeypatch.delenv("BALLBOT_IN_PROCESS")
+    with pytest.raises(RuntimeError, match="Unpicklable"):
+        jobs.run([jobs.Job("job", unpicklable, (), (0, 1))], tmp_path, 1, ignore)

@@ -144,14 +144,7 @@ def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, c
     assert (tmp_path / "ppo.yml").exists()
 
 
-def test_real_trainings_have_an_outcome_per_seed(monkeypatch):
-    class Trial:
-        def report(self, value, step):
-            pass
-
-        def should_prune(self):
-            return False
-
+def test_real_trainings_have_an_outcome_per_seed():
     tiny = {
         "num_envs": 4,
         "num_steps": 4,
@@ -161,6 +154,7 @@ def test_real_trainings_have_an_outcome_per_seed(monkeypatch):
         "update_epochs": 1,
     }
     search = Search("rsl_ppo", "stabilize", (0, 1), 32, 1)
-    outcome = tuning.outcome_of(search, settings_of(search, tiny), Trial())
+    cost, outcome = tuning.outcome_of(search, settings_of(search, tiny))
+    assert isinstance(cost, float)
     assert isinstance(outcome, Outcome)
     assert len(set(outcome.costs)) == 2

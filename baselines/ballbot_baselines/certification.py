@@ -108,6 +108,40 @@ def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) 
     )
 
 
+def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[str, np.ndarray]:
+    """The optima of any episodes as arrays, for sets too large for an `EvaluationSet`.
+
+    | array | shape | holds |
+    |---|---|---|
+    | episodes | (n,) | numbers of the episodes with an optimum |
+    | states, constants | (n, 8), (n, nc) | of their starts |
+    | costs, violations, statuses | (n,) | as in `EvaluationSet` |
+    | lengths | (n,) | control steps of the optimal trajectories |
+    | x, u | (Σ lengths + n, 8), (Σ lengths, 2) | the trajectories, one after another |
+    | failed, errors | (m,) | episodes without an optimum, and why |
+    """
+    found = [entry for entry in entries if "error" not in entry]
+    failed = [entry for entry in entries if "error" in entry]
+    starts = [episode(task, params, entry["episode"]) for entry in found]
+
+    def joined(name: str, width: int) -> np.ndarray:
+        return np.concatenate([np.zeros((0, width)), *(np.reshape(entry[name], (-1, width)) for entry in found)])
+
+    return {
+        "episodes": np.array([entry["episode"] for entry in found], np.int64),
+        "states": np.array([x for x, _ in starts], float).reshape(-1, 8),
+        "constants": np.array([c for _, c in starts], float).reshape(len(found), len(task.constant_names)),
+        "costs": np.array([entry["cost"] for entry in found], float),
+        "violations": np.array([entry["violation"] for entry in found], float),
+        "statuses": np.array([f"{entry['solver']}: {entry['status']}" for entry in found], str),
+        "lengths": np.array([len(entry["u"]) for entry in found], np.int64),
+        "x": joined("x", 8),
+        "u": joined("u", 2),
+        "failed": np.array([entry["episode"] for entry in failed], np.int64),
+        "errors": np.array([entry["error"] for entry in failed], str),
+    }
+
+
 def _entry(index: int, optimum: Optimum) -> Entry:
     trajectory = optimum.trajectory
     return {

@@ -17,11 +17,14 @@ try:
         BarColumn,
         MofNCompleteColumn,
         Progress,
+        ProgressColumn,
+        Task,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
     from rich.table import Table
+    from rich.text import Text
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
@@ -38,6 +41,18 @@ console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoj
 
 LINE_SECONDS = 10.0
 """How often progress is printed into a file or a pipe."""
+
+
+class _SpeedColumn(ProgressColumn):
+    """Steps per second of late."""
+
+    def render(self, task: Task) -> Text:
+        return Text(_speed(task), style="progress.data.speed")
+
+
+def _speed(task: Task) -> str:
+    """Steps per second, empty before there are any."""
+    return f"{task.speed:.3g}/s" if task.speed else ""
 
 
 class LineProgress(Progress):
@@ -63,7 +78,10 @@ class LineProgress(Progress):
             for task in self.tasks:
                 if not task.finished:
                     elapsed = timedelta(seconds=int(task.elapsed or 0))
-                    self.console.print(f"{elapsed} {task.description}: {task.completed:.0f} of {task.total or 0:.0f}")
+                    speed = f", {_speed(task)}" if task.speed else ""
+                    self.console.print(
+                        f"{elapsed} {task.description}: {task.completed:.0f} of {task.total or 0:.0f}{speed}"
+                    )
 
 
 def physics_or_default(physics: Physics | None) -> Physics:
@@ -84,6 +102,7 @@ def progress_bar() -> Progress:
         TextColumn("{task.description:>10}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
+        _SpeedColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )

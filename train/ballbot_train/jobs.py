@@ -1,24 +1,24 @@
-"""Work that outlives an interruption: jobs in parallel processes, whose finished items are kept as they come.
+"""Work that outlives an interruption: jobs on parallel workers, whose finished items are kept as they come.
 
-Each job is one file of JSON lines. Its process adds a line for every finished item. A run that is killed at any moment and
-started again therefore does only the items that no line holds. A folder belongs to one configuration until it is released,
-and to one process at a time.
+Each job is one file of JSON lines, with a line for every finished item. Workers compute and this process writes, so workers
+may be on other machines; `executors` says where. A run that is killed at any moment and started again therefore does only the
+items that no line holds. A folder belongs to one configuration until it is released, and to one process at a time.
 """
 
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from multiprocessing import active_children, get_context, parent_process
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
+from ballbot_train.executors import Pool, WorkerError, Workers, open_pool
 
 try:
     import filelock
@@ -34,20 +34,17 @@ MARKER = "unfinished.json"
 _FOLDER = "unfinished"
 _LOCK = ".lock"
 _held: dict[Path, filelock.BaseFileLock] = {}
-
-
-class WorkerError(RuntimeError):
-    """Worker processes died, and died again when their items were tried once more."""
+_WORKER_DEATHS, _NODE_DEATHS = 2, 5  # of one item, after which it is not tried again
 
 
 @dataclass(frozen=True)
 class Job:
-    """Items that one process does one after another."""
+    """Items that one worker does one after another. Small items belong into one job, because starting a job takes time."""
 
     name: str
     """Of its file; different for every job of a run."""
     function: Callable[..., Iterator[Entry]]
-    """Called as function(*arguments, items), in another process: a function of a module. Yields one entry per item."""
+    """Called as function(*arguments, items), perhaps elsewhere: a function of a module. Yields one entry per item."""
     arguments: tuple[Any, ...]
     items: tuple[Any, ...]
     """Done in this order; each is what JSON holds."""
@@ -70,6 +67,10 @@ def make_folder(out: Path) -> None:
 def unfinished(out: Path) -> Path:
     """The folder within a run's folder that only serves to continue the run; `release` deletes it."""
     return out / _FOLDER
+
+
+def _path_of(out: Path, name: str) -> Path:
+    return unfinished(out) / f"{name}.jsonl"
 
 
 def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Mapping[str, Any] | None = None) -> None:
@@ -134,6 +135,11 @@ def release(out: Path, marker: str = MARKER) -> None:
     unlock(out)
 
 
+def forget(out: Path, name: str) -> None:
+    """Deletes the entries of a job, which are kept elsewhere now."""
+    _path_of(out, name).unlink(missing_ok=True)
+
+
 def unlock(out: Path) -> None:
     """Lets other processes use a folder; its configuration stays. Without effect where this process holds no lock."""
     lock = _held.pop(out.resolve(), None)
@@ -175,138 +181,151 @@ def _locked(out: Path) -> Iterator[None]:
         unlock(out)
 
 
-def run(jobs: Sequence[Job], out: Path, workers: int, on_progress: Callable[[str, int], None]) -> list[list[Entry]]:
-    """Does what is not done yet.
-
-    An item whose process dies is tried once more. If that process dies too, the item is left out, all others are done,
-    and a WorkerError says which are missing.
-
-    Args:
-        jobs: what there is to do.
-        out: folder of the results; unfinished ones are in a folder within.
-        workers: processes. The calling process does no item itself, so that it outlives any of them; but with 1 worker and
-            $BALLBOT_IN_PROCESS set, it does them all, for debuggers and tests.
-        on_progress: called with a job's group and a number of its items that are there.
+def run(
+    jobs: Sequence[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]
+) -> list[list[Entry]]:
+    """Does what is not done yet, as `stream` does.
 
     Returns:
         The entries of each job, in the order of its items; every item has one.
+    """
+    done = dict(stream(jobs, out, workers, on_progress))
+    return [done[i] for i in range(len(jobs))]
+
+
+def stream(
+    jobs: Iterable[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]
+) -> Iterator[tuple[int, list[Entry]]]:
+    """Does what is not done yet, and gives each job when it is done.
+
+    The calling process writes every entry when it comes, whoever computed it. An item whose process dies is tried once
+    more. If that process dies too, the item is left out, all others are done, and a WorkerError says which are missing. An
+    item whose node dies is tried on others, five times at most.
+
+    Args:
+        jobs: what there is to do. They are taken when workers have room for them.
+        out: folder of the results; unfinished ones are in a folder within.
+        workers: a number of processes, or `Workers`. The calling process does no item itself, so that it outlives any of
+            them; but with 1 process and $BALLBOT_IN_PROCESS set, it does them all, for debuggers and tests.
+        on_progress: called with a job's group and a number of its items that are there.
+
+    Yields:
+        The number of a job that is done, and its entries in the order of its items.
 
     Raises:
         WorkerError: processes died, so that items are missing.
         ValueError: another process is using the folder, or there are no workers.
     """
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
-    paths = [unfinished(out) / f"{job.name}.jsonl" for job in jobs]
-    with _locked(out):
-        done = [_read(path, len(job.items)) for path, job in zip(paths, jobs, strict=True)]
-        for job, entries in zip(jobs, done, strict=True):
-            on_progress(job.group, len(entries))
-        missing = [i for i, job in enumerate(jobs) if len(done[i]) < len(job.items)]
-        if workers == 1 and os.environ.get("BALLBOT_IN_PROCESS"):
-            for i in missing:
-                on_progress(jobs[i].group, _work(jobs[i], paths[i]))
-        elif missing:
-            work = [(jobs[i], paths[i]) for i in missing]
-            lost = _in_processes(work, min(workers, len(missing)), on_progress)
-            if lost:
-                raise WorkerError(
-                    f"worker processes died, most likely out of memory, at {'; '.join(lost)}. Everything else is kept: the "
-                    "same command does only what is missing, with fewer --workers each has more memory"
-                )
-        return [_complete(job, path) for job, path in zip(jobs, paths, strict=True)]
+    workers = Workers.of(workers)
+    serial = workers.here == 1 and bool(os.environ.get("BALLBOT_IN_PROCESS"))
+    waiting = _begun(jobs, out, on_progress)
+    again = deque[_Progress]()
+    running: dict[Hashable, _Progress] = {}
+    lost: list[str] = []
 
+    def ended(progress: _Progress) -> Iterator[tuple[int, list[Entry]]]:
+        if progress.lost:
+            lost.extend(f"{progress.job.name}, item {progress.job.items[i]}" for i in sorted(progress.lost))
+        else:
+            yield progress.number, progress.entries()
 
-def _complete(job: Job, path: Path) -> list[Entry]:
-    entries = _read(path, len(job.items))
-    if len(entries) < len(job.items):
-        raise ValueError(
-            f"{path} holds {len(entries)} of {len(job.items)} items though the run has ended; run the command again"
+    with _locked(out), ExitStack() as stack:
+        pool: Pool | None = None  # a cluster takes seconds to start, and there may be nothing to do
+        while True:
+            while pool is None or pool.has_room():
+                progress = next(waiting, None) or (again.popleft() if again else None)
+                if progress is None:
+                    break
+                if not progress.missing:
+                    yield from ended(progress)
+                    continue
+                pool = pool or stack.enter_context(open_pool(workers, serial))
+                pool.start(progress.number, _texts, progress.job, progress.missing)
+                running[progress.number] = progress
+            if pool is None or not running:
+                break
+            for event in pool.events():
+                progress = running[event.key]
+                if event.kind == "yielded":
+                    progress.write(*event.value)
+                    on_progress(progress.job.group, 1)
+                    continue
+                del running[event.key]
+                if event.kind == "ended":
+                    yield from ended(progress)
+                elif event.kind == "node died":
+                    progress.note_death(_NODE_DEATHS)
+                    waiting = chain([progress], waiting)
+                else:
+                    progress.note_death(_WORKER_DEATHS)
+                    again.append(progress)  # last in turn, when other processes may have left memory
+    if lost:
+        raise WorkerError(
+            f"worker processes died, most likely out of memory, at {'; '.join(lost)}. Everything else is kept: the "
+            "same command does only what is missing, with fewer --workers each has more memory"
         )
-    return list(entries.values())
 
 
-def _in_processes(work: Sequence[tuple[Job, Path]], workers: int, on_progress: Callable[[str, int], None]) -> list[str]:
-    """Does jobs in parallel processes, and names the items whose processes died twice."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
-    context = get_context("spawn")  # a forked child would share PyBullet's clients and CasADi's state with this process
-
-    # one pool for each process, so that a process that dies takes only its own job with it
-    def new_pool() -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(max_workers=1, mp_context=context)
-
-    queue = list(reversed(range(len(work))))
-    deaths: dict[tuple[int, int], int] = {}
-    counted = {i: len(_read(path, len(job.items))) for i, (job, path) in enumerate(work)}
-    pools: list[ProcessPoolExecutor] = []
-    running: dict[Future[int], tuple[int, ProcessPoolExecutor]] = {}
-
-    def count(i: int) -> None:
-        """Reports what the file of a job holds more than was reported."""
-        job, path = work[i]
-        present = len(_read(path, len(job.items)))
-        on_progress(job.group, present - counted[i])
-        counted[i] = present
-
-    def start(pool: ProcessPoolExecutor) -> None:
-        if not queue:
-            pool.shutdown(wait=False)
-            return
-        i = queue.pop()
-        skipped = {position for (job, position), times in deaths.items() if job == i and times > 1}
-        running[pool.submit(_work, *work[i], skipped)] = i, pool
-
-    try:
-        for _ in range(workers):
-            pools.append(new_pool())
-            start(pools[-1])
-        while running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                i, pool = running.pop(future)
-                try:
-                    future.result()
-                except BrokenProcessPool:
-                    pool.shutdown(wait=False)
-                    dead = _first_missing(*work[i], [p for (job, p), times in deaths.items() if job == i and times > 1])
-                    if dead is not None:
-                        deaths[i, dead] = deaths.get((i, dead), 0) + 1
-                        queue.insert(0, i)  # last in turn, when other processes may have left memory
-                    pools.append(pool := new_pool())
-                count(i)
-                start(pool)
-    except BaseException:
-        for pool in pools:
-            pool.shutdown(wait=False, cancel_futures=True)
-        for child in active_children():  # else an interrupt would wait for their jobs; what is finished is kept
-            child.terminate()
-        raise
-    return [f"{work[i][0].name}, item {work[i][0].items[p]}" for (i, p), times in sorted(deaths.items()) if times > 1]
+def _begun(jobs: Iterable[Job], out: Path, on_progress: Callable[[str, int], None]) -> Iterator["_Progress"]:
+    """Every job with what an earlier run did of it."""
+    unfinished(out).mkdir(parents=True, exist_ok=True)
+    for number, job in enumerate(jobs):
+        progress = _Progress(number, job, _path_of(out, job.name))
+        on_progress(job.group, len(job.items) - len(progress.missing))
+        yield progress
 
 
-def _first_missing(job: Job, path: Path, skipped: Collection[int]) -> int | None:
-    """The position of the item at which a process that died was."""
-    done = _read(path, len(job.items))
-    return next((i for i in range(len(job.items)) if i not in done and i not in skipped), None)
+class _Progress:
+    """A job, and what its file holds of it."""
+
+    def __init__(self, number: int, job: Job, path: Path):
+        self.number, self.job, self.path = number, job, path
+        done = _read(path, len(job.items))
+        if path.exists() and len(done) < len(job.items):  # a kill may have left half a line, which would spoil the next
+            files.write(path, "".join(_line(i, json.dumps(entry)) for i, entry in done.items()))
+        self._done = set(done)
+        self._deaths: Counter[tuple[int, int]] = Counter()
+        self.lost: set[int] = set()
+        """Positions of items that are not tried any more."""
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Positions of the items that are to be done."""
+        return tuple(i for i in range(len(self.job.items)) if i not in self._done and i not in self.lost)
+
+    def write(self, i: int, text: str) -> None:
+        """Keeps the entry of an item."""
+        with self.path.open("a") as file:
+            file.write(_line(i, text))
+        self._done.add(i)
+
+    def note_death(self, most: int) -> None:
+        """Notes that the worker died at the first missing item, which is lost when it happened so often."""
+        if missing := self.missing:
+            self._deaths[missing[0], most] += 1
+            if self._deaths[missing[0], most] >= most:
+                self.lost.add(missing[0])
+
+    def entries(self) -> list[Entry]:
+        """All entries, in the order of the items."""
+        entries = _read(self.path, len(self.job.items))
+        if len(entries) < len(self.job.items):
+            raise ValueError(
+                f"{self.path} holds {len(entries)} of {len(self.job.items)} items though the run has ended; run the command "
+                "again"
+            )
+        return list(entries.values())
 
 
-def _work(job: Job, path: Path, skipped: Collection[int] = ()) -> int:
-    """Does the items of a job that its file does not hold, less those skipped, and says how many they were."""
-    done = _read(path, len(job.items))
-    positions = [i for i in range(len(job.items)) if i not in done and i not in skipped]
-    missing = tuple(job.items[i] for i in positions)
-    # a kill may have left half a line, which would spoil the next
-    files.write(path, "".join(_line(i, entry) for i, entry in done.items()))
-    with path.open("a") as file:
-        for i, entry in zip(positions, job.function(*job.arguments, missing), strict=True):
-            file.write(_line(i, entry))
-            file.flush()
-            if (parent := parent_process()) is not None and not parent.is_alive():
-                os._exit(1)  # the run was killed, and may already go on in another process
-    return len(missing)
+def _texts(job: Job, positions: Sequence[int]) -> Iterator[tuple[int, str]]:
+    """Does the items at some positions of a job, on a worker: each position and its entry as JSON."""
+    items = tuple(job.items[i] for i in positions)
+    for i, entry in zip(positions, job.function(*job.arguments, items), strict=True):
+        yield i, json.dumps(entry)
 
 
-def _line(i: int, entry: Entry) -> str:
-    return json.dumps({"item": i, "entry": entry}) + "\n"
+def _line(i: int, text: str) -> str:
+    return f'{{"item": {i}, "entry": {text}}}\n'
 
 
 def _read(path: Path, items: int) -> dict[int, Entry]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ballbot_train import jobs
+from ballbot_train.executors import Workers
 
 _PACKAGES = ("gymnasium", "numpy", "pybullet", "casadi", "scipy")
 
@@ -62,11 +63,11 @@ def _largest(loads: Iterable[float]) -> float | None:
 class LoadRecord:
     """The loads during all parts of a run: an interrupted run goes on in another process, perhaps on a quieter machine."""
 
-    def __init__(self, out: Path, workers: int):
+    def __init__(self, out: Path, workers: int | Workers):
         """Begins a part of the run whose folder is `out`, which `jobs.claim` has locked."""
         self._path = jobs.unfinished(out) / "loads.jsonl"
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._add(load(), workers)
+        self._add(load(), Workers.of(workers).here)
 
     def watched(self, on_progress: Callable[[str, int], None]) -> Callable[[str, int], None]:
         """The function, which then notes the load too, now and then."""

@@ -1,12 +1,13 @@
 """`ballbot basins`: from where each controller recovers, and from where anything could."""
 
-import os
 from pathlib import Path
 
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, console, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import basins as maps
 from ballbot_train.evaluation.benchmark import controllers_of, open_run
+from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 
 
@@ -16,7 +17,7 @@ def basins(
     quick: bool = False,
     physics: Physics | None = None,
     out: Path = Path("runs/basins"),
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
 ) -> None:
     """Maps for Stabilize from which leans, speeds and lean rates each controller recovers, within what 350 N allow.
 
@@ -26,7 +27,7 @@ def basins(
         quick: only 9 points.
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
-        workers: processes.
+        workers: who does the work.
     """
     points = min(points, 9) if quick else points
     if not 3 <= points <= 501 or points % 2 == 0:

@@ -9,11 +9,13 @@ from ballbot_gym import certified, files
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, markdown, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import basins
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.executors import Workers
 from ballbot_train.provenance import LoadRecord
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
@@ -30,7 +32,7 @@ def benchmark(
     seed: int = 0,
     runs: Path = Path("runs"),
     out: Path = Path("runs/benchmark"),
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
 ) -> None:
     """Compares controllers by their regret on the certified episodes, and writes a leaderboard with figures.
@@ -46,7 +48,7 @@ def benchmark(
         runs: folder where other commands left their results: the recovered share of `basins` joins the leaderboard, and
             basins, robustness, training and the paper's figures join the report.
         out: folder of the results; an interrupted run continues here.
-        workers: processes; 1 gives the cleanest times per control step.
+        workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.
     """
     chosen = controllers_of(tasks, controllers, robot)

@@ -1,6 +1,6 @@
 """`ballbot certify`: the certified evaluation sets anew."""
 
-import os
+from functools import partial
 from pathlib import Path
 
 from ballbot_baselines import certification
@@ -11,10 +11,13 @@ from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import RobotName, check_least, check_some, console, progress_bars
+from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
 _MOST_EPISODES = 100_000
+_MOST_IN_SHARDS = 100_000_000
 _CHUNK = 5  # episodes of a job
 
 
@@ -22,8 +25,9 @@ def certify(
     tasks: tuple[str, ...] = tuple(TASKS),
     episodes: int = certified.EPISODES,
     install: bool = False,
+    shards: str | None = None,
     out: Path = Path("runs/certify"),
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
     guesses: int = ALL_GUESSES,
 ) -> None:
@@ -33,17 +37,28 @@ def certify(
         tasks: names of tasks.
         episodes: how many, from the first.
         install: puts the finished sets into the package too, in place of those that all evaluation reads.
+        shards: URL or folder for a set of shards, SHARDS/TASK, in place of the .npz files; for more episodes than fit into
+            memory. See `ballbot_train.shards`.
         out: folder of the .npz files; an interrupted run continues here.
-        workers: processes.
+        workers: who does the work.
         robot: whose sets.
         guesses: most guessed paths per episode; default all. With fewer, those of a slalom that are predicted to be the best.
     """
     check_some("task", tasks, TASKS)
-    check_least(1, episodes=episodes, workers=workers, guesses=guesses)
-    if episodes > _MOST_EPISODES:
-        raise ValueError(f"episodes must be at most {_MOST_EPISODES}, not {episodes}")
+    check_least(1, episodes=episodes, guesses=guesses)
+    Workers.of(workers)
+    most = _MOST_EPISODES if shards is None else _MOST_IN_SHARDS
+    if episodes > most:
+        raise ValueError(
+            f"episodes must be at most {most}, not {episodes}" + (most < _MOST_IN_SHARDS) * "; or give --shards"
+        )
     if install and episodes < certified.EPISODES:
         raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
+    if shards is not None:
+        if install:
+            raise ValueError("the package holds no shards; give --install without --shards")
+        _certify_shards(tasks, episodes, shards, out, workers, robot, guesses)
+        return
     facts = provenance()
     settings = {"tasks": tasks, "episodes": episodes, "robot": robot, "guesses": guesses}
     jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], **settings})
@@ -72,3 +87,26 @@ def certify(
         for name, evaluation_set in sets.items():
             task = make_task(name, robot)
             console.print(f"installed: {evaluation_set.save(task, certified.path_of(task, robot), robot)}")
+
+
+def _certify_shards(
+    tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers, robot: str, guesses: int
+) -> None:
+    from ballbot_train.shards import make
+
+    named = {} if robot == PAPER else {"robot": robot}
+    with progress_bars(dict.fromkeys(tasks, episodes)) as bars:
+        for name in tasks:
+            task, params = make_task(name, robot), named_robot(robot)
+            made = make(
+                f"{url.rstrip('/')}/{name}",
+                {"certified": task.problem(), "version": provenance()["version"], **named},
+                episodes,
+                certification.robots_entries,
+                (name, robot, guesses),
+                partial(certification.arrays, task=task, params=params),
+                out / name,
+                workers,
+                partial(bars.advance, name),
+            )
+            console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")

@@ -1,6 +1,5 @@
 """`ballbot demos`: demonstrations of an expert as a Minari dataset."""
 
-import os
 import shlex
 from pathlib import Path
 
@@ -10,8 +9,10 @@ from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
-from ballbot_train.learning.demonstrations import DemoConfig, write_demos
+from ballbot_train.executors import Workers
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
 
 
 def demos(
@@ -23,8 +24,9 @@ def demos(
     pushes: float = 0.5,
     backoff: Backoff = EXECUTED,
     seed: int = 0,
+    shards: str | None = None,
     out: Path | None = None,
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
 ) -> None:
     """Records episodes of an expert with exploration as a Minari dataset; a killed run continues when started again.
@@ -39,17 +41,25 @@ def demos(
         backoff: what the expert's plans keep from their limits: margins in their units, shares of the goal's tolerance
             and of the force. Experts that take no back-off ignore it.
         seed: seed of the dataset.
+        shards: URL or folder for a set of shards in place of a Minari dataset, for more episodes than fit into memory; see
+            `ballbot_train.shards`.
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
-        workers: number of processes.
+        workers: who does the work.
         robot: the robot that is shown.
     """
     check_names("task", [task], TASKS)
     physics = physics_or_default(physics)
     config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed, robot)
     kind = task if robot == PAPER else f"{task}-{robot}"
+    named = out
     out = Path("runs") / "demos" / f"{kind}-{expert}-v0" if out is None else out
     with progress_bar() as progress:
         bar = progress.add_task(f"{task} {expert}", total=episodes)
+        if shards is not None:
+            unfinished = Path("runs") / "demos" / f".{kind}-{expert}.shards" if named is None else named
+            made = write_shards(config, shards, unfinished, workers, lambda count: progress.advance(bar, count))
+            console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards", markup=False)
+            return
         folder = write_demos(config, out, workers, lambda count: progress.advance(bar, count))
     import minari
 

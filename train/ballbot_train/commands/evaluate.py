@@ -1,6 +1,5 @@
 """`ballbot evaluate POLICY`: one policy on thousands of fresh episodes, or anything that acts on the certified ones."""
 
-import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import (
     Physics,
     RobotName,
@@ -24,6 +24,7 @@ from ballbot_train.console import (
 from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
 from ballbot_train.evaluation.controllers import is_expert, make_controller, task_name
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.executors import Workers
 from ballbot_train.provenance import LoadRecord, provenance
 
 _FRESH = 10_000
@@ -44,7 +45,7 @@ def evaluate(
     episodes: int = 0,
     physics: Physics | None = None,
     out: Path | None = None,
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
 ) -> None:
     """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
@@ -63,13 +64,14 @@ def evaluate(
         episodes: how many of the certified episodes to run in PyBullet.
         physics: of the certified episodes, "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         out: folder of the results; default runs/evaluate/TASK-POLICY. An interrupted run continues here.
-        workers: processes, for optima and certified episodes.
+        workers: who does the work, for optima and certified episodes.
         robot: whose episodes.
     """
     task = task_name(policy, task, robot)
     chosen = controllers_of([task], [policy], robot)
     check_least(0, seed=seed, optima=optima, episodes=episodes)
-    check_least(1, workers=workers, **({} if bins is None else {"bins": bins}))
+    check_least(1, **({} if bins is None else {"bins": bins}))
+    Workers.of(workers)
     if bins is not None and bins > _MOST_BINS:
         raise ValueError(f"bins must be at most {_MOST_BINS}, not {bins}")
     if episodes > certified.EPISODES:
@@ -100,7 +102,7 @@ def _fresh(
     count: int | None,
     optima: int,
     out: Path,
-    workers: int,
+    workers: Workers,
     robot: str,
 ) -> None:
     from ballbot_train.evaluation import fresh  # it imports torch
@@ -194,7 +196,9 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
     print_table("", ["worst", "look at it with", "failed", "cost"], rows)
 
 
-def _certified(chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: int, robot: str) -> None:
+def _certified(
+    chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: Workers, robot: str
+) -> None:
     facts = open_run(out, chosen, workers, physics, 0, robot, episodes=episodes)
     loads = LoadRecord(out, workers)
     with progress_bars(dict.fromkeys(chosen, episodes)) as bars:

@@ -9,6 +9,7 @@ from ballbot_gym import files
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import (
     Physics,
     RobotName,
@@ -21,6 +22,7 @@ from ballbot_train.console import (
 )
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.executors import Workers
 from ballbot_train.provenance import LoadRecord
 from ballbot_train.report import figures
 
@@ -38,7 +40,7 @@ def robustness(
     physics: Physics | None = None,
     seed: int = 0,
     out: Path = Path("runs/robustness"),
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
 ) -> None:
     """Runs the certified episodes under pushes, noise, delay, lag and other robots, and draws success and regret by severity.
@@ -52,7 +54,7 @@ def robustness(
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         seed: of pushes, noise and the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
-        workers: processes.
+        workers: who does the work.
         robot: whose episodes and controllers.
     """
     chosen = controllers_of(tasks, controllers, robot)

@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
+from ballbot_train.executors import Workers
 from ballbot_train.learning.learners import LEARNERS, check_settings
+from ballbot_train.policy_files import paths_of
 
 _MOST_THREADS = 1024
 
@@ -23,8 +26,8 @@ class Run:
     """Name of a task."""
     robot: RobotName = "paper"
     """Name of a robot."""
-    demos: Path | None = None
-    """Folder of a demonstration dataset, made by `ballbot demos`."""
+    demos: str | None = None
+    """Folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards."""
     start: Path | None = None
     """Policy file whose weights training starts from; only for shac."""
     seed: int = 0
@@ -32,8 +35,8 @@ class Run:
     seeds: str | None = None
     """Several seeds in place of one, as 0:5 (0 to 4) or 0,3,7: a queue of one-core runs, each in a folder in --out. The same
     command continues a queue that was stopped."""
-    workers: int = 1
-    """How many runs of --seeds go on at once, each on one core."""
+    workers: WorkersOption = Workers()
+    """Who does the runs of --seeds, each on one core; by default one after another here, and all cores of a cluster."""
     threads: int | None = None
     """Threads of torch; default, torch's own choice. Another number changes the last digits."""
     out: Path | None = None
@@ -46,7 +49,7 @@ def train(
     learner: str,
     /,
     task: str = "stabilize",
-    demos: Path | None = None,
+    demos: str | Path | None = None,
     start: Path | None = None,
     seed: int = 0,
     settings: Any = None,
@@ -55,7 +58,7 @@ def train(
     resume: bool = False,
     command: str | None = None,
     seeds: str | None = None,
-    workers: int = 1,
+    workers: int | Workers = 1,
     robot: RobotName = "paper",
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
@@ -63,7 +66,7 @@ def train(
     Args:
         learner: name of a learner in `LEARNERS`.
         task: name of a task.
-        demos: folder of a demonstration dataset, made by `ballbot demos`.
+        demos: folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards.
         start: policy file whose weights training starts from; only for shac.
         seed: seed of everything that is drawn.
         settings: the learner's settings; default, those tuned for the task.
@@ -72,7 +75,7 @@ def train(
         resume: continue the run in this folder, if there is one.
         command: the command that was typed, for the record; default, one with all settings.
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
-        workers: how many runs of `seeds` go on at once.
+        workers: how many runs of `seeds` go on at once, or `Workers`.
         robot: name of a robot.
     """
     check_names("learner", [learner], LEARNERS)
@@ -84,10 +87,11 @@ def train(
         raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
+    workers = Workers.of(workers)
+    if workers.ray is not None and seeds is None:
+        raise ValueError("--ray does the runs of --seeds; a single training runs here")
     if seeds is not None:
-        _train_seeds(learner, Run(task, robot, demos, start, threads=threads, out=out), settings, seeds, workers)
+        _train_seeds(learner, Run(task, robot, _text(demos), start, threads=threads, out=out), settings, seeds, workers)
         return
 
     import torch
@@ -107,7 +111,7 @@ def train(
     kind = task if robot == PAPER else f"{task}-{robot}"
     out = Path("runs") / "train" / f"{kind}-{learner}" if out is None else out
     if command is None:
-        command = command_with(learner, Run(task, robot, demos, start, seed, threads=threads, out=out), settings)
+        command = command_with(learner, Run(task, robot, _text(demos), start, seed, threads=threads, out=out), settings)
     # the record also says how the demonstrations, or the policy to start from, were made
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
@@ -139,7 +143,7 @@ def train(
     )
 
 
-def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int) -> None:
+def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Workers) -> None:
     """Trains on several seeds, and prints what each reached."""
     from ballbot_train.learning import seeds as queue
 
@@ -155,9 +159,13 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int
     expected = {"learner": learner, "task": run.task, "settings": asdict(settings)}
     if run.robot != "paper":
         expected["robot"] = run.robot
+    inputs = [
+        *([Path(run.demos)] if run.demos and "://" not in run.demos else []),
+        *(paths_of(run.start) if run.start else []),
+    ]
     with progress_bar() as progress:
         bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
-        trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar))
+        trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar), inputs)
     header = ["seed", "", "success", "failures", "mean regret", "minutes"]
     rows = [_row(str(each.seed), vars(each)) for each in trained]
     middle, worst = queue.middle_and_worst(trained)
@@ -165,6 +173,10 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: int
         f"{learner} on {run.task}, certified episodes", header, [*rows, _row("median", middle), _row("worst", worst)]
     )
     console.print(f"learning curves: ballbot curves {shlex.quote(str(out))}")
+
+
+def _text(path: str | Path | None) -> str | None:
+    return None if path is None else str(path)
 
 
 def _row(name: str, values: Mapping[str, Any]) -> list[str]:

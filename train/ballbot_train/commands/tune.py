@@ -3,8 +3,10 @@
 from pathlib import Path
 
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.commands.train import Run, command_with
 from ballbot_train.console import check_least, check_names, console, print_table, progress_bar
+from ballbot_train.executors import Workers
 from ballbot_train.learning.learners import LEARNERS
 
 _SHOWN = 8
@@ -19,6 +21,7 @@ def tune(
     env_steps: int = 1_000_000,
     evaluations: int = 8,
     out: Path | None = None,
+    workers: WorkersOption = Workers(1),
 ) -> None:
     """Searches a learner's hyperparameters: Optuna's TPE, pruned by regret; a killed search continues when started again.
 
@@ -31,6 +34,7 @@ def tune(
         evaluations: of each training; after each of them a trial may be pruned.
         out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), trials.csv, importances.csv,
             best.json and, for ppo and sac, settings for rl-zoo3.
+        workers: who runs trials.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
@@ -42,7 +46,7 @@ def tune(
     search = tuning.Search(learner, task, tuple(range(seeds)), env_steps, evaluations)
     with progress_bar() as progress:
         bar = progress.add_task(f"{learner} {task}", total=trials)
-        best = tuning.run(search, trials, out, lambda count: progress.update(bar, completed=count))
+        best = tuning.run(search, trials, out, lambda count: progress.update(bar, completed=count), workers)
     if not best:
         raise ValueError(f"none of {trials} trials came to its end; {out / 'trials.csv'} says why. Give more --trials")
     settings = tuning.settings_of(search, {name: best["settings"][name] for name in tuning.SPACES[learner]})

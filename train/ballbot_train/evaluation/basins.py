@@ -21,7 +21,8 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import make_packed, packed
+from ballbot_train.executors import Workers
 
 TASK = "stabilize"
 BOUNDARY = "boundary"
@@ -68,12 +69,12 @@ class BasinMap:
         return float(np.sum(self.recovered[controller]) / np.sum(self.recoverable))
 
 
-def boundaries(out: Path, workers: int, on_progress: Callable[[str, int], None]) -> dict[str, np.ndarray]:
+def boundaries(out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]) -> dict[str, np.ndarray]:
     """The boundary of what is recoverable along every axis, (m, 2) lean, degrees, and value, resumably.
 
     Args:
         out: folder of the results.
-        workers: processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with `BOUNDARY` and a number of finished axes.
     """
     work = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (), (name,), BOUNDARY) for name in AXES]
@@ -115,10 +116,11 @@ def cell_jobs(
     for name, boundary in bounds.items():
         worth = _within(boundary, *grid(name, points), _DOUBT)
         for controller in controllers:
+            arguments = name, controller, physics, points, packed(controller)
             for i in range(points // 2, points):
                 items = tuple((i, int(j)) for j in np.flatnonzero(worth[i]))
                 stem = f"{_slug(name)}-{_slug(controller)}-{zlib.crc32(controller.encode()):08x}-{physics}-{points}-{i:02d}"
-                work.append(jobs.Job(stem, _cells, (name, controller, physics, points), items, controller))
+                work.append(jobs.Job(stem, _cells, arguments, items, controller))
     return work
 
 
@@ -136,7 +138,7 @@ def run(
     points: int,
     physics: str,
     out: Path,
-    workers: int,
+    workers: int | Workers,
     on_progress: Callable[[str, int], None],
 ) -> list[BasinMap]:
     """Runs the controllers from every state within the boundaries, resumably, and makes a map for each axis.
@@ -147,7 +149,7 @@ def run(
         points: along each axis of a map; odd.
         physics: "bullet" or "rk4".
         out: folder of the results.
-        workers: processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with a controller and a number of finished states.
     """
     done = jobs.run(cell_jobs(bounds, controllers, points, physics), out, workers, on_progress)
@@ -155,10 +157,15 @@ def run(
 
 
 def _cells(
-    axis: str, controller: str, physics: str, points: int, items: Sequence[tuple[int, int]]
+    axis: str,
+    controller: str,
+    physics: str,
+    points: int,
+    policy_files: Mapping[str, bytes],
+    items: Sequence[tuple[int, int]],
 ) -> Iterator[jobs.Entry]:
     env = BallbotEnv(TASK, physics=physics, arena_radius=_ARENA_RADIUS)
-    made = make_controller(controller, env.task, env.params)
+    made = make_packed(controller, policy_files, env.task, env.params)
     leans, values = grid(axis, points)
     for i, j in items:
         x = np.zeros(8)

@@ -17,6 +17,7 @@ from ballbot_train.console import check_least, check_names, check_some
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation.evaluate import iterate_episodes
 from ballbot_train.evaluation.results import Result
+from ballbot_train.executors import Workers
 from ballbot_train.policy_files import paths_of, shipped_policies
 from ballbot_train.provenance import provenance
 
@@ -82,7 +83,7 @@ def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER)
 def open_run(
     out: Path,
     controllers: Mapping[str, Sequence[str]],
-    workers: int,
+    workers: int | Workers,
     physics: str,
     seed: int | None = None,
     robot: str = PAPER,
@@ -93,7 +94,7 @@ def open_run(
     Args:
         out: the folder.
         controllers: names by task.
-        workers: processes; they change no result.
+        workers: a number of processes, or `Workers`; they change no result.
         physics: "bullet" or "rk4".
         seed: of whatever is drawn, if anything is.
         robot: by name.
@@ -106,7 +107,6 @@ def open_run(
         ValueError: the folder holds an unfinished run with other settings, policies or code; another process is using it;
             or a number is out of its range.
     """
-    check_least(1, workers=workers)
     settings["physics"] = physics
     if seed is not None:
         check_least(0, seed=seed)
@@ -114,7 +114,7 @@ def open_run(
     if robot != PAPER:
         settings["robot"] = robot
     settings["policies"] = policy_digests(controllers, robot)
-    facts = provenance() | settings | {"workers": workers}
+    facts = provenance() | settings | {"workers": Workers.of(workers).named}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
     return facts
 
@@ -135,7 +135,7 @@ def benchmark(
     episodes: int,
     physics: str,
     out: Path,
-    workers: int,
+    workers: int | Workers,
     on_progress: Callable[[str, int], None],
     seed: int = 0,
     robot: str = PAPER,
@@ -147,7 +147,7 @@ def benchmark(
         episodes: how many of each task's certified ones.
         physics: "bullet" or "rk4".
         out: folder of the results.
-        workers: processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with a task and a number of finished episodes.
         seed: of whatever is drawn.
         robot: by name.
@@ -181,7 +181,7 @@ def episode_job(
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(task, controller, physics, seed, randomization, robot),
+        arguments=(task, controller, registry.packed(controller), physics, seed, randomization, robot),
         items=tuple(episodes),
         group=group or task,
     )
@@ -190,6 +190,7 @@ def episode_job(
 def _episode_entries(
     task: str,
     controller: str,
+    packed: Mapping[str, bytes],
     physics: str,
     seed: int,
     randomization: Randomization | None,
@@ -197,7 +198,7 @@ def _episode_entries(
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
-    made = registry.make_controller(controller, env.task, env.params)
+    made = registry.make_packed(controller, packed, env.task, env.params)
     for result in iterate_episodes(env, made, controller, task, episodes, seed):
         yield asdict(result)
     env.close()

@@ -1,8 +1,11 @@
 """Controllers by name: experts of `CONTROLLERS`, policies that come with the package, policy files and saved models."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from ballbot_baselines import CONTROLLERS, VARIANTS
+from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, robot_name
@@ -12,6 +15,7 @@ from ballbot_train.console import check_names
 from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
 
 _SAVED_MODELS = (".zip", ".pt", ".pth")
+_BESIDE = (".json", ".safetensors", ".vecnormalize.npz")  # endings of files that belong to a policy or a saved model
 
 
 def names(task: Task, robot: str = PAPER) -> list[str]:
@@ -110,6 +114,29 @@ def policy_path(name: str, task: Task) -> Path:
             f"{name} is a saved model of another library; give a policy's .json, as `ballbot train` writes it"
         )
     return Path(name)
+
+
+def packed(name: str) -> dict[str, bytes]:
+    """The files of a policy or a saved model by name, for workers that do not have them; empty for other controllers.
+
+    Raises:
+        FileError: the file is missing.
+    """
+    if not is_file(name):
+        return {}
+    path = Path(name)
+    beside = (path.with_name(path.stem + ending) for ending in _BESIDE)
+    return {each.name: files.read(each) for each in {path, *beside} if each == path or each.exists()}
+
+
+def make_packed(name: str, packed: Mapping[str, bytes], task: Task, params: BallbotParams) -> Controller:
+    """As `make_controller`, with the files that `packed` gave."""
+    if not packed:
+        return make_controller(name, task, params)
+    with TemporaryDirectory() as folder:
+        for each, content in packed.items():
+            (Path(folder) / each).write_bytes(content)
+        return make_controller(str(Path(folder) / Path(name).name), task, params)
 
 
 def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:

@@ -30,6 +30,7 @@ from ballbot_train.evaluation.controllers import is_expert, is_file, is_saved_mo
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
+from ballbot_train.executors import Workers
 from ballbot_train.policy import load_network, shipped_policies
 from ballbot_train.saved_models import load_actor
 
@@ -354,7 +355,7 @@ def find_optima(
     episodes: int,
     seed: int,
     out: Path,
-    workers: int,
+    workers: int | Workers,
     on_progress: Callable[[str, int], None],
     robot: str = PAPER,
 ) -> np.ndarray:
@@ -365,7 +366,7 @@ def find_optima(
         episodes: how many.
         seed: of the episodes.
         out: folder in which the optima stay, so that a later call finds only those that are missing.
-        workers: processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with the task's name and a number of optima that are there.
         robot: by name.
     """

@@ -15,6 +15,7 @@ from ballbot_gym.robots import PAPER
 from ballbot_train import jobs
 from ballbot_train.evaluation.benchmark import episode_job
 from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
+from ballbot_train.executors import Workers
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def run(
     episodes: int,
     physics: str,
     out: Path,
-    workers: int,
+    workers: int | Workers,
     on_progress: Callable[[str, int], None],
     seed: int = 0,
     robot: str = PAPER,
@@ -118,7 +119,7 @@ def run(
         episodes: certified episodes of each task, from the first.
         physics: "bullet" or "rk4".
         out: folder of the results.
-        workers: processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with a stress and a number of finished episodes.
         seed: of the draws: episode i draws the same with every controller.
         robot: by name.

@@ -143,7 +143,7 @@ class CurriculumBatch(BallbotBatch):
         params: BallbotParams,
         curriculum: Curriculum,
         gamma: float,
-        demos: Path | None = None,
+        demos: str | Path | None = None,
         full: Task | None = None,
         pay: bool = True,
         failure_price: float = 0.0,
@@ -343,7 +343,7 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) ->
     return _starts(found)
 
 
-def demonstrated_starts(path: Path, task: Task, steps: int) -> Starts:
+def demonstrated_starts(path: str | Path, task: Task, steps: int) -> Starts:
     """The states of the successful demonstrations of a dataset, before their ends and before control step `steps`.
 
     Raises:

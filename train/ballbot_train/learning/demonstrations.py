@@ -14,17 +14,20 @@ dataset shows recoveries too.
 `optimum` is the cost of the optimal undisturbed episode from the same start, NaN if none was found; `solver_status` and
 `violation` are those of its search. `plans` counts the expert's plans, and `plans_failed` its searches that found none.
 
-`load_demos` reads a dataset for learners.
+`load_demos` reads a dataset for learners. Datasets of any size are shards: `write_shards` makes them, and `StreamedDemos`
+reads them one by one.
 """
 
+import base64
 import importlib.metadata
 import inspect
+import json
 import math
 import os
 import shlex
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, cast, runtime_checkable
@@ -44,11 +47,13 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
-from ballbot_train import jobs
+from ballbot_train import jobs, shards
 from ballbot_train.console import check_names
+from ballbot_train.executors import Workers
 from ballbot_train.policy import OBSERVATION_VERSION
 
 _CHUNK = 5  # episodes of a job
+_ARRAYS = "npz"  # where an entry holds the arrays of its episode
 _SEEDS = 1_000_000  # episode seeds per dataset seed, so that datasets of different seeds share none
 
 
@@ -256,13 +261,13 @@ def record(
     return recording, info
 
 
-def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callable[[int], None]) -> Path:
+def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progress: Callable[[int], None]) -> Path:
     """Makes a dataset in parallel processes. A killed run continues when it is started again.
 
     Args:
         config: settings of the dataset.
         out: folder of the dataset, named by its id, NAME-vNUMBER. It appears when the dataset is complete.
-        workers: number of processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with the number of episodes that have been added.
 
     Returns:
@@ -280,16 +285,13 @@ def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callab
         shutil.rmtree(unfinished, ignore_errors=True)  # a kill may have left it
         on_progress(config.episodes)
         return out
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
-    jobs.claim(unfinished, described)
+    Workers.of(workers)
+    jobs.claim(unfinished, described | {"arrays": _ARRAYS})  # earlier versions kept them in files of their own
     try:
         chunks = [
             tuple(range(start, min(start + _CHUNK, config.episodes))) for start in range(0, config.episodes, _CHUNK)
         ]
-        work = [
-            jobs.Job(f"{chunk[0]:06d}", _record_episodes, (config, unfinished / "episodes"), chunk) for chunk in chunks
-        ]
+        work = [jobs.Job(f"{chunk[0]:06d}", _record_episodes, (config,), chunk) for chunk in chunks]
         done = jobs.run(work, unfinished, workers, lambda group, count: on_progress(count))
         _assemble(config, [entry for entries in done for entry in entries], unfinished, out)
         jobs.release(unfinished)
@@ -297,6 +299,102 @@ def write_demos(config: DemoConfig, out: Path, workers: int, on_progress: Callab
     finally:
         jobs.unlock(unfinished)
     return out
+
+
+def write_shards(
+    config: DemoConfig,
+    url: str,
+    out: Path,
+    workers: int | Workers,
+    on_progress: Callable[[int], None],
+    per_shard: int = shards.EPISODES,
+) -> shards.Shards:
+    """Makes a dataset of any size as shards, which `load_demos` and `StreamedDemos` read. A killed run continues.
+
+    Args:
+        config: settings of the dataset. Its number of episodes may grow later.
+        url: folder of the set, on this machine or on any storage that fsspec knows.
+        out: folder of this machine for what is unfinished.
+        workers: a number of processes, or `Workers`.
+        on_progress: called with the number of episodes that have been added.
+        per_shard: episodes of a shard.
+
+    Raises:
+        ValueError: `url` holds another set.
+    """
+    described = asdict(config)
+    del described["episodes"]
+    about = {"demos": described, "task": repr(make_task(config.task)), "observation_version": OBSERVATION_VERSION}
+    return shards.make(
+        url, about, config.episodes, _record_episodes, (config,), _arrays_of, out, workers, on_progress, per_shard
+    )
+
+
+def _arrays_of(entries: Sequence[jobs.Entry]) -> dict[str, np.ndarray]:
+    """Episodes as arrays of a shard: those of their recordings, one after another, with lengths and metadata (JSON)."""
+    made = [entry for entry in entries if "note" not in entry]
+    recorded = [files.arrays_of(base64.b64decode(entry[_ARRAYS]), "an episode") for entry in made]
+    if not recorded:
+        return {}
+    return {
+        **{name: np.concatenate([arrays[name] for arrays in recorded]) for name in recorded[0]},
+        "lengths": np.array([len(arrays["actions"]) for arrays in recorded], np.int64),
+        "about": np.array([json.dumps(_about(entry)) for entry in made], str),
+    }
+
+
+class StreamedDemos:
+    """Demonstrations that are read shard by shard, for datasets that do not fit into memory."""
+
+    def __init__(self, url: str | Path, task: Task, seed: int):
+        """Args: url: of a set of `ballbot demos --shards`; task: the set must be made for it; seed: of the order of shards.
+
+        Raises:
+            ValueError: there is no such set, or it is of another task or observation version.
+        """
+        self._shards, self._task, self._seed = _opened(url, task), task, seed
+
+    def at(self, iteration: int) -> Demos:
+        """The demonstrations of an iteration: one shard, which depends on seed and iteration alone.
+
+        All shards come once before any comes again, each time in another order.
+        """
+        numbers = self._shards.numbers
+        epoch, i = divmod(iteration, len(numbers))
+        order = np.random.default_rng([self._seed, epoch, 2]).permutation(len(numbers))
+        return _of_shard(self._shards, numbers[order[i]], self._task)
+
+
+def _opened(url: str | Path, task: Task) -> shards.Shards:
+    """The set of shards, made for a task."""
+    opened = shards.Shards(url)
+    if opened.about is None or "demos" not in opened.about or not opened.numbers:
+        raise ValueError(f'{url} is no dataset of "ballbot demos --shards", or an empty one')
+    _check_made_for(str(url), opened.about, task)
+    return opened
+
+
+def _of_shard(opened: shards.Shards, number: int, task: Task) -> Demos:
+    arrays = opened.read(number)
+    try:
+        first = np.cumsum(arrays["lengths"] + 1) - arrays["lengths"] - 1  # where the observations of each episode begin
+        inner = np.ones(len(arrays["observations"]), bool)
+        inner[first] = False
+        last = np.ones(len(arrays["observations"]), bool)
+        last[first + arrays["lengths"]] = False
+        demos = Demos(
+            observations=arrays["observations"][last],
+            actions=arrays["labels"],
+            rewards=arrays["rewards"].astype(np.float32),
+            next_observations=arrays["observations"][inner],
+            terminations=arrays["terminations"],
+            truncations=arrays["truncations"],
+            executed=arrays["actions"],
+        )
+        _check(demos, len(task.observation_scale))
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise ValueError(f"shard {number} of {opened.url} is damaged; make the set anew ({error!r})") from error
+    return demos
 
 
 def dataset_folder(out: Path) -> Path:
@@ -313,25 +411,22 @@ def dataset_folder(out: Path) -> Path:
     return out
 
 
-def load_demos(path: Path, task: Task) -> Demos:
+def load_demos(path: str | Path, task: Task) -> Demos:
     """Reads a dataset of `ballbot demos`, all its episodes.
 
     Args:
-        path: folder of the dataset.
+        path: folder of the dataset, or the URL of shards.
         task: the dataset must have been made for this very task.
 
     Raises:
         ValueError: there is no such dataset, or it is damaged, or of another task or observation version.
     """
+    if shards.is_set(path):
+        opened = _opened(path, task)
+        parts = [vars(_of_shard(opened, number, task)) for number in opened.numbers]
+        return Demos(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
     path = Path(path)
-    metadata = _metadata(path)
-    if metadata.get("task") != repr(task):
-        raise ValueError(f"{path} holds demonstrations of {metadata.get('task')}, not of {task!r}")
-    if metadata.get("observation_version") != OBSERVATION_VERSION:
-        raise ValueError(
-            f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "
-            'make it anew with "ballbot demos"'
-        )
+    _check_made_for(str(path), _metadata(path), task)
     try:
         demos = _read(path / "data")
         _check(demos, len(task.observation_scale))
@@ -340,12 +435,25 @@ def load_demos(path: Path, task: Task) -> Demos:
     return demos
 
 
-def demonstrated_states(path: Path, task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
+def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task) -> None:
+    """Raises a ValueError for demonstrations of another task or observation version."""
+    if metadata.get("task") != repr(task):
+        raise ValueError(f"{path} holds demonstrations of {metadata.get('task')}, not of {task!r}")
+    if metadata.get("observation_version") != OBSERVATION_VERSION:
+        raise ValueError(
+            f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "
+            'make it anew with "ballbot demos"'
+        )
+
+
+def demonstrated_states(path: str | Path, task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
     """The states (T+1, 8) and constants (nc,) of the successful episodes of a dataset of `ballbot demos`.
 
     Raises:
         ValueError: as `load_demos`.
     """
+    if shards.is_set(path):
+        return _states_of_shards(_opened(path, task), task)
     load_demos(path, task)  # it checks the whole dataset
     data = minari.MinariDataset(Path(path) / "data")
     env = BallbotEnv(task, physics="rk4")
@@ -354,6 +462,20 @@ def demonstrated_states(path: Path, task: Task) -> list[tuple[np.ndarray, np.nda
         if about["success"]:
             _, info = env.reset(seed=int(about["seed"]))  # constants follow from the seed
             episodes.append((np.asarray(episode.infos["state"], np.float64), info["constants"]))
+    env.close()
+    return episodes
+
+
+def _states_of_shards(opened: shards.Shards, task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
+    env = BallbotEnv(task, physics="rk4")
+    episodes = []
+    for arrays in opened:
+        states = np.split(arrays["states"], np.cumsum(arrays["lengths"] + 1)[:-1])
+        for each, text in zip(states, arrays["about"], strict=True):
+            about = json.loads(str(text))
+            if about["success"]:
+                _, info = env.reset(seed=int(about["seed"]))  # constants follow from the seed
+                episodes.append((each, info["constants"]))
     env.close()
     return episodes
 
@@ -388,14 +510,19 @@ def _check(demos: Demos, observations: int) -> None:
             raise ValueError(f"{name} holds NaN or infinity")
 
 
-def command_of(path: Path) -> str:
+def command_of(path: str | Path) -> str:
     """The command that makes a dataset of `ballbot demos` anew.
 
     Raises:
         ValueError: it is no such dataset.
     """
-    options = {"out": str(path)}
-    for name, value in _metadata(path)["demos"].items():
+    if shards.is_set(path):
+        opened = shards.Shards(path)
+        settings = {"episodes": opened.episodes} | (opened.about or {}).get("demos", {})
+        options = {"shards": str(path)}
+    else:
+        settings, options = _metadata(Path(path))["demos"], {"out": str(path)}
+    for name, value in settings.items():
         options |= (
             {f"{name}.{part}": each for part, each in value.items()} if isinstance(value, dict) else {name: value}
         )
@@ -415,8 +542,8 @@ def _metadata(path: Path) -> dict[str, Any]:
     return metadata
 
 
-def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
-    """Writes the arrays of each episode to a file, and yields its metadata."""
+def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
+    """Yields the metadata of each episode, and its arrays as an .npz in base64."""
     env = BallbotEnv(config.task, physics=config.physics, robot=config.robot)
     expert = Expert(config.expert, env.task, env.params, config.backoff)
     for i in episodes:
@@ -426,7 +553,6 @@ def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) 
         except PlanError as error:
             yield {"seed": config.episode_seed(i), "note": str(error)}  # the expert has no plan from this start
             continue
-        files.write_npz(folder / f"{i:06d}.npz", asdict(recording))
         yield {
             "seed": config.episode_seed(i),
             "expert": config.expert,
@@ -437,6 +563,7 @@ def _record_episodes(config: DemoConfig, folder: Path, episodes: Sequence[int]) 
             "failure": bool(info["failure"]),
             "plans": expert.plans,
             "plans_failed": expert.plans_failed,
+            _ARRAYS: base64.b64encode(files.npz(asdict(recording))).decode(),
         }
     env.close()
 
@@ -469,7 +596,7 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
             warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
             dataset = minari.create_dataset_from_buffers(
                 dataset_id=out.name,
-                buffer=[_buffer(unfinished / "episodes" / f"{i:06d}.npz", entries[i]["seed"]) for i in made],
+                buffer=[_buffer(entries[i]) for i in made],
                 env=env,
                 algorithm_name=config.expert,
                 description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
@@ -482,17 +609,23 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
         else:
             os.environ["MINARI_DATASETS_PATH"] = before
         env.close()
-    dataset.storage.update_episode_metadata([entries[i] for i in made])
+    dataset.storage.update_episode_metadata([_about(entries[i]) for i in made])
     dataset.storage.update_metadata(
         {"task": repr(task), "observation_version": OBSERVATION_VERSION, "demos": asdict(config)}
     )
     (root / out.name).rename(out)
 
 
-def _buffer(path: Path, seed: int) -> EpisodeBuffer:
-    arrays: dict[str, Any] = dict(files.read_npz(path))  # Minari's annotations say lists
+def _about(entry: jobs.Entry) -> dict[str, Any]:
+    """The metadata of an episode."""
+    return {name: value for name, value in entry.items() if name != _ARRAYS}
+
+
+def _buffer(entry: jobs.Entry) -> EpisodeBuffer:
+    content = base64.b64decode(entry[_ARRAYS])
+    arrays: dict[str, Any] = files.arrays_of(content, "an episode")  # Minari's annotations say lists
     return EpisodeBuffer(
-        seed=seed,
+        seed=entry["seed"],
         observations=arrays["observations"],
         actions=arrays["actions"],
         rewards=arrays["rewards"],

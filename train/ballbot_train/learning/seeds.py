@@ -2,6 +2,9 @@
 
 Each seed has a run folder of its own, OUT/seed-K, and prints into OUT/seed-K.log. A queue that is killed goes on when it is
 started again: finished runs stay, and interrupted ones resume.
+
+On a Ray cluster each run works in an empty folder of its worker, and what it writes comes back every half minute. So a run
+whose node dies goes on elsewhere from its last checkpoint.
 """
 
 import math
@@ -10,17 +13,21 @@ import shlex
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ballbot_gym import files
 from ballbot_train import jobs
+from ballbot_train.executors import WorkerError, Workers, open_pool
 from ballbot_train.policy_files import PolicyError, read_description
 
 _MOST_SEEDS = 1000
+_SEND_SECONDS = 30.0  # how often a worker of a cluster sends what a run has written
 
 
 @dataclass(frozen=True)
@@ -59,13 +66,18 @@ def folder_of(out: Path, seed: int) -> Path:
     return out / f"seed-{seed}"
 
 
+def _log_of(out: Path, seed: int) -> Path:
+    return out / f"seed-{seed}.log"
+
+
 def run(
     command_of: Callable[[int], str],
     expected: Mapping[str, Any],
     seeds: Sequence[int],
     out: Path,
-    workers: int,
+    workers: int | Workers,
     on_seed: Callable[[int], None] = lambda seed: None,
+    inputs: Sequence[Path] = (),
 ) -> list[Trained]:
     """Runs what is not finished.
 
@@ -74,8 +86,9 @@ def run(
         expected: what the record of a finished run must say besides its seed, by name.
         seeds: in this order.
         out: folder of all runs.
-        workers: how many run at once, each on one core.
+        workers: how many run at once, each on one core, or `Workers`; one by default.
         on_seed: called with a seed when its run is finished.
+        inputs: files and folders that a run reads. A cluster gets them, under the same relative paths.
 
     Returns:
         What each seed reached.
@@ -87,9 +100,29 @@ def run(
     for seed in seeds:
         if seed not in waiting:
             on_seed(seed)
+    workers = Workers.of(workers)
+    if workers.ray is not None:
+        failed = _run_on_cluster(command_of, waiting, out, workers, on_seed, inputs)
+    else:
+        failed = _run_here(command_of, waiting, out, workers.workers or 1, on_seed)
+    if failed:
+        seed, status = min(failed)
+        log = _log_of(out, seed)
+        last = next((line for line in reversed(log.read_text(errors="replace").splitlines()) if line.strip()), "")
+        raise ValueError(
+            f"seeds {', '.join(str(seed) for seed, _ in sorted(failed))} did not finish (exit status {status}: {last}); "
+            f"see {log}. The same command goes on with them"
+        )
+    return [_trained(folder_of(out, seed), seed) for seed in seeds]
+
+
+def _run_here(
+    command_of: Callable[[int], str], waiting: Sequence[int], out: Path, workers: int, on_seed: Callable[[int], None]
+) -> list[tuple[int, int]]:
+    """Runs seeds on this machine; gives those that failed with their exit status."""
     failed = []
     with ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(_run_one, command_of(seed), out / f"seed-{seed}.log"): seed for seed in waiting}
+        running = {pool.submit(_run_one, command_of(seed), _log_of(out, seed)): seed for seed in waiting}
         try:
             for done in as_completed(running):
                 if status := done.result():
@@ -99,15 +132,95 @@ def run(
         except KeyboardInterrupt:  # the terminal has interrupted the runs too, and they save
             pool.shutdown(wait=True, cancel_futures=True)
             raise
-    if failed:
-        seed, status = min(failed)
-        log = out / f"seed-{seed}.log"
-        last = next((line for line in reversed(log.read_text(errors="replace").splitlines()) if line.strip()), "")
-        raise ValueError(
-            f"seeds {', '.join(str(seed) for seed, _ in sorted(failed))} did not finish (exit status {status}: {last}); "
-            f"see {log}. The same command goes on with them"
-        )
-    return [_trained(folder_of(out, seed), seed) for seed in seeds]
+    return failed
+
+
+def _run_on_cluster(
+    command_of: Callable[[int], str],
+    waiting: Sequence[int],
+    out: Path,
+    workers: Workers,
+    on_seed: Callable[[int], None],
+    inputs: Sequence[Path],
+) -> list[tuple[int, int]]:
+    """As `_run_here`, on a Ray cluster."""
+    for path in (out, *inputs):
+        if path.is_absolute() or ".." in path.parts:
+            raise ValueError(
+                f"with --ray give a path below the working folder, not {path}: it is the same on the workers, which have "
+                "folders of their own"
+            )
+    given, failed, queue = _packed(inputs), [], list(reversed(waiting))
+    deaths: Counter[int] = Counter()
+
+    with open_pool(workers, per_core=1) as pool:
+        running = 0
+        while queue or running:
+            while queue and pool.has_room():
+                seed = queue.pop()
+                held = _packed([folder_of(out, seed), _log_of(out, seed)])
+                pool.start(seed, _train_away, command_of(seed), given | held, out, _log_of(out, seed))
+                running += 1
+            for event in pool.events():
+                assert isinstance(event.key, int)
+                if event.kind == "yielded":
+                    status, made = event.value
+                    for name, content in made.items():
+                        files.write(out / name, content)
+                    if status == 0:
+                        on_seed(event.key)
+                    elif status is not None:
+                        failed.append((event.key, status))
+                    continue
+                running -= 1
+                if event.kind != "ended":
+                    deaths[event.key] += event.kind == "worker died"
+                    if deaths[event.key] > 1:
+                        raise WorkerError(
+                            f"the worker of seed {event.key} died twice, most likely out of memory; the same command goes on"
+                        )
+                    queue.append(event.key)
+    return failed
+
+
+def _packed(paths: Sequence[Path]) -> dict[str, bytes]:
+    """The files at some paths and in folders there, by their path; hidden ones are locks and temporary files."""
+    found = [each for path in paths for each in ([path] if path.is_file() else sorted(path.rglob("*")))]
+    return {str(path): path.read_bytes() for path in found if path.is_file() and not path.name.startswith(".")}
+
+
+def _train_away(
+    command: str, given: Mapping[str, bytes], out: Path, log: Path
+) -> Iterator[tuple[int | None, dict[str, bytes]]]:
+    """Runs a command in an empty folder with the given files.
+
+    Yields:
+        The exit status, None while it runs, and the files below `out` that have changed, by their path there.
+    """
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for path, content in given.items():
+            files.write(folder / path, content)
+        sent: dict[str, int] = {}
+        process = _start_in(folder, command, folder / log)
+        try:
+            ended = False
+            while not ended:
+                try:
+                    process.wait(_SEND_SECONDS)
+                    ended = True
+                except subprocess.TimeoutExpired:
+                    pass
+                stamps = {
+                    str(path.relative_to(folder / out)): path.stat().st_mtime_ns
+                    for path in (folder / out).rglob("*")
+                    if path.is_file() and not path.name.startswith(".")
+                }
+                changed = [path for path, stamp in stamps.items() if sent.get(path) != stamp]
+                sent = stamps
+                yield process.poll() if ended else None, {path: (folder / out / path).read_bytes() for path in changed}
+        finally:
+            process.kill()
 
 
 def middle_and_worst(trained: Sequence[Trained]) -> tuple[dict[str, float], dict[str, float]]:
@@ -119,13 +232,30 @@ def middle_and_worst(trained: Sequence[Trained]) -> tuple[dict[str, float], dict
     return {name: statistics.median(values) for name, values in columns.items()}, worst
 
 
+_ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+
+
+def _words(command: str) -> list[str]:
+    """A command of `ballbot`, run by this Python."""
+    return [sys.executable, "-m", "ballbot_train.cli", *shlex.split(command)[1:]]
+
+
 def _run_one(command: str, log: Path) -> int:
     """Runs a command on one core, and gives its exit status."""
     log.parent.mkdir(parents=True, exist_ok=True)
-    one_core = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    words = [sys.executable, "-m", "ballbot_train.cli", *shlex.split(command)[1:]]
     with log.open("a") as file:
-        return subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, env=os.environ | one_core).returncode
+        return subprocess.run(
+            _words(command), stdout=file, stderr=subprocess.STDOUT, env=os.environ | _ONE_CORE
+        ).returncode
+
+
+def _start_in(folder: Path, command: str, log: Path) -> "subprocess.Popen[bytes]":
+    """Starts a command on one core in another folder, with the packages of this process."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    packages = {"PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path if path)}
+    environment = os.environ | _ONE_CORE | packages
+    with log.open("a") as file:
+        return subprocess.Popen(_words(command), stdout=file, stderr=subprocess.STDOUT, env=environment, cwd=folder)
 
 
 def _is_finished(folder: Path, expected: Mapping[str, Any]) -> bool:

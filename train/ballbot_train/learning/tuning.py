@@ -20,13 +20,15 @@ A search is a folder:
 | best.json | all settings of the best trial, what each seed reached, and the command that trains with them |
 | ppo.yml, sac.yml | of those two learners: settings of the four ids in the format of rl-zoo3 |
 
-A search that is killed goes on where it stopped; the trial that was running begins anew.
+A search that is killed goes on where it stopped; trials that were running begin anew. Trials run in this process, in several,
+or on a Ray cluster. The study stays with this process: workers only train, and say what they reach.
 """
 
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
+from ballbot_train.executors import Pool, Workers, open_pool
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import LEARNERS
 
@@ -146,7 +149,13 @@ class Outcome:
     """Mean regret of the last policy on the certified episodes; an episode without success counts as failing at once."""
 
 
-def run(search: Search, trials: int, out: Path, on_trial: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
+def run(
+    search: Search,
+    trials: int,
+    out: Path,
+    on_trial: Callable[[int], None] = lambda count: None,
+    workers: int | Workers = 1,
+) -> dict[str, Any]:
     """Searches until so many trials have ended, goes on with what is there, and writes all files.
 
     Args:
@@ -154,6 +163,8 @@ def run(search: Search, trials: int, out: Path, on_trial: Callable[[int], None] 
         trials: how many, pruned and failed ones included.
         out: folder of the search.
         on_trial: called with the number of trials that have ended.
+        workers: a number of processes, or `Workers`; each runs a trial at a time. One process is this one, and then the same
+            search proposes the same trials. With more, proposals depend on which trials have ended before.
 
     Returns:
         The contents of best.json.
@@ -163,14 +174,12 @@ def run(search: Search, trials: int, out: Path, on_trial: Callable[[int], None] 
     """
     if search.learner not in SPACES:
         raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
+    workers = Workers.of(workers)
     jobs.claim(out, vars(search) | {"seeds": list(search.seeds)}, "config.json")
     try:
         study = open_study(search, out)
-        while (ended := len(_ended(study))) < trials:
-            on_trial(ended)
-            _try(study, search)
-            write_tables(study, search, out)
-        on_trial(ended)
+        with open_pool(workers, serial=workers.here == 1, per_core=1) as pool:
+            _search(study, search, trials, out, pool, on_trial)
         return write_tables(study, search, out)
     finally:
         jobs.unlock(out)
@@ -226,28 +235,78 @@ def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
     return replace(settings, evaluations=search.evaluations, **{name: iterations})
 
 
-def _try(study: "optuna.Study", search: Search) -> None:
-    """Runs one trial."""
-    trial, began = study.ask(), time.process_time()
-    try:
-        outcome = outcome_of(search, settings_of(search, _proposed(trial, SPACES[search.learner])), trial)
-    except optuna.TrialPruned:
-        study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-    except (ValueError, FloatingPointError) as error:  # what torch answers to weights that are not finite
-        trial.set_user_attr("error", f"{error!r:.200}")
+def _search(
+    study: "optuna.Study", search: Search, trials: int, out: Path, pool: Pool, on_trial: Callable[[int], None]
+) -> None:
+    """Runs trials on the workers of a pool. Each yields its cost after every evaluation, and may be pruned then."""
+    running: dict[Hashable, tuple[optuna.Trial, Any]] = {}
+    evaluated: Counter[Hashable] = Counter()
+    deaths: Counter[Hashable] = Counter()
+    while True:
+        ended = len(_ended(study))
+        on_trial(ended)
+        while ended + len(running) < trials and pool.has_room():
+            trial = study.ask()
+            settings = settings_of(search, _proposed(trial, SPACES[search.learner]))
+            running[trial.number] = trial, settings
+            pool.start(trial.number, _attempt, search, settings)
+        if not running:
+            return
+        for event in pool.events():
+            if event.key not in running:  # it has just been pruned
+                continue
+            trial, settings = running[event.key]
+            if event.kind == "yielded" and isinstance(event.value, float):
+                evaluated[event.key] += 1
+                trial.report(event.value, evaluated[event.key])
+                if evaluated[event.key] == search.evaluations or not trial.should_prune():
+                    continue
+                study.tell(trial, state=optuna.trial.TrialState.PRUNED)  # others were better by then
+                pool.stop(event.key)
+            elif event.kind == "yielded":
+                _end(study, trial, *event.value)
+                continue
+            elif event.kind != "ended":
+                deaths[event.key] += event.kind == "worker died"
+                evaluated[event.key] = 0
+                if deaths[event.key] < 2:
+                    pool.start(event.key, _attempt, search, settings)
+                    continue
+                _end(study, trial, "its worker died twice", 0.0)
+            del running[event.key]
+            write_tables(study, search, out)
+
+
+def _end(study: "optuna.Study", trial: "optuna.Trial", outcome: Outcome | str, minutes: float) -> None:
+    """Ends a trial with what it reached, or with what went wrong."""
+    if isinstance(outcome, str):
+        trial.set_user_attr("error", outcome)
         study.tell(trial, state=optuna.trial.TrialState.FAIL)
-    else:
-        for name, value in vars(outcome).items():
-            trial.set_user_attr(name, list(value))
-        trial.set_user_attr("cpu_minutes", (time.process_time() - began) / 60)
-        study.tell(trial, float(np.mean(outcome.costs)))
+        return
+    for name, value in vars(outcome).items():
+        trial.set_user_attr(name, list(value))
+    trial.set_user_attr("cpu_minutes", minutes)
+    study.tell(trial, float(np.mean(outcome.costs)))
 
 
-def outcome_of(search: Search, settings: Any, trial: Any) -> Outcome:
+def _attempt(search: Search, settings: Any) -> Iterator[float | tuple[Any, float]]:
+    """A trial, on a worker: as `outcome_of`, with the CPU time of it all, min. A failure is given in words."""
+    began = time.process_time()
+    try:
+        for reached in outcome_of(search, settings):
+            if isinstance(reached, float):
+                yield reached
+            else:
+                yield reached, (time.process_time() - began) / 60
+    except (ValueError, FloatingPointError) as error:  # what torch answers to weights that are not finite
+        yield f"{error!r:.200}", (time.process_time() - began) / 60
+
+
+def outcome_of(search: Search, settings: Any) -> Iterator[float | Outcome]:
     """Trains with one set of settings on every seed.
 
-    Raises:
-        optuna.TrialPruned: other trials were better by then.
+    Yields:
+        After every evaluation the least cost so far, averaged over the seeds; at the end the outcome.
     """
     task, params = make_task(search.task), default_params()
     learners = [LEARNERS[search.learner].make(task, params, settings, seed, None) for seed in search.seeds]
@@ -259,11 +318,9 @@ def outcome_of(search: Search, settings: Any, trial: Any) -> Outcome:
         validations = [training.validate(learner.network, task) for learner in learners]
         costs = [(validation.cost + validation.mean_cost) / 2 for validation in validations]
         best = [min(pair) for pair in zip(best, costs, strict=True)]
-        trial.report(float(np.mean(best)), k)
-        if k < search.evaluations and trial.should_prune():
-            raise optuna.TrialPruned
+        yield float(np.mean(best))
     scores = [training.score(learner.network, task) for learner in learners]
-    return Outcome(
+    yield Outcome(
         costs=tuple(best),
         success=tuple(validation.success for validation in validations),
         certified_regret=tuple(score.cost_ratio - 1 for score in scores),

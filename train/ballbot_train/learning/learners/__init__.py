@@ -44,7 +44,7 @@ class Algorithm:
         """
         return load(f"{self.module}:TUNED").get(task, load(f"{self.module}:{self.config}")())
 
-    def make(self, task: Task, params: BallbotParams, settings: Any, seed: int, demos: Path | None) -> "Learner":
+    def make(self, task: Task, params: BallbotParams, settings: Any, seed: int, demos: str | Path | None) -> "Learner":
         """Makes the learner.
 
         Args:

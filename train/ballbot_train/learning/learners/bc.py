@@ -10,9 +10,10 @@ import numpy as np
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.demonstrations import load_demos
+from ballbot_train.learning.demonstrations import StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.policy import PolicyNetwork
+from ballbot_train.shards import is_set
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,10 @@ TUNED: dict[str, BcConfig] = {"weave": BcConfig(hidden=(256, 256))}
 class BehaviourCloning:
     """The learner; see `training.Learner`. An iteration's random numbers depend on seed and iteration alone."""
 
-    def __init__(self, task: Task, params: BallbotParams, config: BcConfig, seed: int, samples: Samples):
+    # an iteration reads one shard of demonstrations that are shards
+    def __init__(
+        self, task: Task, params: BallbotParams, config: BcConfig, seed: int, samples: "Samples | StreamedDemos"
+    ):
         self.config, self.iteration = config, 0
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         self._seed, self._samples = seed, samples
@@ -57,7 +61,11 @@ class BehaviourCloning:
         progress = self.iteration / config.total_iterations
         rate = schedules.cosine(config.learning_rate, config.final_learning_rate_fraction, progress)
         rng = np.random.default_rng([self._seed, self.iteration])
-        loss = self._fit.run(self._samples, config.gradient_steps, config.batch_size, rate, rng)
+        samples = self._samples
+        if isinstance(samples, StreamedDemos):
+            demos = samples.at(self.iteration)
+            samples = Samples.of(demos.observations, demos.actions)
+        loss = self._fit.run(samples, config.gradient_steps, config.batch_size, rate, rng)
         self.iteration += 1
         return {"loss/imitation": loss, "train/learning_rate": rate}
 
@@ -69,7 +77,7 @@ class BehaviourCloning:
         self._fit.load_state_dict(state)
 
 
-def make(task: Task, params: BallbotParams, config: BcConfig, seed: int, demos: Path | None) -> BehaviourCloning:
+def make(task: Task, params: BallbotParams, config: BcConfig, seed: int, demos: str | Path | None) -> BehaviourCloning:
     """Makes the learner.
 
     Raises:
@@ -77,5 +85,7 @@ def make(task: Task, params: BallbotParams, config: BcConfig, seed: int, demos: 
     """
     if demos is None:
         raise ValueError('bc learns from demonstrations: give --demos a dataset of "ballbot demos"')
+    if is_set(demos):
+        return BehaviourCloning(task, params, config, seed, StreamedDemos(demos, task, seed))
     loaded = load_demos(demos, task)
     return BehaviourCloning(task, params, config, seed, Samples.of(loaded.observations, loaded.actions))

@@ -331,7 +331,7 @@ def tube_gains(task: Task, params: BallbotParams, plan: Optimum, c: np.ndarray) 
     return TvlqrController(params, trajectory, dt, q * dt, r * dt, active @ active.T + 1e-3 * np.eye(8)).gains.k
 
 
-def make(task: Task, params: BallbotParams, config: DaggerConfig, seed: int, demos: Path | None) -> Dagger:
+def make(task: Task, params: BallbotParams, config: DaggerConfig, seed: int, demos: str | Path | None) -> Dagger:
     """Makes the learner; demonstrations, if given, are its first samples.
 
     Raises:

@@ -207,7 +207,7 @@ class Ppo(ModelFree):
         return float(self._log_std.detach().exp()[0]) ** -2
 
 
-def make(task: Task, params: BallbotParams, config: PpoConfig, seed: int, demos: Path | None) -> Ppo:
+def make(task: Task, params: BallbotParams, config: PpoConfig, seed: int, demos: str | Path | None) -> Ppo:
     """Makes the learner.
 
     Raises:

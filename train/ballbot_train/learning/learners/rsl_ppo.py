@@ -220,7 +220,7 @@ class RslPpo:
     """The learner; see `training.Learner`."""
 
     def __init__(
-        self, task: Task, params: BallbotParams, config: RslPpoConfig, seed: int = 0, demos: Path | None = None
+        self, task: Task, params: BallbotParams, config: RslPpoConfig, seed: int = 0, demos: str | Path | None = None
     ):
         """Args: demos: dataset of demonstrations on whose states episodes of the curriculum begin.
 
@@ -366,7 +366,7 @@ class RslPpo:
         self._ppo.gamma = self._batch.gamma = state["gamma"]
 
 
-def make(task: Task, params: BallbotParams, config: RslPpoConfig, seed: int, demos: Path | None) -> RslPpo:
+def make(task: Task, params: BallbotParams, config: RslPpoConfig, seed: int, demos: str | Path | None) -> RslPpo:
     """Makes the learner.
 
     Raises:

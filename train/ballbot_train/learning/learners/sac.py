@@ -211,7 +211,7 @@ class Sac(ModelFree):
         return 1.0
 
 
-def make(task: Task, params: BallbotParams, config: SacConfig, seed: int, demos: Path | None) -> Sac:
+def make(task: Task, params: BallbotParams, config: SacConfig, seed: int, demos: str | Path | None) -> Sac:
     """Makes the learner.
 
     Raises:

@@ -303,6 +303,6 @@ class Shac:
         return total / max(1, config.critic_gradient_steps)
 
 
-def make(task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: Path | None) -> Shac:
+def make(task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: str | Path | None) -> Shac:
     """Makes the learner; it uses no demonstrations."""
     return Shac(task, params, config, seed)

@@ -1,0 +1,91 @@
+"""PPO of RLlib on a ballbot with several env runners, on this machine or a cluster, measured by the regret of its policy.
+
+Needs `pip install "ballbot-gym[rllib]"`, which installs an older Gymnasium.
+"""
+
+import time
+
+import tyro
+
+
+def main(
+    task: str = "stabilize",
+    iterations: int = 100,
+    env_runners: int = 2,
+    envs_per_runner: int = 8,
+    batch: int = 8192,
+    minibatch: int = 1024,
+    epochs: int = 8,
+    learning_rate: float = 1e-3,
+    gamma: float = 0.995,
+    every: int = 20,
+    episodes: int = 200,
+    physics: str | None = None,
+    seed: int = 0,
+    ray: str | None = None,
+    save: str | None = None,
+) -> None:
+    """Trains and reports.
+
+    Args:
+        task: name of the task.
+        iterations: of PPO.
+        env_runners: processes that step environments.
+        envs_per_runner: environments of each.
+        batch: env steps of an iteration.
+        minibatch: env steps of a gradient step.
+        epochs: over the batch.
+        learning_rate: step size.
+        gamma: discount.
+        every: iterations from one report to the next.
+        episodes: certified episodes that are run in the end.
+        physics: of those, "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        seed: of everything that is drawn.
+        ray: address of a cluster whose nodes have ballbot-gym; default, a Ray of its own on this machine.
+        save: folder of a checkpoint in the end.
+    """
+    import ray as cluster
+    from ray.rllib.algorithms.ppo import PPOConfig
+
+    from ballbot_gym.tasks import TASKS
+    from ballbot_train import evaluate, evaluate_fresh
+    from ballbot_train.rllib import RllibPolicy, register
+
+    register()
+    if not cluster.is_initialized():
+        small = (
+            {} if ray else {"num_cpus": env_runners + 1, "object_store_memory": 200 * 2**20, "include_dashboard": False}
+        )
+        cluster.init(ray or "local", log_to_driver=False, logging_level="ERROR", **small)
+    settings = (
+        PPOConfig()
+        .environment(TASKS[task].id, env_config={})
+        .env_runners(num_env_runners=env_runners, num_envs_per_env_runner=envs_per_runner, num_cpus_per_env_runner=1)
+        .training(
+            train_batch_size_per_learner=batch,
+            minibatch_size=minibatch,
+            num_epochs=epochs,
+            lr=learning_rate,
+            gamma=gamma,
+        )
+        .debugging(seed=seed)
+    )
+    algorithm, began = settings.build_algo(), time.monotonic()
+    for i in range(1, iterations + 1):
+        algorithm.train()
+        if i % every == 0 or i == iterations:
+            row = evaluate_fresh(RllibPolicy(algorithm), task, episodes=200).summary()
+            print(
+                f"{i * batch:9,} steps, {(time.monotonic() - began) / 60:5.1f} min: success {row.success:6.1%}, "
+                f"{row.failures:3} failures, cost {row.cost_median:8.2f} median",
+                flush=True,
+            )
+    row = evaluate(RllibPolicy(algorithm), task, episodes, physics, name="rllib-ppo")
+    print(f"certified episodes: success {row.success:.1%}, {row.falls} falls, mean regret {row.regret_mean:.1%}")
+    if save is not None:
+        algorithm.save_to_path(save)
+    algorithm.stop()
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

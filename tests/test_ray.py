@@ -1,0 +1,170 @@
+"""Work on a Ray cluster of two nodes on this machine gives what one process gives, also when a node is killed."""
+
+import csv
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballbot_gym import files
+from ballbot_gym.env import make_task
+from ballbot_train import jobs
+from ballbot_train.commands.certify import certify
+from ballbot_train.commands.train import train
+from ballbot_train.evaluation.benchmark import benchmark
+from ballbot_train.executors import Workers, open_pool
+from ballbot_train.learning import tuning
+from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+from ballbot_train.learning.learners import LEARNERS
+
+ray = pytest.importorskip("ray")
+pytestmark = pytest.mark.slow
+
+SMALL = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+
+
+@pytest.fixture(scope="module")
+def head():
+    from ray import cloudpickle
+    from ray.cluster_utils import Cluster
+
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the nodes do not have this file
+    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  # else workers wait for everything else on this machine
+    cluster = Cluster(initialize_head=True, head_node_args={**SMALL, "include_dashboard": False})
+    yield cluster
+    cluster.shutdown()
+
+
+@pytest.fixture
+def cluster(head):
+    node = head.add_node(**SMALL)
+    yield head, node
+    if node in head.worker_nodes:
+        head.remove_node(node)
+
+
+def certified_sets(out, workers):
+    certify(("stabilize",), 24, out=out, workers=workers)
+    return files.read_npz(out / "BallbotStabilize-v0.npz")
+
+
+def results(out, workers):
+    done = benchmark({"stabilize": ["lqr"], "turn": ["lqr"]}, 12, "rk4", out, workers, lambda task, count: None)
+    times = {"plan_seconds", "step_seconds"}
+    return {
+        f"{row.task}-{row.episode}": np.array([str(value) for name, value in vars(row).items() if name not in times])
+        for row in done
+    }
+
+
+def demonstrations(out, workers):
+    config = DemoConfig("stabilize", "lqr", episodes=16, physics="rk4")
+    return vars(load_demos(write_demos(config, out / "demos-v0", workers, lambda count: None), make_task("stabilize")))
+
+
+@pytest.mark.parametrize(
+    ("made", "count"),
+    [(certified_sets, 24), (results, 24), (demonstrations, 16)],
+    ids=["certify", "benchmark", "demos"],
+)
+def test_every_item_arrives_once_and_unchanged_when_a_node_is_killed(made, count, cluster, tmp_path, monkeypatch):
+    head, node = cluster
+    expected = made(tmp_path / "serial", 1)
+    written = []
+    write = jobs._Progress.write
+
+    def write_and_kill(self, i, text):
+        write(self, i, text)
+        written.append((self.job.name, i))
+        if len(written) == count // 4:
+            head.remove_node(node, allow_graceful=False)
+
+    monkeypatch.setattr(jobs._Progress, "write", write_and_kill)
+    found = made(tmp_path / "cluster", Workers(ray=head.address))
+    assert len(written) == len(set(written)) == count
+    assert found.keys() == expected.keys()
+    for name, array in expected.items():
+        assert np.array_equal(found[name], array, equal_nan=array.dtype.kind == "f"), name
+
+
+def dies_at_three(log, items):
+    for item in items:
+        with Path(log).open("a") as file:
+            file.write(f"{item}\n")
+        if item == 3 and Path(log).read_text().split().count("3") == 1:
+            os._exit(1)
+        yield {"item": item}
+
+
+def test_an_item_whose_worker_dies_is_tried_again(cluster, tmp_path):
+    head, _ = cluster
+    work = [jobs.Job("job", dies_at_three, (str(tmp_path / "log"),), tuple(range(6)))]
+    counted = []
+    address = Workers(ray=head.address)
+    (entries,) = jobs.run(work, tmp_path, address, lambda group, count: counted.append(count))
+    assert [entry["item"] for entry in entries] == list(range(6))
+    assert sum(counted) == 6
+    assert (tmp_path / "log").read_text().split() == ["0", "1", "2", "3", "3", "4", "5"]
+
+
+def refuses(items):
+    yield {"item": 0}
+    raise ValueError("no such item")
+
+
+def test_an_error_of_an_item_is_the_error_of_the_run(cluster, tmp_path):
+    head, _ = cluster
+    with pytest.raises(ValueError, match=r"^no such item$"):
+        jobs.run([jobs.Job("job", refuses, (), (0, 1))], tmp_path, Workers(ray=head.address), lambda *_: None)
+
+
+def test_few_tasks_are_in_flight(cluster):
+    head, _ = cluster
+    with open_pool(Workers(ray=head.address)) as pool:
+        started = 0
+        while pool.has_room():
+            pool.start(started, numbers, 1)
+            started += 1
+        assert started == 4  # two for each core
+        ended = set()
+        while len(ended) < started:
+            ended |= {event.key for event in pool.events() if event.kind == "ended"}
+
+
+def numbers(count):
+    yield from range(count)
+
+
+def test_a_search_runs_its_trials_on_the_nodes(cluster, tmp_path):
+    head, _ = cluster
+    ended = []
+    search = tuning.Search("ppo", "stabilize", (0,), 64, 1)
+    best = tuning.run(search, 3, tmp_path, ended.append, Workers(2, head.address))
+    rows = list(csv.DictReader((tmp_path / "trials.csv").open()))
+    assert sorted(row["trial"] for row in rows) == ["0", "1", "2"]
+    assert ended[-1] == 3
+    costs = [float(row["cost"]) for row in rows if row["state"] == "complete"]
+    assert best["validation_cost"] == min(costs)
+
+
+def test_trainings_of_seeds_come_back_from_the_nodes_as_this_machine_makes_them(cluster, tmp_path, monkeypatch):
+    head, _ = cluster
+    settings = replace(
+        LEARNERS["ppo"].settings("turn"),
+        rl_iterations=2,
+        num_envs=4,
+        num_steps=8,
+        batch_size=16,
+        hidden=(8,),
+        evaluations=1,
+    )
+    monkeypatch.chdir(tmp_path)
+    train("ppo", "turn", settings=settings, seeds="0:2", out=Path("here"))
+    train("ppo", "turn", settings=settings, seeds="0:2", out=Path("there"), workers=Workers(ray=head.address))
+    for seed in ("seed-0", "seed-1"):
+        here, there = (Path(out) / seed for out in ("here", "there"))
+        assert (here / "policy.safetensors").read_bytes() == (there / "policy.safetensors").read_bytes()
+        assert {path.name for path in here.iterdir()} == {path.name for path in there.iterdir()}

@@ -1,0 +1,178 @@
+"""Data sets as shards hold what one file would hold, survive a kill, and are read one shard at a time."""
+
+import json
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+
+from ballbot_gym import files
+from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
+from ballbot_train import shards
+from ballbot_train.commands.certify import certify
+from ballbot_train.learning.demonstrations import (
+    DemoConfig,
+    StreamedDemos,
+    command_of,
+    demonstrated_states,
+    load_demos,
+    write_demos,
+    write_shards,
+)
+from ballbot_train.learning.learners import LEARNERS
+
+TASK = make_task("turn")
+CONFIG = DemoConfig("turn", "lqr", episodes=7, physics="rk4")
+
+
+def numbered(log, numbers):
+    for i in numbers:
+        with open(log, "a") as file:
+            file.write(f"{i}\n")
+        yield {"i": i}
+
+
+def arrays_of(entries):
+    return {"i": np.array([entry["i"] for entry in entries])}
+
+
+def made(url, out, episodes, about=None, on_progress=lambda count: None):
+    about = {"seed": 1} if about is None else about
+    log = str(out.parent / "log")
+    return shards.make(url, about, episodes, numbered, (log,), arrays_of, out, 1, on_progress, per_shard=7)
+
+
+@pytest.mark.parametrize("where", ["folder", "memory"])
+def test_every_episode_is_in_one_shard_in_order(where, tmp_path):
+    url = str(tmp_path / "set") if where == "folder" else "memory://set-of-numbers"
+    made(url, tmp_path / "out", 20)
+    read = shards.Shards(url)
+    assert [arrays["i"].tolist() for arrays in read] == [[*range(7)], [*range(7, 14)], [*range(14, 20)]]
+    assert read.episodes == 20
+    assert shards.is_set(url)
+    assert not list((tmp_path / "out").rglob("*.jsonl"))
+    if where == "memory":
+        fsspec.filesystem("memory").rm("/set-of-numbers", recursive=True)
+
+
+def test_a_killed_run_goes_on_and_writes_no_shard_twice(tmp_path):
+    url, counted = str(tmp_path / "set"), []
+
+    def killed(count):
+        counted.append(count)
+        if sum(counted) >= 11:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        made(url, tmp_path / "out", 20, on_progress=killed)
+    first = Path(url) / "shard-000000.npz"
+    assert [path.name for path in Path(url).glob("*.npz")] == [first.name]
+    stamp = first.stat().st_mtime_ns
+    counted = []
+    made(url, tmp_path / "out", 20, on_progress=counted.append)
+    assert sum(counted) == 20
+    assert first.stat().st_mtime_ns == stamp
+    assert sorted(map(int, (tmp_path / "log").read_text().split())) == list(range(20))
+
+
+def test_a_set_may_grow_and_is_never_mixed_with_another(tmp_path):
+    url = str(tmp_path / "set")
+    made(url, tmp_path / "out", 9)
+    made(url, tmp_path / "out", 16)
+    assert np.concatenate([arrays["i"] for arrays in shards.Shards(url)]).tolist() == list(range(16))
+    with pytest.raises(ValueError, match="a set of seed 1, not 2"):
+        made(url, tmp_path / "other", 9, about={"seed": 2})
+
+
+def test_a_shard_that_was_changed_is_named(tmp_path):
+    url = str(tmp_path / "set")
+    made(url, tmp_path / "out", 9)
+    files.write_npz(Path(url) / "shard-000001.npz", {"i": np.arange(3)})
+    with pytest.raises(shards.ShardError, match=r"shard-000001\.npz is not the file that manifest\.json names"):
+        list(shards.Shards(url))
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"version": 9}', '{"version": 1, "about": {}, "shards": {"0": {"file": "../x"}}}']
+)
+def test_a_damaged_manifest_is_named(text, tmp_path):
+    (tmp_path / shards.MANIFEST).write_text(text)
+    with pytest.raises(shards.ShardError, match=r"manifest\.json is damaged"):
+        shards.Shards(tmp_path)
+
+
+def test_a_place_that_does_not_exist_is_named():
+    with pytest.raises(shards.ShardError, match="nowhere://set cannot be read"):
+        shards.Shards("nowhere://set")
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demos")
+    write_demos(CONFIG, folder / "demos-v0", 1, lambda count: None)
+    write_shards(CONFIG, str(folder / "set"), folder / "out", 1, lambda count: None, per_shard=3)
+    return folder
+
+
+def test_demonstrations_in_shards_are_those_of_one_dataset(demos):
+    whole, sharded = load_demos(demos / "demos-v0", TASK), load_demos(demos / "set", TASK)
+    for name, array in vars(whole).items():
+        assert np.array_equal(vars(sharded)[name], array), name
+        assert vars(sharded)[name].dtype == array.dtype
+    for (x, c), (y, d) in zip(
+        demonstrated_states(demos / "demos-v0", TASK), demonstrated_states(demos / "set", TASK), strict=True
+    ):
+        assert np.array_equal(x, y)
+        assert np.array_equal(c, d)
+    assert f"--shards {demos / 'set'}" in command_of(demos / "set")
+    with pytest.raises(ValueError, match="holds demonstrations of Turn"):
+        load_demos(demos / "set", make_task("orbit"))
+
+
+def test_a_stream_gives_every_shard_once_per_epoch_in_an_order_of_its_own(demos):
+    def lengths(seed):
+        stream = StreamedDemos(demos / "set", TASK, seed)
+        return [len(stream.at(i)) for i in range(30)]
+
+    drawn = lengths(0)
+    assert len({tuple(sorted(drawn[i : i + 3])) for i in range(0, 30, 3)}) == 1
+    assert len({tuple(drawn[i : i + 3]) for i in range(0, 30, 3)}) > 1
+    assert drawn == lengths(0)
+    assert drawn != lengths(1)
+
+
+def test_behaviour_cloning_reads_one_shard_per_iteration_and_resumes_with_the_same_bits(demos, monkeypatch):
+    settings = type(LEARNERS["bc"].settings("turn"))(total_iterations=4, gradient_steps=2, batch_size=8, hidden=(4,))
+    read = []
+    real = shards.Shards.read
+    monkeypatch.setattr(shards.Shards, "read", lambda self, number: (read.append(number), real(self, number))[1])
+
+    def learner():
+        return LEARNERS["bc"].make(TASK, default_params(), settings, 0, demos / "set")
+
+    first, second = learner(), learner()
+    for _ in range(4):
+        first.iterate()
+    assert len(read) == 4
+    assert set(read[:3]) == {0, 1, 2}
+    for _ in range(2):
+        second.iterate()
+    state, third = second.state_dict(), learner()
+    third.load_state_dict(state)
+    for _ in range(2):
+        third.iterate()
+    for a, b in zip(first.network.parameters(), third.network.parameters(), strict=True):
+        assert bool((a == b).all())
+
+
+def test_certified_shards_are_the_certified_set(tmp_path):
+    certify(("stabilize",), 6, out=tmp_path / "set", workers=1)
+    certify(("stabilize",), 6, shards=str(tmp_path / "shards"), out=tmp_path / "out", workers=1)
+    whole = files.read_npz(tmp_path / "set" / "BallbotStabilize-v0.npz")
+    (arrays,) = shards.Shards(tmp_path / "shards" / "stabilize")
+    for name in ("states", "constants", "costs", "violations", "statuses", "lengths", "x", "u"):
+        assert np.array_equal(arrays[name], whole[name]), name
+    assert arrays["episodes"].tolist() == list(range(6))
+    assert json.loads((tmp_path / "shards" / "stabilize" / shards.MANIFEST).read_text())["shards"]["0"]["episodes"] == 6

@@ -1,0 +1,253 @@
+"""Data sets of any size as shards: .npz files of some hundred episodes, in a folder or on object storage.
+
+A set is a folder of any kind that fsspec knows, such as runs/set, s3://BUCKET/set or gs://BUCKET/set:
+
+| file | holds |
+|---|---|
+| shard-000000.npz, … | the arrays of some hundred episodes, one after another |
+| manifest.json | what the set was made from, and of every finished shard its file, episodes, bytes and SHA-256 |
+
+The manifest names a shard after its file is there. So whoever reads the manifest finds whole shards only, and a run that was
+killed makes those that it does not name. A reader holds one shard in memory, and checks its digest.
+"""
+
+import base64
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_gym.lazy import missing
+from ballbot_train import jobs
+from ballbot_train.executors import Workers
+
+try:
+    import fsspec
+    from fsspec.implementations.local import LocalFileSystem
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
+
+EPISODES = 500
+"""Episodes of a shard."""
+
+MANIFEST = "manifest.json"
+_CHUNK = 5  # episodes of a job, and of its only item: workers send arrays, so that little is left to do here
+_ARRAYS = "npz"
+_LIMIT = 2**32  # bytes of a shard, unpacked
+_VERSION = 1
+
+Arrays = Mapping[str, np.ndarray]
+
+
+class ShardError(ValueError):
+    """A set that is missing or damaged; the message names it."""
+
+
+class Shards:
+    """A set of shards, to read or to add to."""
+
+    def __init__(self, url: str | Path):
+        """Reads the manifest, if there is one.
+
+        Raises:
+            ShardError: the manifest is damaged, or nothing can be read there.
+        """
+        self.url = str(url).rstrip("/")
+        try:
+            self._files, self._root = fsspec.core.url_to_fs(self.url)
+            text = self._files.cat_file(f"{self._root}/{MANIFEST}")
+        except FileNotFoundError:
+            text = None
+        except (ImportError, ValueError, OSError) as error:
+            raise ShardError(f"{self.url} cannot be read: {error}") from error
+        self.about: dict[str, Any] | None = None
+        """What the set was made from; None where there is none yet."""
+        self._shards: dict[int, dict[str, Any]] = {}
+        if text is not None:
+            self._parse(text)
+
+    def _parse(self, text: bytes) -> None:
+        try:
+            manifest = json.loads(text)
+            if manifest["version"] != _VERSION:
+                raise ValueError(f"version {manifest['version']}")
+            self.about = dict(manifest["about"])
+            self._shards = {int(i): dict(shard) for i, shard in manifest["shards"].items()}
+            for i, shard in self._shards.items():
+                if shard["file"] != _name(i) or not isinstance(shard["sha256"], str):
+                    raise ValueError(f"shard {i}")
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ShardError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set anew") from error
+
+    @property
+    def numbers(self) -> list[int]:
+        """Of the finished shards, in order."""
+        return sorted(self._shards)
+
+    @property
+    def episodes(self) -> int:
+        """Of all finished shards."""
+        return sum(shard["episodes"] for shard in self._shards.values())
+
+    def episodes_of(self, number: int) -> int:
+        """Of one finished shard."""
+        return self._shards[number]["episodes"]
+
+    def read(self, number: int) -> dict[str, np.ndarray]:
+        """The arrays of a shard.
+
+        Raises:
+            ShardError: the shard is missing, or is not the one of the manifest.
+        """
+        shard = self._shards[number]
+        path = f"{self.url}/{shard['file']}"
+        try:
+            content = self._files.cat_file(f"{self._root}/{shard['file']}")
+        except OSError as error:
+            raise ShardError(f"{path} cannot be read: {error}") from error
+        if hashlib.sha256(content).hexdigest() != shard["sha256"]:
+            raise ShardError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
+        return files.arrays_of(content, path, _LIMIT)
+
+    def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
+        """The shards one after another, in order."""
+        return map(self.read, self.numbers)
+
+    def begin(self, about: Mapping[str, Any]) -> None:
+        """Says what the set is made from, before the first shard is written.
+
+        Raises:
+            ValueError: the folder holds a set that is made from something else.
+        """
+        if self.about is not None:
+            jobs.check_same(self.about, about, Path(self.url), "a set")
+            return
+        self.about = json.loads(json.dumps(dict(about)))
+        self._write_manifest()
+
+    def write(self, number: int, arrays: Arrays, episodes: int) -> None:
+        """Adds a shard."""
+        content = files.npz(arrays, compressed=False)  # trajectories hardly shrink, and one process writes all shards
+        self._write(_name(number), content)
+        digest = hashlib.sha256(content).hexdigest()
+        self._shards[number] = {
+            "file": _name(number),
+            "episodes": episodes,
+            "bytes": len(content),
+            "sha256": digest,
+        }
+        self._write_manifest()
+
+    def _write_manifest(self) -> None:
+        manifest = {"version": _VERSION, "about": self.about, "shards": {i: self._shards[i] for i in self.numbers}}
+        self._write(MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+
+    def _write(self, name: str, content: bytes) -> None:
+        path = f"{self._root}/{name}"
+        if isinstance(self._files, LocalFileSystem):
+            files.write(path, content)
+        else:  # objects appear whole
+            self._files.pipe_file(path, content)
+
+
+def _name(number: int) -> str:
+    return f"shard-{number:06d}.npz"
+
+
+def is_set(path: str | Path) -> bool:
+    """Whether a path is the URL or the folder of a set of shards."""
+    return "://" in str(path) or (Path(path) / MANIFEST).is_file()
+
+
+def make(
+    url: str,
+    about: Mapping[str, Any],
+    episodes: int,
+    function: Callable[..., Iterator[jobs.Entry]],
+    arguments: tuple[Any, ...],
+    arrays_of: Callable[[Sequence[jobs.Entry]], Arrays],
+    out: Path,
+    workers: int | Workers,
+    on_progress: Callable[[int], None],
+    per_shard: int = EPISODES,
+) -> Shards:
+    """Makes what is missing of a set, episode by episode on workers, and keeps nothing of a shard that is written.
+
+    Args:
+        url: of the set.
+        about: what decides the episodes besides their numbers; anything that JSON holds.
+        episodes: how many, from number 0.
+        function: called as function(*arguments, numbers) on a worker; yields an entry for every episode.
+        arguments: of the function.
+        arrays_of: gives the arrays of some episodes by name, or none, on the worker. They are joined along their first axis.
+        out: folder of this machine for what is unfinished, by which a killed run continues.
+        workers: a number of processes, or `Workers`.
+        on_progress: called with a number of episodes that are there.
+        per_shard: episodes of a shard.
+
+    Raises:
+        ValueError: the set is made from something else, or another process is making it.
+        WorkerError: processes died, so that episodes are missing.
+    """
+    shards = Shards(url)
+    about = {**about, "per_shard": per_shard}
+    jobs.claim(out, {"shards": url, **about})
+    shards.begin(about)
+    kept = set(shards.numbers)
+    parts: dict[int, dict[int, Arrays]] = {}  # by shard and first episode
+    where: dict[int, tuple[int, int]] = {}  # the shard and first episode of a job that is not done
+
+    def ranges(shard: int) -> list[range]:
+        last = min((shard + 1) * per_shard, episodes)
+        return [range(start, min(start + _CHUNK, last)) for start in range(shard * per_shard, last, _CHUNK)]
+
+    def is_kept(shard: int) -> bool:
+        return shard in kept and shards.episodes_of(shard) == sum(map(len, ranges(shard)))
+
+    def work() -> Iterator[jobs.Job]:
+        number = 0
+        for shard in range(-(-episodes // per_shard)):
+            if is_kept(shard):
+                on_progress(sum(map(len, ranges(shard))))
+                continue
+            for part in ranges(shard):
+                where[number] = shard, part.start
+                number += 1
+                item = part.start, part.stop
+                yield jobs.Job(_job_name(part.start), _made, (function, arguments, arrays_of), (item,))
+
+    for number, (entry,) in jobs.stream(work(), out, workers, lambda group, count: None):
+        shard, start = where.pop(number)
+        parts.setdefault(shard, {})[start] = files.arrays_of(base64.b64decode(entry[_ARRAYS]), "what a worker sent")
+        wanted = ranges(shard)
+        on_progress(next(len(part) for part in wanted if part.start == start))
+        if len(parts[shard]) == len(wanted):
+            made = parts.pop(shard)
+            in_order = [made[part.start] for part in wanted if made[part.start]]
+            names = in_order[0] if in_order else ()
+            joined = {name: np.concatenate([each[name] for each in in_order]) for name in names}
+            shards.write(shard, joined, sum(map(len, wanted)))
+            for part in wanted:
+                jobs.forget(out, _job_name(part.start))
+    jobs.release(out)
+    return shards
+
+
+def _made(
+    function: Callable[..., Iterator[jobs.Entry]],
+    arguments: tuple[Any, ...],
+    arrays_of: Callable[[Sequence[jobs.Entry]], Arrays],
+    items: Sequence[tuple[int, int]],
+) -> Iterator[jobs.Entry]:
+    """The arrays of some ranges of episodes, on a worker."""
+    for start, stop in items:
+        arrays = arrays_of(list(function(*arguments, range(start, stop))))
+        yield {_ARRAYS: base64.b64encode(files.npz(arrays, compressed=False)).decode()}
+
+
+def _job_name(start: int) -> str:
+    return f"{start:09d}"
