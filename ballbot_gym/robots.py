@@ -87,7 +87,7 @@ def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
         if robot != PAPER:
             raise ValueError("give either robot or params, not both: robot takes a name or a BallbotParams")
         robot = params
-    if isinstance(robot, str):
+    if params is None and isinstance(robot, str):
         return named_robot(robot)
     if not isinstance(robot, BallbotParams):
         raise TypeError(

@@ -313,7 +313,7 @@ def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
     task = make_task("turn")
     full = certified.load(task)
     monkeypatch.setattr(certified, "EPISODES", 2)
-    monkeypatch.setattr(certified, "path_of", lambda task: tmp_path / "package" / f"{task.id}.npz")
+    monkeypatch.setattr(certified, "path_of", lambda task, robot: tmp_path / "package" / f"{task.id}.npz")
     certify(("turn",), 2, out=tmp_path / "out", workers=1)
     assert not (tmp_path / "package").exists()
     certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
