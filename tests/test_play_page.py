@@ -343,6 +343,37 @@ def shown(browser, words, seconds=120.0):
     wait_for(lambda: words in browser.execute_script("return document.body.innerText"), seconds)
 
 
+def focus(browser, has):
+    """Whether the page has the focus; without it viser's page does not try again where its first connection fails."""
+    browser.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", {"enabled": has})
+
+
+def choose(browser, present, wanted):
+    """Chooses another controller in the page, as a hand does."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    find = "return [...document.querySelectorAll('input')].filter(i => i.value == arguments[0])[0]"
+    offered = (
+        "return [...document.querySelectorAll('[role=option]')].filter(o => o.innerText.trim() == arguments[0])[0]"
+    )
+    browser.execute_script(find, present).click()
+    option = WebDriverWait(browser, 60).until(lambda _: browser.execute_script(offered, wanted))
+    browser.execute_script("arguments[0].click()", option)
+
+
+def watched(opened):
+    """A list that gets the place of the robot after every step from now on."""
+    places, step = [], opened.playground.step
+
+    def recorded():
+        moved = step()
+        places.append(opened.playground.main.x[:2])
+        return moved
+
+    opened.playground.step = recorded
+    return places
+
+
 def severe(browser):
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
 
@@ -352,6 +383,8 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     one, two = chromium(), chromium()
     port = opened.viewer.port
     address = f"{opened.viewer.address}/?fixedDpr=0.1"  # large pixels, because the processor draws them
+    for browser in (one, two):
+        focus(browser, True)
     one.get(address)
     shown(one, "LQR")
     wait_for(lambda: len(opened.viewer.server.get_clients()) == 1)
@@ -370,6 +403,17 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     wait_for(lambda: opened.playground.main.samples[-1].tilt > max(before, np.radians(4)), 60)
     assert opened.playground._runners["you"].samples
 
+    # the ghost gets the push too, and the driver chooses another controller: the robot goes on where it is
+    leaning = [sample.tilt for sample in opened.playground._runners["you"].samples]
+    assert max(leaning[-200:]) > np.radians(4)
+    opened.do(lambda: opened.playground.set_ghosts([]))
+    places = watched(opened)
+    choose(one, "LQR", "you")
+    wait_for(lambda: opened.playground.main.name == "you", 60)
+    choose(one, "you", "LQR")
+    wait_for(lambda: opened.playground.main.name == "lqr", 60)
+    assert np.abs(np.diff(places, axis=0)).max() < 0.02 * 8  # m: a control step at less than 8 m/s
+
     # a reload in the middle: the page comes back, and whoever acts first drives
     one.refresh()
     shown(one, "LQR")
@@ -377,7 +421,9 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     for browser in (one, two):
         assert severe(browser) == []
 
-    # the server is stopped and started: the pages come back by themselves
+    # the server is stopped and started: the pages come back by themselves, even those that have not the focus
+    for browser in (one, two):
+        focus(browser, False)
     opened.close()
     again = Opened(tmp_path, port=port, task="orbit")
     try:
