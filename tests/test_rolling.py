@@ -401,6 +401,7 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
     assert [entry.get("draw") for entry in entries] == [None, 2]
     made = certification.evaluation_set(task, rolling, entries)
     np.testing.assert_array_equal(made.states[1], certification.episode(task, rolling, 1, 2)[0])
+    np.testing.assert_array_equal(certification.arrays(entries, task, rolling)["states"], made.states)
     refused.append(certification.episode(Stabilize(), default_params(), 0)[0])
     assert "error" in next(certification.entries("stabilize", [0], "paper", 5))
 

@@ -76,6 +76,11 @@ def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: i
     return _entry(index, optimum) | ({"draw": draw} if draw else {})
 
 
+def _start(task: Task, params: BallbotParams, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
+    """Initial state and constants of the episode of an entry, of whichever draw it is."""
+    return episode(task, params, entry["episode"], entry.get("draw", 0))
+
+
 def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) -> EvaluationSet:
     """The set of the first episodes.
 
@@ -96,7 +101,7 @@ def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) 
             raise ValueError(
                 f"entry {index} of {task.id} is of episode {entry['episode']}; give episodes 0, 1, 2, … in order"
             )
-    episodes = [episode(task, params, index, entry.get("draw", 0)) for index, entry in enumerate(entries)]
+    episodes = [_start(task, params, entry) for entry in entries]
     return EvaluationSet(
         states=np.array([x for x, _ in episodes]),
         constants=np.array([c for _, c in episodes]),
@@ -122,7 +127,7 @@ def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[
     """
     found = [entry for entry in entries if "error" not in entry]
     failed = [entry for entry in entries if "error" in entry]
-    starts = [episode(task, params, entry["episode"]) for entry in found]
+    starts = [_start(task, params, entry) for entry in found]
 
     def joined(name: str, width: int) -> np.ndarray:
         return np.concatenate([np.zeros((0, width)), *(np.reshape(entry[name], (-1, width)) for entry in found)])
