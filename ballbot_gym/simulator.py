@@ -193,9 +193,8 @@ class BulletContactSimulator(BulletSimulator):
         for point in points:
             for force, direction in ((point[9], point[7]), (point[10], point[11]), (point[12], point[13])):
                 for i in range(3):
-                    total[i] += (
-                        self._substeps * force * direction[i]
-                    )  # Bullet divides a substep's impulse by the whole step
+                    # Bullet divides a substep's impulse by the whole step
+                    total[i] += self._substeps * force * direction[i]
         return total[0], total[1], total[2]
 
     def height(self) -> float:

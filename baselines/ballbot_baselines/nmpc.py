@@ -44,9 +44,8 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-_BACKOFF = Backoff(
-    margin=0.01, goal=0.05, force=0.02, grip=0.1
-)  # of the plan; for the goal it is half of TrajoptController's
+# of the plan; for the goal it is half of TrajoptController's
+_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02, grip=0.1)
 _OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05, grip=0.1)  # what is left of a wrong model
 _SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
 _NODES = 40
