@@ -1,12 +1,12 @@
 """`ballbot transfer`: controllers made for one robot, run on another."""
 
-import os
 from pathlib import Path
 
 from ballbot_gym import files
 from ballbot_gym.robots import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
+from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import (
     Physics,
     RobotName,
@@ -20,6 +20,7 @@ from ballbot_train.console import (
 )
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, policy_digests
+from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
 
@@ -34,7 +35,7 @@ def transfer(
     physics: Physics | None = None,
     seed: int = 0,
     out: Path = Path("runs/transfer"),
-    workers: int = os.cpu_count() or 1,
+    workers: WorkersOption = Workers(),
 ) -> None:
     """Runs controllers that were made for one robot on another: success, falls and cost over that robot's optimum.
 
@@ -49,10 +50,9 @@ def transfer(
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed, with contact where the ball rolls.
         seed: of the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
-        workers: processes.
+        workers: who does the work.
     """
     check_some("robot", made_for, ROBOTS)
-    check_least(1, workers=workers)
     check_least(0, seed=seed)
     floors = frictions or (None,)
     for friction in floors:
@@ -69,7 +69,7 @@ def transfer(
         "physics": physics,
         "seed": seed,
     }
-    facts = provenance() | settings | {"workers": workers}
+    facts = provenance() | settings | {"workers": Workers.of(workers).named}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
     totals = dict.fromkeys(tasks, 0)
     for group in chosen.values():

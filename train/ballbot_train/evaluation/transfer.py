@@ -16,9 +16,10 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import named_robot
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.controllers import make_packed, packed
 from ballbot_train.evaluation.evaluate import iterate_episodes
 from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
+from ballbot_train.executors import Workers
 
 _CHUNK = 5  # episodes of a job
 
@@ -68,7 +69,7 @@ def run(
     episodes: int,
     physics: str,
     out: Path,
-    workers: int,
+    workers: int | Workers,
     on_progress: Callable[[str, int], None],
     seed: int = 0,
 ) -> list[TransferResult]:
@@ -81,7 +82,7 @@ def run(
         episodes: certified episodes of each task, from the first.
         physics: "bullet" or "rk4".
         out: folder of the results.
-        workers: processes.
+        workers: a number of processes, or `Workers`.
         on_progress: called with a task and a number of finished episodes.
         seed: of whatever is drawn.
     """
@@ -98,7 +99,7 @@ def run(
                         job = jobs.Job(
                             name=f"{slug}-{value:g}-{physics}-{start:03d}",
                             function=_entries,
-                            arguments=(task, name, made_for, robot, friction, physics, seed),
+                            arguments=(task, name, packed(name), made_for, robot, friction, physics, seed),
                             items=items,
                             group=task,
                         )
@@ -110,6 +111,7 @@ def run(
 def _entries(
     task: str,
     controller: str,
+    files_of: Mapping[str, bytes],
     made_for: str,
     robot: str,
     friction: float | None,
@@ -118,7 +120,7 @@ def _entries(
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     env = BallbotEnv(task, physics=physics, robot=floor(robot, friction))
-    made = make_controller(controller, make_task(task, made_for), named_robot(made_for))
+    made = make_packed(controller, files_of, make_task(task, made_for), named_robot(made_for))
     for result in iterate_episodes(env, made, controller, task, episodes, seed):
         yield asdict(result)
     env.close()
