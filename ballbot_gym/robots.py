@@ -61,6 +61,11 @@ def named_robot(name: str) -> BallbotParams:
     return BallbotParams.from_urdf(ROBOTS[name].urdf)
 
 
+def file_name(name: str, robot: str) -> str:
+    """A name of a file or folder, with that of the robot by name; the paper's robot adds nothing."""
+    return name if robot == PAPER else f"{name}-{robot}"
+
+
 def robot_name(params: BallbotParams) -> str:
     """The name in `ROBOTS` of a robot, or of the one that it is a variant of.
 

@@ -13,7 +13,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot, robot_name
+from ballbot_gym.robots import PAPER, file_name, named_robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -73,7 +73,7 @@ _PER_EPISODE = ("states", "constants", "costs", "durations", "violations", "stat
 
 def path_of(task: Task, robot: str = PAPER) -> Path:
     """Where the package keeps the evaluation set of a task and a robot by name."""
-    return Path(__file__).parent / (f"{task.id}.npz" if robot == PAPER else f"{task.id}-{robot}.npz")
+    return Path(__file__).parent / f"{file_name(task.id, robot)}.npz"
 
 
 def load(task: str | Task, path: str | Path | None = None, robot: str | BallbotParams = PAPER) -> EvaluationSet:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
-from ballbot_gym.robots import PAPER, ROBOTS
+from ballbot_gym.robots import PAPER, ROBOTS, file_name
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
 
@@ -137,7 +137,7 @@ def shipped_policies(task: Task, robot: str = PAPER) -> dict[str, Path]:
     name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
     if name is None:
         return {}
-    start = f"{name}-" if robot == PAPER else f"{name}-{robot}-"
+    start = f"{file_name(name, robot)}-"
     found = {path.stem.removeprefix(start): path for path in sorted(SHIPPED.glob(f"{start}*.json"))}
     return {learner: path for learner, path in found.items() if learner.partition("-")[0] not in ROBOTS}
 

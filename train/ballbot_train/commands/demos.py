@@ -7,7 +7,7 @@ import numpy as np
 
 from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
@@ -50,7 +50,7 @@ def demos(
     check_names("task", [task], TASKS)
     physics = physics_or_default(physics)
     config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed, robot)
-    kind = task if robot == PAPER else f"{task}-{robot}"
+    kind = file_name(task, robot)
     named = out
     out = Path("runs") / "demos" / f"{kind}-{expert}-v0" if out is None else out
     with progress_bar() as progress:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
@@ -125,8 +125,7 @@ def _fresh(
         )
     if optima:
         with progress_bars({task: optima}) as bars:
-            kind = task if robot == PAPER else f"{task}-{robot}"
-            folder = out.parent / "optima" / f"{kind}-{seed}"
+            folder = out.parent / "optima" / f"{file_name(task, robot)}-{seed}"
             found = fresh.find_optima(task, optima, seed, folder, workers, bars.advance, robot)
         result = replace(result, optima=found)
     binned = result.bins(count)

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
@@ -94,7 +94,7 @@ def _read(
     check_names("expert", [ghost_by], CONTROLLERS)
     _check(bool(controllers), "give at least one controller")
     shown = certified_replay(task, controllers, episode, physics, robot=robot)
-    made = task if robot == PAPER else f"{task}-{robot}"
+    made = file_name(task, robot)
     name = f"{made}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
     if ghosts:
         shown = with_companions(shown, certified_replay(task, ghosts, episode, physics, robot=robot))

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from ballbot_gym.robots import PAPER, file_name, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
@@ -24,7 +25,7 @@ class Run:
 
     task: str = "stabilize"
     """Name of a task."""
-    robot: RobotName = "paper"
+    robot: RobotName = PAPER
     """Name of a robot."""
     demos: str | None = None
     """Folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards."""
@@ -59,7 +60,7 @@ def train(
     command: str | None = None,
     seeds: str | None = None,
     workers: int | Workers = 1,
-    robot: RobotName = "paper",
+    robot: RobotName = PAPER,
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
@@ -97,7 +98,6 @@ def train(
     import torch
 
     from ballbot_gym.env import make_task
-    from ballbot_gym.robots import PAPER, named_robot
     from ballbot_gym.simulator import PHYSICS_NAMES
     from ballbot_train.learning import training
     from ballbot_train.learning.demonstrations import command_of
@@ -108,7 +108,7 @@ def train(
     problem = make_task(task, robot)
     settings = algorithm.settings(task) if settings is None else settings
     check_settings(settings)
-    kind = task if robot == PAPER else f"{task}-{robot}"
+    kind = file_name(task, robot)
     out = Path("runs") / "train" / f"{kind}-{learner}" if out is None else out
     if command is None:
         command = command_with(learner, Run(task, robot, _text(demos), start, seed, threads=threads, out=out), settings)
@@ -150,14 +150,14 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Wor
     seeds = queue.parse_seeds(named)
     settings = LEARNERS[learner].settings(run.task) if settings is None else settings
     check_settings(settings)
-    kind = run.task if run.robot == "paper" else f"{run.task}-{run.robot}"
+    kind = file_name(run.task, run.robot)
     out = Path("runs") / "train" / f"{kind}-{learner}" if run.out is None else run.out
 
     def command_of(seed: int) -> str:
         return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
 
     expected = {"learner": learner, "task": run.task, "settings": asdict(settings)}
-    if run.robot != "paper":
+    if run.robot != PAPER:
         expected["robot"] = run.robot
     inputs = [
         *([Path(run.demos)] if run.demos and "://" not in run.demos else []),
@@ -234,7 +234,7 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
     for name, value in _shallow(run).items():
-        if value is not None and name not in ("resume", "seeds", "workers") and (name, value) != ("robot", "paper"):
+        if value is not None and name not in ("resume", "seeds", "workers") and (name, value) != ("robot", PAPER):
             words += [f"--{name}", str(value)]
     for name, value in asdict(settings).items():
         words += _option(name.replace("_", "-"), value)
