@@ -4,9 +4,10 @@
 
 NMPC runs beside a ghost, is pushed every few seconds, and a page that somebody watches is drawn 30 times per second. Run it
 on a quiet machine. Controllers are made, and solvers compiled, before time counts. As in `ballbot play` another process plans
-the next episode every 8 s, and that counts. Memory is that of both processes. Its growth is counted from the first minute on,
-because plots and traces are full by then. Exit status 1 says that the real-time factor is below 0.99, that more than 0.1 % of
-the steps began later than 20 ms after their time, or that memory grew by more than `--growth` MiB.
+the next episode every 8 s, and that counts. Beside it, a loop that does nothing but wait counts how often the machine itself
+is late. Memory is that of both processes of the playground. Its growth is counted from the first minute on, because plots and
+traces are full by then. Exit status 1 says that the real-time factor is below 0.99, that more than 0.1 % of the steps began
+later than 20 ms after their time, or that memory grew by more than `--growth` MiB.
 """
 
 import math
@@ -15,13 +16,14 @@ import resource
 import sys
 import time
 from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import tyro
 
 from ballbot_gym import files
 from ballbot_gym.viewer import Viewer
-from ballbot_train.play.clock import LATE, Timing
+from ballbot_train.play.clock import LATE, Clock, Timing
 from ballbot_train.play.page import PlayPage
 from ballbot_train.play.playground import Playground
 
@@ -44,6 +46,9 @@ class Result:
     real_time_factor: float
     late_percent: float
     worst_lateness_ms: float
+    idle_late_percent: float
+    """Of the loop that only waits."""
+    idle_worst_lateness_ms: float
     cpu_share: float
     memory_before: float
     memory_after: float
@@ -65,6 +70,15 @@ def watch(port: int) -> None:
     with connect(f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as client:
         while True:
             client.recv()
+
+
+def idle(dt: float, there: Connection) -> None:
+    """Waits for steps that do nothing until it is asked, then sends how late they were."""
+    clock = Clock(dt)
+    while not there.poll():
+        clock.take()
+        time.sleep(clock.wait())
+    there.send(clock.timing)
 
 
 def measure(
@@ -95,6 +109,11 @@ def measure(
     playground.settle()
     page.run(_PUSH_EVERY)  # the watcher has come
     page.clock.timing = Timing()
+    here, there = multiprocessing.get_context("spawn").Pipe()
+    waiter = multiprocessing.get_context("spawn").Process(
+        target=idle, args=(playground.task.control_dt, there), daemon=True
+    )
+    waiter.start()
     began, cpu = time.perf_counter(), time.process_time()
     end, count, sizes = began + 60 * minutes, 0, [memory(playground)]
     while (left := end - time.perf_counter()) > 0:
@@ -106,6 +125,8 @@ def measure(
             print(f"minute {len(sizes) - 1}: {sizes[-1]:.0f} MiB, {page.clock.timing.late} late steps", flush=True)
     sizes.append(memory(playground))
     seconds, timing = time.perf_counter() - began, page.clock.timing
+    here.send(None)
+    waited: Timing = here.recv()
     result = Result(
         task=task,
         controller=controller,
@@ -116,6 +137,8 @@ def measure(
         real_time_factor=timing.real_time_factor,
         late_percent=100 * timing.late_share,
         worst_lateness_ms=1e3 * timing.worst,
+        idle_late_percent=100 * waited.late_share,
+        idle_worst_lateness_ms=1e3 * waited.worst,
         cpu_share=(time.process_time() - cpu) / seconds,
         memory_before=sizes[1],
         memory_after=sizes[-1],
