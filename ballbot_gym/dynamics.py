@@ -23,6 +23,7 @@ gives f = F − (I_b/r²) p̈. The height of the body's centre, with h n_z = m·
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 from ballbot_gym import ops
@@ -176,6 +177,11 @@ def grip_limits(params: BallbotParams, force: tuple[Any, Any, Any], backoff: Any
     load = normal / weight - backoff
     slip = ops.squared(fx, fy) / (weight * params.friction) ** 2
     return load - LEAST_NORMAL_FORCE, ops.squared(load) - slip
+
+
+def keeps_grip(params: BallbotParams, forces: Iterable[tuple[float, float, float]]) -> bool:
+    """Whether the floor can give all of these forces (f_x, f_y, N), N, on a ball."""
+    return all(limit >= 0 for force in forces for limit in grip_limits(params, force))
 
 
 def grip_reserve(params: BallbotParams, force: tuple[Any, Any, Any]) -> Any:

@@ -362,8 +362,7 @@ class BallbotEnv(gymnasium.Env):
         robot = self.episode_params
         asked = dynamics.held_contact(robot, x, total, self.task.control_dt)
         needed = max(map(dynamics.needed_friction, asked))
-        lost = not all(limit >= 0 for force in asked for limit in dynamics.grip_limits(robot, force))
-        return (*asked[0], needed), lost
+        return (*asked[0], needed), not dynamics.keeps_grip(robot, asked)
 
     def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Initial state and constants. Those that the options do not give are drawn."""

@@ -247,6 +247,31 @@ def test_another_task_keeps_the_controllers_that_it_has(play):
     assert (playground.task_name, playground.controller, playground.ghosts) == ("orbit", "lqr", ("you",))
 
 
+@pytest.mark.parametrize("robot", "seed"), [("rolling", 0), ("rolling", 1)])
+@pytest.mark.parametrize("physics", ["rk4", "bullet"])
+def test_an_episode_of_another_robot_is_that_of_the_env(play, robot, seed, physics):
+    if physics == "bullet":
+        pytest.importorskip("pybullet")
+    playground = play(robot=robot, episode=None, seed=seed, physics=physics)
+    (state, constants), env = playground._start, BallbotEnv("stabilize", robot=robot, physics=physics)
+    controller = CONTROLLERS["lqr"](env.task, env.params)
+    expected = rollout(env, controller, options={"state": state, "constants": constants})
+    while not playground.scores:
+        playground.step()
+    (score,) = playground.scores
+    assert score.cost == pytest.approx(expected.cost, rel=1e-6)
+    assert (score.failure != "") == expected.failure
+
+
+def test_another_robot_keeps_the_controllers_that_it_has(play):
+    playground = play(controller="lqr", ghosts=["you", "shac"])
+    playground.set_robot("kugle")
+    playground.settle()
+    assert playground.step()
+    assert (playground.robot, playground.controller, playground.ghosts) == ("kugle", "lqr", ("you",))
+    assert playground.params.total_mass == pytest.approx(1.478 + 16.154)
+
+
 # --- bad input ---
 
 

@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import Literal
 
+from ballbot_gym.robots import PAPER
 from ballbot_gym.viewer import HOST, PORT, Viewer, import_viser
-from ballbot_train.console import console
+from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.play.gate import Gate
 from ballbot_train.play.page import PlayPage
@@ -21,7 +22,7 @@ def play(
     policies: tuple[str, ...] = (),
     episode: int | None = 0,
     physics: Literal["bullet", "rk4"] | None = None,
-    robot: str = "paper",
+    robot: RobotName = PAPER,
     seed: int = 0,
     host: str = HOST,
     port: int = PORT,
@@ -43,7 +44,7 @@ def play(
         port: where the page is; the next free one, if it is taken.
         out: folder of saved files.
     """
-    task = task_name(controller, task)
+    task = task_name(controller, task, robot)
     import_viser()
     playground = Playground(task, controller, ghosts, physics, episode, seed, robot, policies, other_process=True)
     local = host in _LOCAL

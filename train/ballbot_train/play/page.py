@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
 from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play.clock import Clock
-from ballbot_train.play.playground import AT_END, DRIVERS, LARGEST_PUSH, PLANT, ROBOTS, Playground
+from ballbot_train.play.playground import AT_END, DRIVERS, LARGEST_PUSH, PLANT, Playground
 from ballbot_train.play.tunable import weight_names
 from ballbot_train.report import labels
 from ballbot_train.report.replay import Replay
@@ -248,12 +249,11 @@ class PlayPage:
                 playground.set_task,
                 lambda: playground.task_name,
             )
-            if len(ROBOTS) > 1:
-                self._bind(
-                    gui.add_dropdown("Robot", tuple(ROBOTS), initial_value=playground.robot),
-                    playground.set_robot,
-                    lambda: playground.robot,
-                )
+            self._bind(
+                gui.add_dropdown("Robot", tuple(ROBOTS), initial_value=playground.robot),
+                playground.set_robot,
+                lambda: playground.robot,
+            )
             self._controller = gui.add_dropdown("Controller", ("",))
             self._bind(self._controller, self._choose, lambda: self._option(playground.controller))
             file = gui.add_text("Policy file", "", hint=_FILE_HINT)

@@ -17,8 +17,9 @@ from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_gym import certified
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.rollout import Controller
 from ballbot_gym.simulator import default_physics
 from ballbot_gym.tasks import TASKS, Task
@@ -40,9 +41,6 @@ from ballbot_train.play.tunable import Tunable, weight_names
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.report import labels
 from ballbot_train.report.replay import Replay, Take
-
-ROBOTS: dict[str, Callable[[], BallbotParams]] = {"paper": default_params}
-"""Every robot by its name in the page."""
 
 DRIVERS: dict[str, Literal["force", "speed"]] = {"you": "speed", "you (force)": "force"}
 """Controllers that are human: by name, what the stick commands."""
@@ -131,7 +129,7 @@ class Playground:
         physics: str | None = None,
         episode: int | None = 0,
         seed: int = 0,
-        robot: str = "paper",
+        robot: str = PAPER,
         policies: Sequence[str] = (),
         other_process: bool = False,
     ):
@@ -145,7 +143,7 @@ class Playground:
             physics: "bullet" or "rk4"; default, as for environments.
             episode: index of a certified episode; None for a random start.
             seed: of random starts, sensor noise and random pushes.
-            robot: name in `ROBOTS`.
+            robot: name in `robots.ROBOTS`.
             policies: paths of more policies that can be chosen in the tasks that they are made for.
             other_process: whether another process plans, so that planning takes no time from a simulation in real time. A
                 script that asks for it needs the guard `if __name__ == "__main__":`.
@@ -156,7 +154,7 @@ class Playground:
         """
         self.physics = default_physics() if physics is None else physics
         self.robot = _known("robot", robot, ROBOTS)
-        self.params = ROBOTS[robot]()
+        self.params = named_robot(robot)
         self.stick = Stick()
         self.at_end: AtEnd = "go on"
         self.scores: list[Score] = []
@@ -308,20 +306,15 @@ class Playground:
         Raises:
             ValueError: no task of this name.
         """
-        _known("task", task, TASKS)
-        known = self._controllers_of(make_task(task))
-        ghosts = [ghost for ghost in self.ghosts if ghost in known]
-        self._open_task(task, self.controller if self.controller in known else "nmpc", ghosts, 0)
+        self._change(_known("task", task, TASKS), self.robot)
 
     def set_robot(self, robot: str) -> None:
-        """Another robot, in the same task.
+        """Another robot, in the same task, under the same controllers where it has them.
 
         Raises:
             ValueError: no robot of this name.
         """
-        self.robot = _known("robot", robot, ROBOTS)
-        self.params = ROBOTS[robot]()
-        self._open_task(self.task_name, self.controller, self.ghosts, self.episode)
+        self._change(self.task_name, _known("robot", robot, ROBOTS))
 
     def set_controller(self, name: str) -> None:
         """Another controller for the main robot, as soon as it is made. The robot goes on where it is.
@@ -532,7 +525,7 @@ class Playground:
 
     def _open_task(self, task: str, controller: str, ghosts: Sequence[str], episode: int | None) -> None:
         self.task_name = _known("task", task, TASKS)
-        self.base: Task = make_task(task)
+        self.base: Task = make_task(task, self.robot)
         self._fitting = self._controllers_of(self.base)
         self._check_controller(controller)
         for name in ghosts:
@@ -543,7 +536,8 @@ class Playground:
         self.task = Tunable.of(self.base)
         self.weights: dict[str, float] = {}
         """Those that differ from the task's own."""
-        self._episodes = certified.load(self.base) if certified.path_of(self.base).exists() else None
+        known = certified.path_of(self.base, self.robot).exists()
+        self._episodes = certified.load(self.base, robot=self.robot) if known else None
         self._runners, self._wanted = {}, {}
         self._next: dict[str, Controller] = {}
         self._add_runner("main", controller)
@@ -555,6 +549,13 @@ class Playground:
         else:
             self.start_certified(episode)
 
+    def _change(self, task: str, robot: str) -> None:
+        """Opens a task for a robot, with the present controllers that are made for them."""
+        self.robot, self.params = robot, named_robot(robot)
+        known = self._controllers_of(make_task(task, robot))
+        ghosts = [ghost for ghost in self.ghosts if ghost in known]
+        self._open_task(task, self.controller if self.controller in known else "nmpc", ghosts, 0)
+
     def _add_runner(self, key: str, name: str) -> None:
         self._wanted[key] = name
         runner = self._runners[key] = Runner(name, self.task, self.params, self.physics)
@@ -565,9 +566,10 @@ class Playground:
         own = []
         for policy in self._policies:
             with contextlib.suppress(PolicyError):  # a file that is gone by now
-                own += [policy] * is_made_for(policy, task)
-        experts = [name for name in names(task) if is_expert(name)]
-        return [*experts, *VARIANTS, *(name for name in names(task) if name not in experts), *own, *DRIVERS]
+                own += [policy] * is_made_for(policy, task, self.robot)
+        known = names(task, self.robot)
+        experts = [name for name in known if is_expert(name)]
+        return [*experts, *VARIANTS, *(name for name in known if name not in experts), *own, *DRIVERS]
 
     def _check_controller(self, name: str) -> None:
         """Raises a ValueError where nothing has this name. What is in a policy file is found out when it is loaded."""

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ballbot_gym import dynamics
+from ballbot_gym.env import GRIP
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.rollout import Controller
-from ballbot_gym.simulator import PHYSICS, State
+from ballbot_gym.simulator import State, make_simulator
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.tunable import Tunable
 
@@ -53,7 +54,7 @@ class Runner:
         self._task, self._nominal = task, params
         self._controller_start = 0
         self._act_seconds = 0.0
-        self._simulator = PHYSICS[physics](params, task.control_dt)
+        self._simulator = make_simulator(physics, params, task.control_dt)
         self.set_plant(Randomization())
         self.begin(self.x)
 
@@ -105,7 +106,8 @@ class Runner:
         self._drawn = randomization.draw((0.5,) * Randomization.EPISODE_DRAWS, dt)
         self._disturbance = Disturbance(randomization, self._nominal, dt)
         self._disturbance.begin(self._drawn)
-        self._simulator.set_params(randomization.robot(self._nominal, self._drawn[:4]))
+        self._true = randomization.robot(self._nominal, self._drawn[:4])
+        self._simulator.set_params(self._true)
         self._simulator.reset(self.x)
 
     def act(self, step: int, noise: tuple[float, ...]) -> tuple[float, float]:
@@ -146,8 +148,10 @@ class Runner:
         self.force = self._disturbance.actuate(command)
         self.push = push
         self.cost += task.cost(self.x, self.force, c) * dt
-        x = self._simulator.step((self.force[0] + push[0], self.force[1] + push[1]))
-        self.violated = task.violated(x, c)
+        total = (self.force[0] + push[0], self.force[1] + push[1])
+        slips = self._slips(total)
+        x = self._simulator.step(total)
+        self.violated = task.violated(x, c) or (GRIP if slips else "")
         if not all(map(math.isfinite, x)):
             x = self.x
         self.arrived = task.first_exit and not self.violated and task.is_goal(x, c)
@@ -159,6 +163,13 @@ class Runner:
         self._forces.append(self.force)
         if self.violated:
             self.cost += task.survival_reward * seconds_left
+
+    def _slips(self, total: tuple[float, float]) -> bool:
+        """Whether a force, N, asks the floor for more than it can give, where contact is not simulated."""
+        if not self._true.grips or self._simulator.floor_force() is not None:
+            return False
+        asked = dynamics.held_contact(self._true, self.x, total, self._task.control_dt)
+        return not dynamics.keeps_grip(self._true, asked)
 
     def weigh_again(self, c: tuple[float, ...]) -> None:
         """Counts the cost so far with other weights."""
