@@ -247,7 +247,7 @@ def test_another_task_keeps_the_controllers_that_it_has(play):
     assert (playground.task_name, playground.controller, playground.ghosts) == ("orbit", "lqr", ("you",))
 
 
-@pytest.mark.parametrize("robot", "seed"), [("rolling", 0), ("rolling", 1)])
+@pytest.mark.parametrize(("robot", "seed"), [("rolling", 0), ("rolling", 1)])
 @pytest.mark.parametrize("physics", ["rk4", "bullet"])
 def test_an_episode_of_another_robot_is_that_of_the_env(play, robot, seed, physics):
     if physics == "bullet":
