@@ -77,7 +77,10 @@ def cluster(*cores: int) -> Iterator[Cluster]:
 def timed(
     function: Callable[..., Any], argument: float, n: int, batch: int, workers: Workers, at_once: int
 ) -> tuple[float, float]:
-    """Mean time from item to item, and in an item, s, once every worker has done a first item, which does not count."""
+    """Mean time from item to item, and in an item, s, once every worker has done a first item, which does not count.
+
+    It is measured again with twice the items where less than half of them were left when the last worker had begun.
+    """
     work = [jobs.Job(f"warm-{i}", sleeping, (_WARM_SECONDS,), (0,), "warm") for i in range(at_once)]
     starts = range(0, n, batch)
     work += [
@@ -93,6 +96,8 @@ def timed(
     inside = [entry["seconds"] for entries in done[at_once:] for entry in entries]
     began = times["warm"][-1]
     counted = [each for each in times["item"] if each > began]
+    if len(counted) < n / 2:
+        return timed(function, argument, 2 * n, batch, workers, at_once)
     return (counted[-1] - began) / len(counted), float(np.mean(inside))
 
 
