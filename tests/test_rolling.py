@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import math
 from types import SimpleNamespace
+from typing import get_args
 
 import casadi
 import numpy as np
@@ -27,6 +28,7 @@ from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
+from ballbot_train.console import RobotName
 from ballbot_train.policy import load_policy
 from ballbot_train.policy_files import PolicyError, PolicySpec, shipped_policies
 
@@ -436,3 +438,7 @@ def test_a_policy_is_of_one_robot(rolling):
     assert not set(shipped_policies(make_task("turn"))) & set(ROBOTS)
     with pytest.raises(PolicyError, match="was trained on the robot 'paper', not on 'rolling'"):
         load_policy(shipped_policies(make_task("turn"))["dagger"], make_task("turn", "rolling"), rolling)
+
+
+def test_every_robot_can_be_named_on_the_command_line():
+    assert get_args(RobotName) == tuple(ROBOTS)

@@ -63,7 +63,8 @@ def evaluate(
             folder `optima` beside --out, for later calls and other policies.
         episodes: how many of the certified episodes to run in PyBullet.
         physics: of the certified episodes, "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
-        out: folder of the results; default runs/evaluate/TASK-POLICY. An interrupted run continues here.
+        out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper. An
+            interrupted run continues here.
         workers: who does the work, for optima and certified episodes.
         robot: whose episodes.
     """
@@ -87,7 +88,7 @@ def evaluate(
             f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a policy, "
             "or run the expert on certified episodes with --episodes"
         )
-    out = Path("runs") / "evaluate" / f"{task}-{Path(policy).stem}" if out is None else out
+    out = Path("runs") / "evaluate" / file_name(f"{task}-{Path(policy).stem}", robot) if out is None else out
     if fresh:
         _fresh(policy, task, fresh, seed, bins, optima, out, workers, robot)
     if episodes:
