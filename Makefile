@@ -8,7 +8,7 @@ TRIALS := benchmarks/soak.py benchmarks/faults.py benchmarks/fuzz.py
 
 .PHONY: demo test test-slow bench soak faults fuzz docs certify clients ray clean
 
-demo: $(VENV)/installed
+demo: $(VENV)/runs
 	$(BIN)/ballbot benchmark --episodes 25 --out runs/demo
 
 test: $(VENV)/installed
@@ -60,8 +60,9 @@ ray: $(VENV)/installed
 certify: $(VENV)/installed
 	$(BIN)/ballbot certify
 
-# PyBullet has no wheels for newer Pythons than 3.11. Where it is missing, uv fetches it.
-$(VENV)/installed: pyproject.toml constraints.txt
+# PyBullet has no wheels for newer Pythons than 3.11. Where it is missing, uv fetches it. `runs` is what the commands need, and
+# `installed` has the tools for tests, types and documentation too.
+$(VENV)/runs: pyproject.toml constraints.txt
 	@if command -v $(PYTHON) >/dev/null; then \
 		$(PYTHON) -m venv $(VENV); \
 	elif command -v uv >/dev/null; then \
@@ -72,6 +73,10 @@ $(VENV)/installed: pyproject.toml constraints.txt
 		exit 1; \
 	fi
 	$(BIN)/pip install -c constraints.txt "torch==2.13.0"
+	$(BIN)/pip install -c constraints.txt -e ".[train]"
+	touch $@
+
+$(VENV)/installed: $(VENV)/runs
 	$(BIN)/pip install -c constraints.txt -e ".[all,dev,docs]"
 	touch $@
 
