@@ -17,7 +17,7 @@ ROBOTS = Randomization(body_mass=(0.8, 1.2), actuator_delay=(0.0, 0.06), positio
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine):
     """The sync envs draw other episodes, so that both are started alike at each restart of ours."""
-    size, duration = 4, 0.4
+    size, duration = 4, 0.2
     ours = BallbotVectorEnv(
         size, type(task)(duration=duration), dtype=torch.float64, compile=False, engine=engine, autoreset_mode=mode
     )
@@ -41,7 +41,7 @@ def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine)
     sync.reset(seed=5)
     follow(np.ones(size, bool), infos)
     rng, ends, pending = np.random.default_rng(1), 0, np.zeros(size, bool)
-    for _ in range(600):
+    for _ in range(300):
         actions = rng.uniform(-1, 1, (size, 2)) * np.array([[0.05], [0.3], [1.0], [1.2]])
         observation, *got, infos = ours.step(actions)
         its_observation, *expected, its_infos = sync.step(actions)

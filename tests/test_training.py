@@ -37,7 +37,7 @@ SETTINGS = [
     "--total-iterations",
     "6",
     "--evaluations",
-    "3",
+    "1",
     "--num-envs",
     "4",
     "--horizon",
@@ -45,6 +45,8 @@ SETTINGS = [
     "--hidden",
     "8",
     "--no-compile",
+    "--test-episodes",
+    "8",
 ]
 
 
@@ -154,7 +156,7 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path):
     assert (killed / "policy.safetensors").read_bytes() == (whole / "policy.safetensors").read_bytes()
     measured = [json.loads((out / "policy.json").read_text())["measured"] for out in (whole, killed)]
     assert measured[0] == measured[1]
-    assert measured[0]["physics"] == "bullet"
+    assert (measured[0]["physics"], measured[0]["episodes"]) == ("bullet", 8)
     different = run(*common, "--seed", 1, "--out", killed, "--resume")
     assert different.wait() == 1
     assert "holds a run of seed" in " ".join(different.stdout.read().split())
@@ -170,6 +172,7 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path):
         (["shac", "--demos", "nothing"], 1, "shac uses no demonstrations"),
         (["shac", "--threads", "0"], 1, "threads must be 1 to 1024, not 0"),
         (["shac", *SETTINGS, "--total-iterations", "-5"], 1, "total_iterations must be 1 to 1000000000, not -5"),
+        (["shac", *SETTINGS, "--test-episodes", "201"], 1, "test_episodes must be 1 to 200, not 201"),
         (["shac", *SETTINGS, "--evaluations", "0"], 1, "evaluations must be 1 to 1000000000, not 0"),
     ],
 )
@@ -197,7 +200,7 @@ def short_run(tmp_path, monkeypatch):
     """Trains for two iterations, each followed by an evaluation, without the measurement in PyBullet."""
     task, params = TASKS["stabilize"](), default_params()
     config = shac.ShacConfig(total_iterations=2, evaluations=2, num_envs=2, horizon=2, hidden=(4,), compile=False)
-    monkeypatch.setattr(training._Run, "measure", lambda run: None)
+    monkeypatch.setattr(training._Run, "measure", lambda run, count: None)
 
     def start(resume=False):
         learner = shac.Shac(task, params, config)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from ballbot_gym import certified
 from ballbot_gym.robots import PAPER, file_name, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
@@ -42,6 +43,8 @@ class Run:
     """Threads of torch; default, torch's own choice. Another number changes the last digits."""
     out: Path | None = None
     """Folder of the run, or of all runs of --seeds; default runs/train/TASK-LEARNER."""
+    test_episodes: int = certified.EPISODES
+    """On how many of the certified episodes the policy is measured in the end, from the first."""
     resume: bool = False
     """Continue the run in this folder, if there is one."""
 
@@ -56,6 +59,7 @@ def train(
     settings: Any = None,
     threads: int | None = None,
     out: Path | None = None,
+    test_episodes: int = certified.EPISODES,
     resume: bool = False,
     command: str | None = None,
     seeds: str | None = None,
@@ -73,6 +77,7 @@ def train(
         settings: the learner's settings; default, those tuned for the task.
         threads: threads of torch; default, torch's own choice. Another number changes the last digits.
         out: folder of the run; default runs/train/TASK-LEARNER.
+        test_episodes: on how many of the certified episodes the policy is measured in the end, from the first.
         resume: continue the run in this folder, if there is one.
         command: the command that was typed, for the record; default, one with all settings.
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
@@ -86,13 +91,21 @@ def train(
         raise ValueError(f"threads must be 1 to {_MOST_THREADS}, not {threads}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
+    if not 1 <= test_episodes <= certified.EPISODES:
+        raise ValueError(f"test_episodes must be 1 to {certified.EPISODES}, not {test_episodes}")
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
     workers = Workers.of(workers)
     if workers.ray is not None and seeds is None:
         raise ValueError("--ray does the runs of --seeds; a single training runs here")
     if seeds is not None:
-        _train_seeds(learner, Run(task, robot, _text(demos), start, threads=threads, out=out), settings, seeds, workers)
+        _train_seeds(
+            learner,
+            Run(task, robot, _text(demos), start, threads=threads, out=out, test_episodes=test_episodes),
+            settings,
+            seeds,
+            workers,
+        )
         return
 
     import torch
@@ -111,7 +124,8 @@ def train(
     kind = file_name(task, robot)
     out = Path("runs") / "train" / f"{kind}-{learner}" if out is None else out
     if command is None:
-        command = command_with(learner, Run(task, robot, _text(demos), start, seed, threads=threads, out=out), settings)
+        options = Run(task, robot, _text(demos), start, seed, threads=threads, out=out, test_episodes=test_episodes)
+        command = command_with(learner, options, settings)
     # the record also says how the demonstrations, or the policy to start from, were made
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
@@ -136,7 +150,7 @@ def train(
             raise ValueError(f"{learner} cannot start from a policy")
         made.start_from(load_network(start, problem, robot))
     physics = physics_or_default(None)
-    row = training.train(made, problem, config, out, resume)
+    row = training.train(made, problem, config, out, resume, test_episodes)
     console.print(
         f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
         f"{_share(row.regret_mean)} mean, {_share(row.regret_median)} median\npolicy: {out / 'policy.json'}"
@@ -233,9 +247,10 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
 def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
+    defaults = {"robot": PAPER, "test_episodes": certified.EPISODES}  # settings of which older records know nothing
     for name, value in _shallow(run).items():
-        if value is not None and name not in ("resume", "seeds", "workers") and (name, value) != ("robot", PAPER):
-            words += [f"--{name}", str(value)]
+        if value is not None and name not in ("resume", "seeds", "workers") and value != defaults.get(name):
+            words += [f"--{name.replace('_', '-')}", str(value)]
     for name, value in asdict(settings).items():
         words += _option(name.replace("_", "-"), value)
     return shlex.join(words)

@@ -181,7 +181,14 @@ def validate(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Validati
     )
 
 
-def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool = False) -> evaluate.Row:
+def train(
+    learner: Learner,
+    task: Task,
+    config: Mapping[str, Any],
+    out: Path,
+    resume: bool = False,
+    test_episodes: int = certified.EPISODES,
+) -> evaluate.Row:
     """Runs a learner to its end and measures the best policy in PyBullet. Ctrl-C saves and stops.
 
     Args:
@@ -191,6 +198,7 @@ def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, re
             paper's.
         out: folder of the run.
         resume: continue the run in `out`, if there is one.
+        test_episodes: of the certified ones, on how many the policy is measured, from the first.
 
     Returns:
         What the best policy measures in PyBullet.
@@ -205,12 +213,12 @@ def train(learner: Learner, task: Task, config: Mapping[str, Any], out: Path, re
             raise ValueError(f"{name} must be at least 1, not {getattr(learner, name)}")
     run = _Run(learner, task, config, out, resume)
     try:
-        return _learn(run, learner, config)
+        return _learn(run, learner, config, test_episodes)
     finally:
         jobs.unlock(out)
 
 
-def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any]) -> evaluate.Row:
+def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any], test_episodes: int) -> evaluate.Row:
     writer = SummaryWriter(str(run.out / "tensorboard"), purge_step=learner.iteration)
     every = max(1, learner.iterations // learner.evaluations)
     saved = time.monotonic()
@@ -238,7 +246,7 @@ def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any]) -> evaluate
                 raise KeyboardInterrupt
     run.save()
     writer.close()
-    return run.measure()
+    return run.measure(test_episodes)
 
 
 class _Run:
@@ -330,13 +338,12 @@ class _Run:
         torch.save(state, buffer)
         files.write(self.out / "checkpoint.pt", buffer.getvalue())
 
-    def measure(self) -> evaluate.Row:
-        """Measures the best policy on the certified episodes in PyBullet, and adds the result to its JSON file."""
+    def measure(self, count: int) -> evaluate.Row:
+        """Measures the best policy on the first certified episodes in PyBullet, and adds the result to its JSON file."""
         network = load_network(self.out / "policy", self.task, self.robot)
         env = BallbotEnv(self.task, robot=self.robot)
         controller = PolicyController(self.task, named_robot(self.robot), network)
-        episodes = range(len(certified.load(self.task, robot=self.robot)))
-        results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], episodes)
+        results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()
         row = evaluate.summarize(results)
         measured = {
