@@ -11,10 +11,7 @@ from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 
-SHIPPED = [
-    *((PAPER, name) for name in TASKS),
-    *(("rolling", name) for name in ("stabilize", "turn", "orbit")),
-]
+SHIPPED = [(robot, name) for robot in (PAPER, "rolling") for name in TASKS]
 """Robots and tasks whose sets come with the package."""
 
 
