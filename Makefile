@@ -21,7 +21,7 @@ test-slow: $(VENV)/installed
 	$(BIN)/pytest -m slow
 
 bench: $(VENV)/installed
-	$(BIN)/pip install -c constraints.txt -e ".[bench]"
+	$(INSTALL) -e ".[bench]"
 	for script in $(filter-out $(TRIALS),$(wildcard benchmarks/*.py)); do $(BIN)/python $$script; done
 
 # millions of steps and a thousand environments: time and memory must not grow
@@ -53,16 +53,18 @@ clients: $(VENV)/installed
 
 # Ray clusters of two nodes on this machine, with nodes that are killed
 ray: $(VENV)/installed
-	$(BIN)/pip install -c constraints.txt -e ".[ray,tune]"
+	$(INSTALL) -e ".[ray,tune]"
 	$(BIN)/pytest tests/test_ray.py
 
 # the optima that the package ships, computed anew
 certify: $(VENV)/installed
 	$(BIN)/ballbot certify
 
-# PyBullet has no wheels for newer Pythons than 3.11. Where it is missing, uv fetches it. `runs` is what the commands need, and
-# `installed` has the tools for tests, types and documentation too.
-$(VENV)/runs: pyproject.toml constraints.txt
+# PyBullet has no wheels for newer Pythons than 3.11. Where it is missing, uv fetches it. Python compiles what is imported, when
+# it is first imported; pip would compile everything.
+INSTALL := $(BIN)/pip install --no-compile -c constraints.txt
+
+$(VENV)/python: pyproject.toml constraints.txt
 	@if command -v $(PYTHON) >/dev/null; then \
 		$(PYTHON) -m venv $(VENV); \
 	elif command -v uv >/dev/null; then \
@@ -72,12 +74,17 @@ $(VENV)/runs: pyproject.toml constraints.txt
 		echo "Install Python 3.11 or uv, or name your interpreter: make PYTHON=/path/to/python3.11"; \
 		exit 1; \
 	fi
-	$(BIN)/pip install -c constraints.txt "torch==2.13.0"
-	$(BIN)/pip install -c constraints.txt -e ".[train]"
+	$(INSTALL) "torch==2.13.0"
 	touch $@
 
-$(VENV)/installed: $(VENV)/runs
-	$(BIN)/pip install -c constraints.txt -e ".[all,dev,docs]"
+# what the commands need
+$(VENV)/runs: $(VENV)/python
+	$(INSTALL) -e ".[train]"
+	touch $@
+
+# what tests, types and documentation need
+$(VENV)/installed: $(VENV)/python
+	$(INSTALL) -e ".[all,dev,docs]"
 	touch $@
 
 clean:
