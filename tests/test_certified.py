@@ -97,7 +97,8 @@ def test_stored_trajectories_are_feasible_and_cost_what_is_stored(task, evaluati
     ],
     indirect=True,
 )
-def test_solving_again_from_another_guess_gives_the_same_cost(task, evaluation, params):
+def test_solving_again_from_another_guess_finds_nothing_cheaper(task, evaluation, params):
+    """And the same, but for a slalom whose floor slips: its narrow passages have dearer local optima too."""
     pytest.importorskip("casadi")
     from ballbot_baselines.optimum import find_optimum
 
@@ -106,7 +107,9 @@ def test_solving_again_from_another_guess_gives_the_same_cost(task, evaluation, 
         s = np.linspace(0, np.pi, len(path))
         detour = path + 0.15 * np.column_stack([np.sin(2 * s), -np.sin(s)])
         again = find_optimum(task, params, evaluation.states[i], evaluation.constants[i], paths=[detour])
-        assert again.cost == pytest.approx(evaluation.costs[i], rel=1e-4)
+        assert again.cost >= (1 - 1e-4) * evaluation.costs[i]
+        if not (task.id.startswith("BallbotWeave") and params.grips):
+            assert again.cost == pytest.approx(evaluation.costs[i], rel=1e-4)
 
 
 def test_entries_survive_json_and_make_the_set_that_the_optima_make():
