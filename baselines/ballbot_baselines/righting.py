@@ -116,6 +116,7 @@ def _simulate(
     aside = lean * np.array([-along[1], along[0]])
     h, mass = params.first_moment, params.moving_mass
     inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
+    turning = mass * params.ball_radius if params.rolls else 0.0  # the torque that drives the ball turns the body too
     x = np.tile(np.asarray(x0, np.float64), (gains.shape[1], 1))
     states, forces = [x], []
     for k in range(steps):
@@ -125,10 +126,7 @@ def _simulate(
         acceleration = -(bandwidth**2) * (leans - wanted) - 2 * bandwidth * rate
         # of a body in a vertical plane: inertia · lean acceleration = h g sin(lean) − (h/M) F cos(lean)
         moment = h * params.gravity * np.sin(leans) - inertia * acceleration
-        u = moment * mass / (h * np.cos(leans))
-        if params.rolls:  # the torque that drives the ball turns the body too
-            u = moment / (h * np.cos(leans) / mass + params.ball_radius)
-        u = np.clip(u, -force, force)
+        u = np.clip(moment * mass / (h * np.cos(leans) + turning), -force, force)
         forces.append(u)
         x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
         states.append(x)
