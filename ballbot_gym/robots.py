@@ -66,6 +66,11 @@ def file_name(name: str, robot: str) -> str:
     return name if robot == PAPER else f"{name}-{robot}"
 
 
+def robot_setting(robot: str) -> dict[str, str]:
+    """{"robot": name} for the settings of a record, and nothing for the paper's: older records do not name theirs."""
+    return {} if robot == PAPER else {"robot": robot}
+
+
 def robot_name(params: BallbotParams) -> str:
     """The name in `ROBOTS` of a robot, or of the one that it is a variant of.
 

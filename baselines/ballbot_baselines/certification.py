@@ -60,11 +60,6 @@ def entries(task_name: str, indices: Iterable[int], robot: str = PAPER, guesses:
         yield entry
 
 
-def robots_entries(task_name: str, robot: str, guesses: int, indices: Iterable[int]) -> Iterator[Entry]:
-    """`entries` as a job calls it, with the indices last."""
-    return entries(task_name, indices, robot, guesses)
-
-
 def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: int) -> Entry:
     try:
         optimum = find_optimum(task, params, *episode(task, params, index, draw), guesses=guesses)

@@ -7,7 +7,7 @@ from ballbot_baselines import certification
 from ballbot_baselines.optimum import ALL_GUESSES
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
@@ -62,8 +62,9 @@ def certify(
     facts = provenance()
     settings = {"tasks": tasks, "episodes": episodes, "robot": robot, "guesses": guesses}
     jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], **settings})
+    solve = partial(certification.entries, robot=robot, guesses=guesses)
     work = [
-        jobs.Job(f"{task}-{start:04d}", certification.robots_entries, (task, robot, guesses), items, task)
+        jobs.Job(f"{task}-{start:04d}", solve, (task,), items, task)
         for task in tasks
         for start in range(0, episodes, _CHUNK)
         for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
@@ -94,16 +95,16 @@ def _certify_shards(
 ) -> None:
     from ballbot_train.shards import make
 
-    named = {} if robot == PAPER else {"robot": robot}
+    settings = robot_setting(robot) | ({} if guesses == ALL_GUESSES else {"guesses": guesses})
     with progress_bars(dict.fromkeys(tasks, episodes)) as bars:
         for name in tasks:
             task, params = make_task(name, robot), named_robot(robot)
             made = make(
                 f"{url.rstrip('/')}/{name}",
-                {"certified": task.problem(), "version": provenance()["version"], **named},
+                {"certified": task.problem(), "version": provenance()["version"], **settings},
                 episodes,
-                certification.robots_entries,
-                (name, robot, guesses),
+                partial(certification.entries, robot=robot, guesses=guesses),
+                (name,),
                 partial(certification.arrays, task=task, params=params),
                 out / name,
                 workers,

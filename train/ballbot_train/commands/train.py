@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ballbot_gym import certified
-from ballbot_gym.robots import PAPER, file_name, named_robot
+from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
@@ -98,14 +98,10 @@ def train(
     workers = Workers.of(workers)
     if workers.ray is not None and seeds is None:
         raise ValueError("--ray does the runs of --seeds; a single training runs here")
+    out = Path("runs") / "train" / f"{file_name(task, robot)}-{learner}" if out is None else out
+    run = Run(task, robot, _text(demos), start, seed, threads=threads, out=out, test_episodes=test_episodes)
     if seeds is not None:
-        _train_seeds(
-            learner,
-            Run(task, robot, _text(demos), start, threads=threads, out=out, test_episodes=test_episodes),
-            settings,
-            seeds,
-            workers,
-        )
+        _train_seeds(learner, run, out, settings, seeds, workers)
         return
 
     import torch
@@ -121,11 +117,8 @@ def train(
     problem = make_task(task, robot)
     settings = algorithm.settings(task) if settings is None else settings
     check_settings(settings)
-    kind = file_name(task, robot)
-    out = Path("runs") / "train" / f"{kind}-{learner}" if out is None else out
     if command is None:
-        options = Run(task, robot, _text(demos), start, seed, threads=threads, out=out, test_episodes=test_episodes)
-        command = command_with(learner, options, settings)
+        command = command_with(learner, run, settings)
     # the record also says how the demonstrations, or the policy to start from, were made
     if demos is not None:
         command = f"{command_of(demos)} && {command}"
@@ -142,7 +135,7 @@ def train(
         "settings": asdict(settings),
         "start": None if start is None else str(start),
         "command": command,
-        **({} if robot == PAPER else {"robot": robot}),
+        **robot_setting(robot),
     }
     made = algorithm.make(problem, named_robot(robot), settings, seed, demos)
     if start is not None:
@@ -157,22 +150,18 @@ def train(
     )
 
 
-def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Workers) -> None:
+def _train_seeds(learner: str, run: Run, out: Path, settings: Any, named: str, workers: Workers) -> None:
     """Trains on several seeds, and prints what each reached."""
     from ballbot_train.learning import seeds as queue
 
     seeds = queue.parse_seeds(named)
     settings = LEARNERS[learner].settings(run.task) if settings is None else settings
     check_settings(settings)
-    kind = file_name(run.task, run.robot)
-    out = Path("runs") / "train" / f"{kind}-{learner}" if run.out is None else run.out
 
     def command_of(seed: int) -> str:
         return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
 
-    expected = {"learner": learner, "task": run.task, "settings": asdict(settings)}
-    if run.robot != PAPER:
-        expected["robot"] = run.robot
+    expected = {"learner": learner, "task": run.task, "settings": asdict(settings), **robot_setting(run.robot)}
     inputs = [
         *([Path(run.demos)] if run.demos and "://" not in run.demos else []),
         *(paths_of(run.start) if run.start else []),

@@ -9,8 +9,9 @@ from typing import Any
 from ballbot_baselines import VARIANTS
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, check_some
@@ -111,8 +112,7 @@ def open_run(
     if seed is not None:
         check_least(0, seed=seed)
         settings["seed"] = seed
-    if robot != PAPER:
-        settings["robot"] = robot
+    settings |= robot_setting(robot)
     settings["policies"] = policy_digests(controllers, robot)
     facts = provenance() | settings | {"workers": Workers.of(workers).named}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
@@ -170,18 +170,20 @@ def episode_job(
     randomization: Randomization | None = None,
     label: str = "",
     group: str = "",
-    robot: str = PAPER,
+    robot: str | BallbotParams = PAPER,
+    made_for: str | None = None,
 ) -> jobs.Job:
-    """Some certified episodes under a controller by name, as a job whose entries are the fields of Results.
+    """Some certified episodes of a robot under a controller by name, as a job whose entries are the fields of Results.
 
-    The label tells jobs apart that differ in their randomization; progress counts for the group, or else the task.
+    The controller is made for the robot, or for another one by name. The label tells jobs apart that differ in their
+    randomization or robots; progress counts for the group, or else the task.
     """
     what = f"{task}-{controller}-{physics}-{label}"
     slug = "".join(sign if sign.isalnum() else "-" for sign in what)
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(task, controller, registry.packed(controller), physics, seed, randomization, robot),
+        arguments=(task, controller, registry.packed(controller), physics, seed, randomization, robot, made_for),
         items=tuple(episodes),
         group=group or task,
     )
@@ -194,11 +196,13 @@ def _episode_entries(
     physics: str,
     seed: int,
     randomization: Randomization | None,
-    robot: str,
+    robot: str | BallbotParams,
+    made_for: str | None,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
-    made = registry.make_packed(controller, packed, env.task, env.params)
+    believed = (env.task, env.params) if made_for is None else (make_task(task, made_for), named_robot(made_for))
+    made = registry.make_packed(controller, packed, *believed)
     for result in iterate_episodes(env, made, controller, task, episodes, seed):
         yield asdict(result)
     env.close()

@@ -22,7 +22,7 @@ from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import limit_names, make_task
 from ballbot_gym.lazy import missing
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
@@ -370,8 +370,7 @@ def find_optima(
         on_progress: called with the task's name and a number of optima that are there.
         robot: by name.
     """
-    named = {} if robot == PAPER else {"robot": robot}
-    jobs.claim(out, {"task": make_task(task, robot).problem(), "seed": seed, **named})
+    jobs.claim(out, {"task": make_task(task, robot).problem(), "seed": seed, **robot_setting(robot)})
     try:
         work = [
             jobs.Job(f"optima-{start:06d}", _optima, (task, seed, robot), items, task)

@@ -6,18 +6,16 @@ from what the controller was made for.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym import certified, files
-from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import named_robot
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import make_packed, packed
-from ballbot_train.evaluation.evaluate import iterate_episodes
+from ballbot_train.evaluation.benchmark import episode_job
 from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
 from ballbot_train.executors import Workers
 
@@ -91,39 +89,15 @@ def run(
         for task, names in by_task.items():
             count = episodes_of(task, robot, episodes)
             for name in names:
-                for friction in frictions:
-                    value = floor(robot, friction).friction
+                for params in (floor(robot, friction) for friction in frictions):
+                    of = {"made_for": made_for, "robot": robot, "friction": params.friction}
+                    label = f"{made_for}-{robot}-{params.friction:g}"
                     for start in range(0, count, _CHUNK):
-                        items = tuple(range(start, min(start + _CHUNK, count)))
-                        slug = "".join(sign if sign.isalnum() else "-" for sign in f"{task}-{made_for}-{name}-{robot}")
-                        job = jobs.Job(
-                            name=f"{slug}-{value:g}-{physics}-{start:03d}",
-                            function=_entries,
-                            arguments=(task, name, packed(name), made_for, robot, friction, physics, seed),
-                            items=items,
-                            group=task,
-                        )
-                        work.append((job, {"made_for": made_for, "robot": robot, "friction": value}))
+                        part = range(start, min(start + _CHUNK, count))
+                        job = episode_job(task, name, physics, part, seed, label=label, robot=params, made_for=made_for)
+                        work.append((job, of))
     done = jobs.run([job for job, _ in work], out, workers, on_progress)
     return [TransferResult(**entry, **of) for (_, of), entries in zip(work, done, strict=True) for entry in entries]
-
-
-def _entries(
-    task: str,
-    controller: str,
-    files_of: Mapping[str, bytes],
-    made_for: str,
-    robot: str,
-    friction: float | None,
-    physics: str,
-    seed: int,
-    episodes: Sequence[int],
-) -> Iterator[jobs.Entry]:
-    env = BallbotEnv(task, physics=physics, robot=floor(robot, friction))
-    made = make_packed(controller, files_of, make_task(task, made_for), named_robot(made_for))
-    for result in iterate_episodes(env, made, controller, task, episodes, seed):
-        yield asdict(result)
-    env.close()
 
 
 def rows_of(results: Sequence[TransferResult], seed: int = 0) -> list[TransferRow]:
