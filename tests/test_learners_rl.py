@@ -162,10 +162,10 @@ def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
     assert sample.actions[1].tolist() == [0.5, 0.5]
 
 
-@pytest.mark.parametrize("frame", [None, "radial"])
+@pytest.mark.parametrize("frame", [None, "radial", "slalom"])
 def test_a_quadratic_value_is_linear_in_what_the_critic_sees(frame):
     entries = 8 if frame is None else FRAMES[frame].size
-    observation = observed(400, 8 if frame is None else 13)
+    observation = observed(400, {None: 8, "radial": 13, "slalom": 23}[frame])
     seen = CriticInputs(observation.shape[1], products=True, frame=frame)(observation).double()
     plain = CriticInputs(observation.shape[1], products=False, frame=frame)(observation).double()
     form = torch.randn(entries, entries, dtype=torch.double)

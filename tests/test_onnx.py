@@ -53,6 +53,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     ("task", "fields"),
     [
         ("orbit", {"frame": "radial"}),
+        ("weave", {"frame": "slalom"}),
         ("stabilize", {"odd": True, "linear": False, "squash": "clip"}),
         ("weave", {"mirrors": True, "activation": "silu"}),
     ],

@@ -85,6 +85,35 @@ def test_the_radial_frame_sees_the_same_wherever_on_the_circle_the_robot_is(para
         np.testing.assert_allclose(back_elsewhere(tuple(u)), rotation @ back(tuple(u)), rtol=1e-9, atol=1e-6)
 
 
+def test_the_slalom_frame_sees_a_mirror_image_as_the_same(params, rng):
+    task = TASKS["weave"]()
+    frame, signs = FRAMES[task.frame], np.array(task.observation_signs(task.mirrors[0]))
+    for _ in range(50):
+        seen = task.observe(*task.sample(rng, params)) + rng.normal(size=len(signs))
+        features, back = frame.features(tuple(seen))
+        mirrored, mirrored_back = frame.features(tuple(signs * seen))
+        assert len(features) == frame.size
+        np.testing.assert_allclose(mirrored, features, atol=1e-12)
+        assert mirrored_back((1.0, 2.0)) == (back((1.0, 2.0))[0], -back((1.0, 2.0))[1])
+
+
+def test_the_slalom_frame_forgets_obstacles_that_are_passed(params, rng):
+    task = TASKS["weave"]()
+    _, c = task.sample(rng, params)
+    obstacles = np.array([(1.5, 0.2, 0.3), (3.0, -0.3, 0.4), (4.5, 0.1, 0.25), (6.0, 0.3, 0.3), (7.5, -0.1, 0.35)])
+    c[:2] = 9, 0
+    for x0 in np.linspace(0, 9, 50):
+        state = np.array([x0, rng.uniform(-1, 1), *rng.normal(scale=0.2, size=6)])
+        ahead = obstacles[obstacles[:, 0] + obstacles[:, 2] + 0.1 >= x0]
+        shown = np.concatenate([ahead, np.repeat(obstacles[-1:], 5 - len(ahead), axis=0)])
+        features, expected = (
+            FRAMES[task.frame].features(tuple(task.observe(state, np.concatenate([c[:2], each.ravel()]))))[0]
+            for each in (obstacles, shown)
+        )
+        np.testing.assert_array_equal(features, expected)
+        assert features[9] >= 0  # the next one is on the left
+
+
 @pytest.mark.parametrize(("name", "index"), MIRRORED)
 def test_a_policy_that_is_averaged_over_mirror_images_mirrors_exactly(name, index, rng):
     task = TASKS[name]()

@@ -49,6 +49,9 @@ class Frame:
 def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     """Orbit's observation as seen from the ball: outwards is forwards, and the commanded motion goes to the left.
 
+    The last feature is the commanded centripetal acceleration, v²/r, in units of 10 m/s². Leans and forces of the steady
+    orbit are nearly linear in it, and so slow orbits need no other rule than fast ones.
+
     The body's axis is rotated instead of the angles γ and θ, because a rotation about the vertical takes axis to axis
     exactly. The body's inertia about its own axis, 1 % of the other, is what the symmetry leaves out.
     """
@@ -72,6 +75,7 @@ def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
         *rotated(ex, ey),
         radius,
         side * speed,
+        speed * speed / radius * (5.0**2 / 3.0 / 10.0),  # as observed they are divided by 5 m/s and by 3 m
     )
 
     def back(action: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -81,5 +85,39 @@ def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     return features, back
 
 
-FRAMES: dict[str, Frame] = {"radial": Frame(12, _radial)}
+def _slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
+    """Weave's observation as seen along the way: the next obstacles, the first of them on the left.
+
+    Obstacles that the ball has passed leave the list, and the next take their places. The side of the last one decides
+    behind it too, so that nothing flips where the robot comes to rest.
+    """
+    x, y, gamma, theta, vx, vy, gamma_dot, theta_dot, *numbers = observation
+    obstacles = list(zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True))
+    for _ in obstacles[1:]:
+        passed = _passed(*obstacles[0])
+        obstacles = [
+            tuple(ops.where(passed, after, before) for before, after in zip(*pair, strict=True))
+            for pair in zip(obstacles, [*obstacles[1:], obstacles[-1]], strict=True)
+        ]
+    side = ops.where(obstacles[0][1] < 0, -1.0, 1.0)
+    features = [x, side * y, gamma, side * theta, vx, side * vy, gamma_dot, side * theta_dot]
+    for dx, dy, radius in obstacles[:_OBSTACLES_SEEN]:
+        passed = _passed(dx, dy, radius)
+        features += [ops.where(passed, -0.2, dx), ops.where(passed, 0.0, side * dy), ops.where(passed, 0.0, radius)]
+
+    def back(action: tuple[Any, Any]) -> tuple[Any, Any]:
+        return action[0], side * action[1]
+
+    return tuple(features), back
+
+
+def _passed(dx: Any, dy: Any, radius: Any) -> Any:
+    """Whether the ball is beyond an obstacle, given as observed."""
+    return 5.0 * dx < -(radius + _BALL_RADIUS)
+
+
+_OBSTACLES_SEEN = 3
+_BALL_RADIUS = 0.1  # m, about
+
+FRAMES: dict[str, Frame] = {"radial": Frame(13, _radial), "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom)}
 """Every frame by the name that tasks and policy files give."""

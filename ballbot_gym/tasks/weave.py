@@ -83,6 +83,7 @@ class Weave(Task):
     """How far from the goal the ball may go, m."""
 
     id = "BallbotWeave-v0"
+    frame = "slalom"
     mirrors = (replace(MIRROR_Y, constants=(1, -1) + (1, -1, 1) * MAX_OBSTACLES),)
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0) + (5.0, 5.0, 1.0) * MAX_OBSTACLES
     margin_names = ("tilt", *(f"obstacle {i}" for i in range(MAX_OBSTACLES)))
