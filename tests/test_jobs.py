@@ -103,6 +103,46 @@ def test_a_killed_process_loses_no_finished_item(tmp_path):
     assert started[0] == kept
 
 
+ENDLESS = """
+import os, time
+from pathlib import Path
+
+def work(folder, items):
+    for item in items:
+        (Path(folder) / f"{os.getpid()}.pid").touch()
+        time.sleep(600)
+        yield {}
+"""
+
+
+def lives(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_workers_end_with_a_run_that_is_killed(tmp_path):
+    (tmp_path / "endless.py").write_text(ENDLESS)
+    code = (
+        "import sys; from pathlib import Path; sys.path.insert(0, '.'); import endless; from ballbot_train import jobs\n"
+        "work = [jobs.Job(str(i), endless.work, ('.',), (0,)) for i in range(2)]\n"
+        "if __name__ == '__main__': jobs.run(work, Path('out'), 2, lambda group, count: None)"
+    )
+    run = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and len(list(tmp_path.glob("*.pid"))) < 2:
+        time.sleep(0.05)
+    run.kill()
+    run.wait()
+    workers = [int(path.stem) for path in tmp_path.glob("*.pid")]
+    assert len(workers) == 2
+    while time.monotonic() < deadline and any(map(lives, workers)):
+        time.sleep(0.05)
+    assert not any(map(lives, workers))
+
+
 def test_a_folder_belongs_to_one_run_until_it_is_released(tmp_path):
     jobs.claim(tmp_path, {"episodes": 3, "policies": {}})
     jobs.claim(tmp_path, {"episodes": 3, "policies": {}})

@@ -16,10 +16,11 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Thread
 from typing import Any, Literal, Protocol
 
 from ballbot_train.console import console
@@ -207,11 +208,20 @@ class _Processes:
 def _serve(connection: Connection) -> None:
     """Does the tasks that come through a pipe until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which then ends its workers
+    Thread(target=_end_with_the_run, daemon=True).start()
     try:
         while True:
             for message in _messages(*connection.recv()):
                 connection.send(message)
     except (EOFError, OSError):  # the run was killed, and may already go on in another process
+        os._exit(1)
+
+
+def _end_with_the_run() -> None:
+    """Ends this worker as soon as the run is killed. Else it would finish its item, which can take minutes, for nobody."""
+    run = parent_process()
+    if run is not None:
+        wait([run.sentinel])
         os._exit(1)
 
 
