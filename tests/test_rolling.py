@@ -29,6 +29,7 @@ from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
 from ballbot_train.console import RobotName
+from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.policy import load_policy
 from ballbot_train.policy_files import PolicyError, PolicySpec, shipped_policies
 
@@ -427,8 +428,19 @@ def test_transfer_tells_who_was_made_for_what(tmp_path):
         ("kugle", "paper", "2"),
     ]
     assert rows[0]["cost_mean"] != rows[1]["cost_mean"]
+    assert (tmp_path / "transfer.png").stat().st_size > 1000
     with pytest.raises(ValueError, match="does not roll"):
         transfer(frictions=(0.8,), out=tmp_path, **arguments)
+
+
+def test_transfer_runs_a_name_for_the_robots_that_have_it():
+    chosen = matrix.controllers_of(["turn"], ["dagger", "lqr"], ["paper", "rolling"])
+    assert chosen["paper"] == {"turn": ["dagger", "lqr"]}
+    assert "lqr" in chosen["rolling"]["turn"]
+    with pytest.raises(ValueError, match="unknown controller nobody"):
+        matrix.controllers_of(["turn"], ["lqr", "nobody"], ["paper", "rolling"])
+    with pytest.raises(ValueError, match="given more than once"):
+        matrix.controllers_of(["turn"], ["lqr", "lqr"], ["paper"])
 
 
 def test_a_policy_is_of_one_robot(rolling):

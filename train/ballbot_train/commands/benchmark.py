@@ -46,7 +46,7 @@ def benchmark(
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         seed: of the bootstrap intervals, and of whatever an episode draws.
         runs: folder where other commands left their results: the recovered share of `basins` joins the leaderboard, and
-            basins, robustness, training and the paper's figures join the report.
+            basins, robustness, transfer, training and the paper's figures join the report.
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.

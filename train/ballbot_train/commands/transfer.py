@@ -19,9 +19,10 @@ from ballbot_train.console import (
     progress_bars,
 )
 from ballbot_train.evaluation import transfer as matrix
-from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, policy_digests
+from ballbot_train.evaluation.benchmark import checked_episodes, policy_digests
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
+from ballbot_train.report import figures
 
 
 def transfer(
@@ -57,7 +58,7 @@ def transfer(
     floors = frictions or (None,)
     for friction in floors:
         matrix.floor(robot, friction)
-    chosen = {name: controllers_of(tasks, controllers, name) for name in made_for}
+    chosen = matrix.controllers_of(tasks, controllers, made_for)
     physics = physics_or_default(physics)
     episodes = checked_episodes(episodes, quick, few=3)
     settings = {
@@ -81,6 +82,7 @@ def transfer(
     matrix.write(rows, results, facts, out)
     table = [matrix.cells(row) for row in rows]
     files.write(out / "transfer.md", markdown(matrix.HEADER, table))
+    figures.save(figures.transfer_figure(rows), out / "transfer.png")
     jobs.release(out)
     print_table(f"{episodes} certified episodes of {robot} per task, physics={physics}", matrix.HEADER, table)
-    console.print(f"matrix: {out / 'transfer.csv'}")
+    console.print(f"matrix: {out / 'transfer.png'}, {out / 'transfer.csv'}")

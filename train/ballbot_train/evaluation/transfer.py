@@ -15,7 +15,7 @@ from ballbot_gym import certified, files
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import named_robot
 from ballbot_train import jobs
-from ballbot_train.evaluation.benchmark import episode_job
+from ballbot_train.evaluation import benchmark
 from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
 from ballbot_train.executors import Workers
 
@@ -60,6 +60,29 @@ def episodes_of(task: str, robot: str, episodes: int) -> int:
     return min(episodes, len(certified.load(task, robot=robot)))
 
 
+def controllers_of(
+    tasks: Sequence[str], names: Sequence[str], made_for: Sequence[str]
+) -> dict[str, dict[str, list[str]]]:
+    """The controllers to run, by the robot that they were made for and by task; a name is of the robots that have it.
+
+    Raises:
+        ValueError: a name that no robot has, or that is given twice; or no task.
+        PolicyError: a policy file that is missing or damaged.
+    """
+    own = {robot: [name for name in names if _has(robot, tasks, name)] for robot in made_for}
+    unknown = [name for name in names if not any(name in group for group in own.values())]
+    if unknown:
+        benchmark.controllers_of(tasks, unknown, made_for[0])  # says why
+    return {robot: benchmark.controllers_of(tasks, own[robot], robot) for robot in made_for if own[robot] or not names}
+
+
+def _has(robot: str, tasks: Sequence[str], name: str) -> bool:
+    try:
+        return bool(benchmark.controllers_of(tasks, [name], robot))
+    except ValueError:
+        return False
+
+
 def run(
     controllers: Mapping[str, Mapping[str, Sequence[str]]],
     robot: str,
@@ -94,7 +117,9 @@ def run(
                     label = f"{made_for}-{robot}-{params.friction:g}"
                     for start in range(0, count, _CHUNK):
                         part = range(start, min(start + _CHUNK, count))
-                        job = episode_job(task, name, physics, part, seed, label=label, robot=params, made_for=made_for)
+                        job = benchmark.episode_job(
+                            task, name, physics, part, seed, label=label, robot=params, made_for=made_for
+                        )
                         work.append((job, of))
     done = jobs.run([job for job, _ in work], out, workers, on_progress)
     return [TransferResult(**entry, **of) for (_, of), entries in zip(work, done, strict=True) for entry in entries]

@@ -20,6 +20,7 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.basins import AXES, BasinMap
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.robustness import NONE, STRESSES, StressRow, curve_of
+from ballbot_train.evaluation.transfer import TransferRow
 from ballbot_train.report.labels import COLORS as COLORS
 from ballbot_train.report.labels import LABELS, color, label
 
@@ -169,6 +170,30 @@ def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
     axes[1][0].set_ylabel("regret, %")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    return figure
+
+
+def transfer_figure(rows: Sequence[TransferRow]) -> Figure:
+    """For every task, the success of controllers made for one robot on another, by its floors; below it their mean regret."""
+    tasks = list(dict.fromkeys(row.task for row in rows))
+    floors = sorted({row.friction for row in rows}, reverse=True)
+    made = {task: list(dict.fromkeys((r.made_for, r.controller) for r in rows if r.task == task)) for task in tasks}
+    most = max(map(len, made.values()))
+    figure = Figure(figsize=((1.7 + 0.9 * len(floors)) * len(tasks) + 0.6, 1.6 + 0.45 * most), layout="constrained")
+    figure.suptitle(f"Success and mean regret of controllers that run on the robot {rows[0].robot}", fontsize=12)
+    for axis, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
+        shares = np.full((len(made[task]), len(floors)), np.nan)
+        for row in rows:
+            if row.task == task:
+                i, k = made[task].index((row.made_for, row.controller)), floors.index(row.friction)
+                shares[i, k] = 100 * row.success
+                regret = f"{100 * row.regret_mean:+.3g} %" if math.isfinite(row.regret_mean) else "–"
+                axis.text(k, i, f"{100 * row.success:.0f} %\n{regret}", ha="center", va="center", fontsize=7)
+        axis.imshow(shares, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.6)
+        axis.set_xticks(range(len(floors)), [f"{floor:g}" if math.isfinite(floor) else "∞" for floor in floors])
+        axis.set_yticks(range(len(made[task])), [f"{label(name)}, {robot}" for robot, name in made[task]], fontsize=8)
+        axis.set_title(task, fontsize=10)
+        axis.set_xlabel("friction of the floor", fontsize=9)
     return figure
 
 

@@ -44,7 +44,7 @@ def leaderboard_sections(
         controllers: by task.
         pictures: of certified episodes.
         physics: "bullet" or "rk4".
-        runs: folder in which other commands have left theirs: basins, robustness, paper, and any training.
+        runs: folder in which other commands have left theirs: basins, robustness, transfer, paper, and any training.
         note: about the leaderboard.
     """
     replays = [replay_of(task, names, results, physics) for task, names in controllers.items()]
@@ -69,6 +69,11 @@ def leaderboard_sections(
             "From where each controller recovers, within what 350 N allow.",
         ),
         folder_section("Robustness", runs / "robustness" / "figures", "The same episodes under growing disturbances."),
+        pictures_section(
+            "From one robot to another",
+            [path for path in (runs / "transfer" / "transfer.png",) if path.exists()],
+            "Controllers that plan for one robot, or learnt on it, on another and on its floors.",
+        ),
         learning_section(runs),
         pictures_section("One certified episode of each task", pictures),
         folder_section("The paper's figures", runs / "paper", "High lean angle trajectory optimization, reproduced."),
