@@ -95,6 +95,18 @@ def test_the_file_says_what_it_takes_and_gives(tmp_path, capsys, monkeypatch):
     assert b"policy.py" not in path.read_bytes()  # of the machine that wrote it
 
 
+def test_the_file_of_another_robot_names_it_and_its_force_limit(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    task = make_task("turn", "kugle")
+    policy = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))), {})
+    export(str(policy), robot="kugle")
+    about = session(tmp_path / "runs" / "export" / "turn-kugle-mine.onnx").get_modelmeta().custom_metadata_map
+    assert about["robot"] == "kugle"
+    assert float(about["force_limit_newton"]) == pytest.approx(48.5, abs=0.1)
+    with pytest.raises(ValueError, match="was trained on"):
+        export(str(policy), task="turn")
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_the_layout_has_a_row_for_every_observed_number(name):
     task = make_task(name)

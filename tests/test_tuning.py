@@ -59,8 +59,8 @@ def fakes(monkeypatch):
         return Fake(settings, seed)
 
     monkeypatch.setattr(type(LEARNERS["ppo"]), "make", make)
-    monkeypatch.setattr(tuning.training, "validate", lambda network, task: Validation(network, 1.0, 0, network))
-    monkeypatch.setattr(tuning.training, "score", lambda network, task: Score(network, 0.1, 0.1, 1.0, 0))
+    monkeypatch.setattr(tuning.training, "validate", lambda network, task, robot: Validation(network, 1.0, 0, network))
+    monkeypatch.setattr(tuning.training, "score", lambda network, task, robot: Score(network, 0.1, 0.1, 1.0, 0))
     space = {"learning_rate": Range(1e-4, 5e-3), "batch_size": Choice((512, 1024, 2048))}
     space["hidden"] = Choice(((64, 64), (128, 128)))
     monkeypatch.setitem(tuning.SPACES, "ppo", space)
@@ -144,7 +144,16 @@ def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, c
     assert (tmp_path / "ppo.yml").exists()
 
 
-def test_real_trainings_have_an_outcome_per_seed():
+def test_a_search_belongs_to_a_robot(fakes, tmp_path, capsys):
+    tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path, robot="kugle")
+    assert "--robot kugle" in capsys.readouterr().out
+    assert not (tmp_path / "ppo.yml").exists()  # rl-zoo3 knows the ids alone
+    with pytest.raises(ValueError, match="robot"):
+        tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path)
+
+
+@pytest.mark.parametrize("robot", ["paper", "rolling"])
+def test_real_trainings_have_an_outcome_per_seed(robot):
     tiny = {
         "num_envs": 4,
         "num_steps": 4,
@@ -153,7 +162,7 @@ def test_real_trainings_have_an_outcome_per_seed():
         "num_mini_batches": 2,
         "update_epochs": 1,
     }
-    search = Search("rsl_ppo", "stabilize", (0, 1), 32, 1)
+    search = Search("rsl_ppo", "stabilize", (0, 1), 32, 1, robot)
     cost, outcome = tuning.outcome_of(search, settings_of(search, tiny))
     assert isinstance(cost, float)
     assert isinstance(outcome, Outcome)

@@ -17,7 +17,7 @@ import numpy as np
 import ballbot_gym
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
-from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicyNetwork, load_network
 from ballbot_train.policy_files import OBSERVATION_VERSION, read_description, weights_digest
@@ -30,7 +30,7 @@ except ModuleNotFoundError as error:
 _LARGEST_ERROR = 1e-5  # of an action: float32 sums in another order differ by less than 1e-6
 
 
-def export_onnx(policy: str | Path, path: str | Path, task: Task, params: BallbotParams | None = None) -> Path:
+def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = PAPER) -> Path:
     """Writes a policy as an ONNX file, after checking that it acts as the policy does.
 
     The model has one input, `observation` (batch, no) float32 as the task observes, and one output, `action` (batch, 2)
@@ -40,36 +40,36 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, params: Ballbo
         policy: the policy's file.
         path: of the ONNX file.
         task: what the policy was made for.
-        params: the robot; default, the paper's.
+        robot: by name.
 
     Raises:
         PolicyError: as `load_network`.
         ModuleNotFoundError: onnx or onnxscript is missing.
         RuntimeError: the ONNX graph acts differently from the policy.
     """
-    network = load_network(policy, task).eval()
+    network = load_network(policy, task, robot).eval()
     model = _traced(network)
-    about = metadata(policy, task, default_params() if params is None else params)
-    for name, value in about.items():
+    for name, value in metadata(policy, task, robot).items():
         entry = model.metadata_props.add()
         entry.key, entry.value = name, value
     _check(model, network)
     return files.write(path, model.SerializeToString())
 
 
-def metadata(policy: str | Path, task: Task, params: BallbotParams) -> dict[str, str]:
+def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, str]:
     """What an ONNX file says of its policy: task, layouts and units of input and output, rate, and where it comes from."""
     described = read_description(policy)
     learner = described.get("training", {}).get("learner", "unknown")
     return {
         "task": task.id,
         "problem": task.problem(),
+        "robot": robot,
         "observation": observation_table(task),
         "observation_scale": json.dumps(task.observation_scale),
         "observation_version": str(OBSERVATION_VERSION),
         "constants": json.dumps(task.constant_names),
         "action": "force Fx, Fy on the ball in the world's frame, in units of force_limit_newton, in [-1, 1]",
-        "force_limit_newton": repr(float(params.force_limit)),
+        "force_limit_newton": repr(float(named_robot(robot).force_limit)),
         "control_dt_seconds": repr(task.control_dt),
         "learner": str(learner),
         "weights_sha256": weights_digest(policy),

@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.commands.train import Run, command_with
-from ballbot_train.console import check_least, check_names, console, print_table, progress_bar
+from ballbot_train.console import RobotName, check_least, check_names, console, print_table, progress_bar
 from ballbot_train.executors import Workers
 from ballbot_train.learning.learners import LEARNERS
 
@@ -22,6 +23,7 @@ def tune(
     evaluations: int = 8,
     out: Path | None = None,
     workers: WorkersOption = Workers(1),
+    robot: RobotName = PAPER,
 ) -> None:
     """Searches a learner's hyperparameters: Optuna's TPE, pruned by regret; a killed search continues when started again.
 
@@ -33,17 +35,18 @@ def tune(
         env_steps: length of each training.
         evaluations: of each training; after each of them a trial may be pruned.
         out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), trials.csv, importances.csv,
-            best.json and, for ppo and sac, settings for rl-zoo3.
+            best.json and, for ppo and sac on the paper's robot, settings for rl-zoo3.
         workers: who runs trials.
+        robot: name of a robot.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
     check_least(1, trials=trials, seeds=seeds, env_steps=env_steps, evaluations=evaluations)
-    out = Path("runs") / "tune" / f"{task}-{learner}" if out is None else out
+    out = Path("runs") / "tune" / f"{file_name(task, robot)}-{learner}" if out is None else out
 
     from ballbot_train.learning import tuning  # it imports torch and Optuna
 
-    search = tuning.Search(learner, task, tuple(range(seeds)), env_steps, evaluations)
+    search = tuning.Search(learner, task, tuple(range(seeds)), env_steps, evaluations, robot)
     with progress_bar() as progress:
         bar = progress.add_task(f"{learner} {task}", total=trials)
         best = tuning.run(search, trials, out, lambda count: progress.update(bar, completed=count), workers)
@@ -63,6 +66,6 @@ def tune(
         print_table("", ["setting", "importance"], [[name, f"{share:.2f}"] for name, share in shares])
     console.print(
         f"trials: {out / 'trials.csv'}\nsettings: {out / 'best.json'}\n"
-        f"train with them: {command_with(learner, Run(task=task), settings)}",
+        f"train with them: {command_with(learner, Run(task=task, robot=robot), settings)}",
         soft_wrap=True,
     )

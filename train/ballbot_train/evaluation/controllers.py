@@ -96,13 +96,13 @@ def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
     return named
 
 
-def policy_path(name: str, task: Task) -> Path:
+def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
     """The file of a policy that comes with the package, or that is named by its path.
 
     Raises:
         ValueError: it is an expert, or nothing of that name.
     """
-    shipped = shipped_policies(task)
+    shipped = shipped_policies(task, robot)
     if name in shipped:
         return shipped[name]
     if name in CONTROLLERS:

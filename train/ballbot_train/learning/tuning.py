@@ -37,7 +37,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.executors import Pool, Workers, open_pool
@@ -135,6 +135,13 @@ class Search:
     """Of each training."""
     evaluations: int
     """Of each training, at equal distances. Trials are pruned at these."""
+    robot: str = PAPER
+    """Name of a robot."""
+
+    def config(self) -> dict[str, Any]:
+        """Everything, as JSON holds it."""
+        others = {name: value for name, value in vars(self).items() if name != "robot"}
+        return others | robot_setting(self.robot) | {"seeds": list(self.seeds)}
 
 
 @dataclass(frozen=True)
@@ -175,7 +182,7 @@ def run(
     if search.learner not in SPACES:
         raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
     workers = Workers.of(workers)
-    jobs.claim(out, vars(search) | {"seeds": list(search.seeds)}, "config.json")
+    jobs.claim(out, search.config(), "config.json")
     try:
         study = open_study(search, out)
         with open_pool(workers, serial=workers.here == 1, per_core=1) as pool:
@@ -308,18 +315,18 @@ def outcome_of(search: Search, settings: Any) -> Iterator[float | Outcome]:
     Yields:
         After every evaluation the least cost so far, averaged over the seeds; at the end the outcome.
     """
-    task, params = make_task(search.task), default_params()
+    task, params = make_task(search.task, search.robot), named_robot(search.robot)
     learners = [LEARNERS[search.learner].make(task, params, settings, seed, None) for seed in search.seeds]
     best, validations = [math.inf] * len(learners), []
     for k in range(1, search.evaluations + 1):
         for learner in learners:
             while learner.iteration < learner.iterations * k // search.evaluations:
                 learner.iterate()
-        validations = [training.validate(learner.network, task) for learner in learners]
+        validations = [training.validate(learner.network, task, search.robot) for learner in learners]
         costs = [(validation.cost + validation.mean_cost) / 2 for validation in validations]
         best = [min(pair) for pair in zip(best, costs, strict=True)]
         yield float(np.mean(best))
-    scores = [training.score(learner.network, task) for learner in learners]
+    scores = [training.score(learner.network, task, search.robot) for learner in learners]
     yield Outcome(
         costs=tuple(best),
         success=tuple(validation.success for validation in validations),
@@ -370,6 +377,7 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
     best = {
         "learner": search.learner,
         "task": search.task,
+        **robot_setting(search.robot),
         "trial": trial.number,
         "validation_cost": trial.value,
         "seeds": list(search.seeds),
@@ -379,7 +387,7 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
         },
     }
     files.write(out / "best.json", json.dumps(best, indent=1) + "\n")
-    if search.learner in ("ppo", "sac"):
+    if search.learner in ("ppo", "sac") and search.robot == PAPER:  # the ids are the paper's robot
         files.write(out / f"{search.learner}.yml", zoo_yaml(search.learner, _best_settings(search, settings, out)))
     return best
 
