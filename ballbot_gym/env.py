@@ -15,7 +15,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.scene import CAMERA_YAW, Scene, no_display
-from ballbot_gym.simulator import PHYSICS, State, default_physics, make_simulator
+from ballbot_gym.simulator import PHYSICS, BulletContactSimulator, State, default_physics, make_simulator
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.viewer import PageScene
 
@@ -212,6 +212,12 @@ class BallbotEnv(gymnasium.Env):
     def episode_params(self) -> BallbotParams:
         """The robot of the running episode: `params`, unless randomized."""
         return self.params if self._disturbance is None else self._disturbance.params
+
+    @property
+    def slip(self) -> float:
+        """Speed of the ball's lowest point over the floor, m/s: 0 in models whose ball cannot slip."""
+        self._check_open()
+        return math.hypot(*self._simulator.slip()) if isinstance(self._simulator, BulletContactSimulator) else 0.0
 
     def render(self) -> np.ndarray | None:
         """The current state as an image (height, width, 3), uint8, or in the window of render_mode="human"."""

@@ -16,7 +16,15 @@ from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
 from ballbot_train.report.film import film_frames, film_times, write_film
 from ballbot_train.report.perspective import Camera
-from ballbot_train.report.replay import Replay, Take, certified_replay, file_replay, with_companions, with_ghosts
+from ballbot_train.report.replay import (
+    LEAST_SLIP,
+    Replay,
+    Take,
+    certified_replay,
+    file_replay,
+    with_companions,
+    with_ghosts,
+)
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
 
@@ -33,6 +41,29 @@ def lean(to, seconds=1.0, steps=50):
 def two_takes():
     takes = (Take("still", lean(0.0), "#c0392b"), Take("leaning", lean(0.8, seconds=0.6), "#1f6fb2", "note"))
     return Replay("a title", takes, (Marker((1.0, 0.0), 0.3, 0.25, (0.8, 0.1, 0.1, 1.0)),))
+
+
+def test_a_rolling_robot_slips_on_a_smoother_floor_than_it_expects():
+    pytest.importorskip("pybullet")
+    shown = certified_replay("stabilize", ["trajopt"], 1, physics="bullet", robot="rolling", frictions=[0.8, 0.6])
+    expected, smoother = shown.takes
+    assert (expected.label, smoother.label) == ("friction 0.8", "friction 0.6")
+    assert expected.slip.max() < LEAST_SLIP < smoother.slip.max()
+    assert "slips for" in smoother.note
+    assert "slips" not in expected.note
+    first = smoother.trajectory.t[np.argmax(smoother.slip > LEAST_SLIP)]
+    assert smoother.slip_at(first) > LEAST_SLIP
+    assert smoother.slip_at(smoother.trajectory.duration) == 0
+    skids = [path for path in shown.drawing(smoother, 3.0).paths if path.name.startswith("skid")]
+    assert skids
+    assert all(len(path.points) >= 2 for path in skids)
+    assert not [path for path in shown.drawing(smoother, 0.0).paths if path.name.startswith("skid")]
+    assert not [path for path in shown.drawing(expected, 3.0).paths if path.name.startswith("skid")]
+
+
+def test_a_ball_that_does_not_roll_has_no_floors():
+    with pytest.raises(ValueError, match="'paper' does not roll"):
+        certified_replay("stabilize", ["lqr"], 0, physics="rk4", frictions=[0.8])
 
 
 def test_camera_looks_at_its_target_and_sees_up_as_up_and_far_as_small():

@@ -31,6 +31,7 @@ def replay(
     ghost_by: str = "trajopt",
     out: Path = Path("runs/replay"),
     robot: RobotName = PAPER,
+    frictions: tuple[float, ...] = (),
 ) -> None:
     """Draws a certified episode under controllers, or trajectory files: a strip of pictures, or a film.
 
@@ -50,6 +51,8 @@ def replay(
         ghost_by: name of that expert.
         out: folder of the file. The file is named after task, controllers and episode.
         robot: whose episode; a trajectory file is drawn with the paper's.
+        frictions: coefficients of friction of floors, for a robot whose ball rolls: every controller is shown on each of
+            them. Where the ball slips, its path is red.
     """
     _check(1 <= fps <= 1000, f"fps must be 1 to 1000, not {fps}")
     _check(1 <= frames <= 100, f"frames must be 1 to 100, not {frames}")
@@ -57,7 +60,7 @@ def replay(
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
     physics = physics_or_default(physics)
-    shown, name = _read(source, controllers, episode, physics, ghosts, ghost_at, ghost_by, robot)
+    shown, name = _read(source, controllers, episode, physics, ghosts, ghost_at, ghost_by, robot, frictions)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":
@@ -80,11 +83,13 @@ def _read(
     ghost_at: float | None,
     ghost_by: str,
     robot: str,
+    frictions: tuple[float, ...],
 ) -> tuple[Replay, str]:
     """The replay to draw, and the name of its file."""
     if all(Path(entry).suffix == ".npz" for entry in source):
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(not ghosts, "trajectory files do not say which episode they are of: give the ghosts as files too")
+        _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
         _check(ghost_at is None, "a trajectory file does not say which task it is of, so it has no ghost")
         paths = [Path(entry) for entry in source]
         return file_replay(paths), "-".join(path.stem for path in paths)
@@ -93,9 +98,11 @@ def _read(
     check_names("task", [task], TASKS)
     check_names("expert", [ghost_by], CONTROLLERS)
     _check(bool(controllers), "give at least one controller")
-    shown = certified_replay(task, controllers, episode, physics, robot=robot)
+    shown = certified_replay(task, controllers, episode, physics, robot=robot, frictions=frictions)
     made = file_name(task, robot)
     name = f"{made}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
+    if frictions:
+        name = f"{name}-on-{'-'.join(f'{friction:g}' for friction in frictions)}"
     if ghosts:
         shown = with_companions(shown, certified_replay(task, ghosts, episode, physics, robot=robot))
         name = f"{name}-beside-{'-'.join(Path(ghost).stem for ghost in ghosts)}"

@@ -20,7 +20,7 @@ from ballbot_gym.drawing import GHOST
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
 from ballbot_train.report.perspective import PerspectiveView
-from ballbot_train.report.replay import Ghost, Replay
+from ballbot_train.report.replay import LEAST_SLIP, Ghost, Replay
 
 Format = Literal["png", "mp4", "gif", "webp"]
 
@@ -158,7 +158,9 @@ class _Film:
         self._clock.set_text(f"{t:5.2f} s")
         for take, stage in zip(self._replay.takes, self._stages, strict=True):
             stage.view.draw(self._replay.drawing(take, t))
-            stage.tilt.set_text(f"{_tilt(take.trajectory.state(t)):.0f}°")
+            slip = take.slip_at(t)
+            slips = f"\nslips, {slip:.1f} m/s" if slip > LEAST_SLIP else ""
+            stage.tilt.set_text(f"{_tilt(take.trajectory.state(t)):.0f}°{slips}")
             ended = t >= take.trajectory.duration
             stage.end.set_visible(take.failed and ended)
             stage.note.set_visible(ended or not take.failed)

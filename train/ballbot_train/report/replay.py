@@ -1,5 +1,6 @@
 """Episodes to look at: the same episode under several controllers, as trajectories with labels. `film` draws them."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,15 +10,19 @@ import numpy as np
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
 from ballbot_gym.drawing import GHOST, GHOST_OPACITY, Drawing, GroundPath, Robot
-from ballbot_gym.env import BallbotEnv
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.transfer import floor
 from ballbot_train.report import labels
 
+LEAST_SLIP = 0.02
+"""m/s: what is less is the simulation's error."""
+_SKID = "#c01818"
 _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 
@@ -54,6 +59,14 @@ class Take:
     note: str = ""
     failed: bool = False
     ghosts: tuple[Ghost, ...] = ()
+    slip: np.ndarray | None = None
+    """(n,) speed of the ball's lowest point over the floor as each force begins, m/s, where contact is simulated."""
+
+    def slip_at(self, t: float) -> float:
+        """The slip at time t, s; 0 after the end."""
+        if self.slip is None or t >= self.trajectory.duration:
+            return 0.0
+        return float(self.slip[np.searchsorted(self.trajectory.t[:-1], t + 1e-9) - 1])
 
     @property
     def end(self) -> float:
@@ -79,6 +92,7 @@ class Replay:
         """One of the takes at time t, s, with its ghosts and the paths so far. After its end a robot stands still."""
         u = take.trajectory.force(t) if t < take.trajectory.duration else None
         robots, paths = [], [GroundPath(_driven_path(take.trajectory, t), take.color)]
+        paths += [GroundPath(points, _SKID, name=f"skid {i}") for i, points in enumerate(_skids(take, t))]
         for i, ghost in enumerate(take.ghosts):
             if (x := ghost.state(t)) is not None:
                 name = f"ghost {i}"
@@ -93,6 +107,15 @@ def _driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
     return np.concatenate([trajectory.x[trajectory.t < t, :2], trajectory.state(t)[None, :2]])
 
 
+def _skids(take: Take, t: float) -> list[np.ndarray]:
+    """Where the ball has slipped until time t, as pieces (n, 2) of its path, m."""
+    if take.slip is None:
+        return []
+    steps = np.flatnonzero((take.slip > LEAST_SLIP) & (take.trajectory.t[1:] <= t))
+    pieces = np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1)
+    return [take.trajectory.x[piece[0] : piece[-1] + 2, :2] for piece in pieces if len(piece)]
+
+
 def certified_replay(
     task: str,
     controllers: Sequence[str],
@@ -100,8 +123,9 @@ def certified_replay(
     physics: str = "bullet",
     skip_planless: bool = False,
     robot: str = PAPER,
+    frictions: Sequence[float] = (),
 ) -> Replay:
-    """A certified episode under controllers by name.
+    """A certified episode under controllers by name, on one floor or on several.
 
     Args:
         task: name of a task.
@@ -110,28 +134,34 @@ def certified_replay(
         physics: "bullet" or "rk4".
         skip_planless: leave out controllers that find no plan.
         robot: by name.
+        frictions: coefficients of friction of the floors, for a robot whose ball rolls; default, its own. Controllers
+            expect its own.
 
     Raises:
-        ValueError: an unknown task, controller or episode.
+        ValueError: an unknown task, controller or episode, or frictions of a robot whose ball does not roll.
         PlanError: a controller finds no plan, unless `skip_planless`.
     """
-    env = BallbotEnv(task, physics=physics, robot=robot)
-    try:
-        episode_set = certified.load(env.task, robot=robot)
-        if not 0 <= episode < len(episode_set):
-            raise ValueError(f"episode must be 0 to {len(episode_set) - 1}, not {episode}")
-        takes = []
-        for i, name in enumerate(controllers):
-            controller = make_controller(name, env.task, env.params)
-            try:
-                takes.append(_take(env, controller, name, i, episode_set, episode))
-            except PlanError:
-                if not skip_planless:
-                    raise
-        markers = tuple(env.task.markers(episode_set.constants[episode]))
-        return Replay(f"{task}, certified episode {episode}", tuple(takes), markers, env.params)
-    finally:
-        env.close()
+    problem, params = make_task(task, robot), named_robot(robot)
+    episode_set = certified.load(problem, robot=robot)
+    if not 0 <= episode < len(episode_set):
+        raise ValueError(f"episode must be 0 to {len(episode_set) - 1}, not {episode}")
+    takes = []
+    for name, friction in itertools.product(controllers, frictions or (None,)):
+        env = BallbotEnv(problem, physics=physics, robot=floor(robot, friction))
+        try:
+            take = _take(env, make_controller(name, problem, params), name, len(takes), episode_set, episode)
+        except PlanError:
+            if not skip_planless:
+                raise
+            continue
+        finally:
+            env.close()
+        if friction is not None:  # the floor gives the colour, because one controller runs on several
+            label = f"friction {friction:g}" if len(controllers) == 1 else f"{take.label}, friction {friction:g}"
+            take = replace(take, label=label, color=labels.color("", len(takes)))
+        takes.append(take)
+    markers = tuple(problem.markers(episode_set.constants[episode]))
+    return Replay(f"{task}, certified episode {episode}", tuple(takes), markers, params)
 
 
 def _take(
@@ -142,12 +172,32 @@ def _take(
     episode_set: certified.EvaluationSet,
     episode: int,
 ) -> Take:
-    run = rollout(env, controller, options=episode_set.options(episode))
+    seen = _SlipRecorder(env, controller)
+    run = rollout(env, seen, options=episode_set.options(episode))
     if run.failure:
         note = f"fails at {run.trajectory.duration:.2f} s"
     else:
         note = f"regret {round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0:.1f} %"  # + 0: no −0.0
-    return Take(labels.label(name), run.trajectory, labels.color(Path(name).stem, i), note, run.failure)
+    slip = np.array(seen.slips)
+    if slip.max() > LEAST_SLIP:
+        note = f"{note}; slips for {env.task.control_dt * np.count_nonzero(slip > LEAST_SLIP):.2f} s"
+    return Take(labels.label(name), run.trajectory, labels.color(Path(name).stem, i), note, run.failure, slip=slip)
+
+
+class _SlipRecorder:
+    """A controller, and how fast the ball slips whenever it acts."""
+
+    def __init__(self, env: BallbotEnv, controller: Controller):
+        self._env, self._controller = env, controller
+        self.slips: list[float] = []
+        """m/s, one for each control step."""
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._controller.reset(t, x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        self.slips.append(self._env.slip)
+        return self._controller.act(t, x)
 
 
 def with_companions(replay: Replay, others: Replay) -> Replay:
