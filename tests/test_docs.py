@@ -82,8 +82,9 @@ def test_the_documentation_says_of_every_shipped_policy_what_its_file_says():
         about = json.loads(path.read_text())
         measured, training = about["measured"], about["training"]
         seconds = about["training_seconds"]
+        kind = f"{training['task']}, {training['robot']}" if "robot" in training else training["task"]
         row = (
-            f"| {training['task']} | {training['learner']} | {seconds / 60:.0f} min | {measured['success']:.1%} | "
+            f"| {kind} | {training['learner']} | {seconds / 60:.0f} min | {measured['success']:.1%} | "
             f"{measured['falls']} | {measured['regret_mean']:.2%} | {measured['regret_median']:.2%} |"
         )
         assert row in text, row

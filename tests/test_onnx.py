@@ -35,11 +35,12 @@ def observations_of_an_episode(env, policy):
 
 @pytest.mark.parametrize("name", SHIPPED_NAMES)
 def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path):
-    task, learner = name.split("-")
-    export(learner, task=task, onnx=tmp_path / "policy.onnx")
+    task, *others, learner = name.split("-")
+    robot = others[0] if others else "paper"
+    export(learner, task=task, onnx=tmp_path / "policy.onnx", robot=robot)
     runtime = session(tmp_path / "policy.onnx")
     policy = load_policy(SHIPPED / f"{name}.json")
-    seen = observations_of_an_episode(BallbotEnv(task, physics="rk4"), policy)
+    seen = observations_of_an_episode(BallbotEnv(task, physics="rk4", robot=robot), policy)
     assert len(seen) > 50
     one_by_one = [runtime.run(None, {"observation": row[None]})[0][0] for row in seen]
     (at_once,) = runtime.run(None, {"observation": seen})

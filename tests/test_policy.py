@@ -1,13 +1,15 @@
 """Policy files: what was saved comes back, and nothing else is accepted."""
 
+import itertools
 import json
 
 import numpy as np
 import pytest
 import torch
 
-from ballbot_gym.env import BallbotEnv
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
+from ballbot_gym.robots import ROBOTS, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller, names
@@ -97,6 +99,21 @@ def test_wrong_files_are_refused_with_the_reason(tmp_path):
         load_policy(path, task)
 
 
+def test_a_policy_is_loaded_for_the_robot_that_its_file_names(tmp_path):
+    task = make_task("stabilize", "kugle")
+    path = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))), {})
+    controller, seen = load_policy(path), np.zeros(8)
+    controller.reset(0.0, seen, np.zeros(0))
+    force = controller.act(0.0, seen)
+    np.testing.assert_allclose(force, named_robot("kugle").force_limit * controller.predict(seen)[0], rtol=1e-6)
+    described = json.loads(path.read_text())
+    for unknown in ("nobody", 3, ["kugle"]):
+        described["spec"]["robot"] = unknown
+        path.write_text(json.dumps(described))
+        with pytest.raises(PolicyError, match=r"trained on the robot .* which is none of paper, rolling, kugle"):
+            load_policy(path)
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_every_named_controller_can_be_made(name):
     task = TASKS[name]()
@@ -106,19 +123,22 @@ def test_every_named_controller_can_be_made(name):
         make_controller("lqrr", task, default_params())
 
 
-SHIPPED = [(name, learner) for name in TASKS for learner in shipped_policies(TASKS[name]())]
+SHIPPED = [
+    (name, robot, learner)
+    for name, robot in itertools.product(TASKS, ROBOTS)
+    for learner in shipped_policies(make_task(name, robot), robot)
+]
 
 
-@pytest.mark.parametrize(("name", "learner"), SHIPPED)
-def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, learner):
+@pytest.mark.parametrize(("name", "robot", "learner"), SHIPPED)
+def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robot, learner):
     """On the first certified episodes they succeed, at a regret of the order that they claim."""
-    task = TASKS[name]()
-    described = read_description(shipped_policies(task)[learner])
+    described = read_description(shipped_policies(make_task(name, robot), robot)[learner])
     assert described["training"]["command"].startswith("ballbot ")
     measured = described["measured"]
     assert measured["physics"] == "bullet"
     assert measured["episodes"] == 200
-    row = evaluate(learner, name, episodes=10)
+    row = evaluate(learner, name, episodes=10, robot=robot)
     assert row.success >= measured["success"] - 0.2
     assert row.regret_median < 3 * max(measured["regret_median"], 0.01)
 

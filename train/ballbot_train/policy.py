@@ -16,8 +16,8 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
-from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.robots import PAPER, robot_name
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
@@ -204,16 +204,21 @@ def load_policy(
     Args:
         path: of either of its files.
         task: what it must have been trained on; default, the registered task, with default fields, that its file names.
-        params: the robot; default, the paper's.
+        params: the robot; default, the one that its file names.
 
     Raises:
         PolicyError: as `load_network`; or no task is given, and its file names none that is registered.
     """
+    spec = read_description(path)["spec"]
+    robot = spec.get("robot", PAPER) if params is None else robot_name(params)
+    if not isinstance(robot, str) or robot not in ROBOTS:
+        raise PolicyError(f"{path} was trained on the robot {robot!r}, which is none of {', '.join(ROBOTS)}")
     if task is None:
-        trained_on = read_description(path)["spec"]["task"]
-        task = next((kind() for kind in TASKS.values() if kind().problem() == trained_on), None)
+        task = next(
+            (each for each in (make_task(name, robot) for name in TASKS) if each.problem() == spec["task"]), None
+        )
         if task is None:
-            raise PolicyError(f"{path} was trained on {trained_on}: give that Task as load_policy(path, task)")
-    task = make_task(task)
-    params = default_params() if params is None else params
-    return PolicyController(task, params, load_network(path, task, robot_name(params)))
+            raise PolicyError(f"{path} was trained on {spec['task']}: give that Task as load_policy(path, task)")
+    task = make_task(task, robot)
+    params = named_robot(robot) if params is None else params
+    return PolicyController(task, params, load_network(path, task, robot))
