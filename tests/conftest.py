@@ -15,6 +15,7 @@ import ballbot_gym
 from ballbot_gym.params import default_params
 from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import TASKS
+from ballbot_train import cli
 
 
 @pytest.fixture(scope="session")
@@ -49,3 +50,21 @@ def make_env():
     yield make
     for env in envs:
         env.close()
+
+
+@pytest.fixture
+def typed(tmp_path, monkeypatch, capsys):
+    """What `ballbot` does with arguments in an empty folder: its exit status, and all that it prints, in one line.
+
+    It runs in this process, because each new one needs seconds to import what it needs.
+    """
+
+    def run(*arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("sys.argv", ["ballbot", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        printed = capsys.readouterr()
+        return ended.value.code, " ".join((printed.out + printed.err).split())
+
+    return run
