@@ -45,7 +45,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
-from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.batch import BallbotBatch, BatchEpisodes, run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
@@ -132,10 +132,14 @@ class Score:
 def score(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Score:
     """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
     episodes = certified.load(task, robot=robot)
-    batch = BallbotBatch(task, len(episodes), compile=False, robot=robot)
-    run = run_episodes(batch, network, episodes.states, episodes.constants)
-    ratio = run.cost.numpy() / episodes.costs
-    priced = fresh.priced(run.cost.numpy(), run.success.numpy(), task) / episodes.costs
+    (run,) = _runs(network, task, robot, (episodes.states, episodes.constants))
+    return _score(run, task, episodes.costs)
+
+
+def _score(run: BatchEpisodes, task: Task, optima: np.ndarray) -> Score:
+    """Score of episodes whose optima cost so much, (B,)."""
+    ratio = run.cost.numpy() / optima
+    priced = fresh.priced(run.cost.numpy(), run.success.numpy(), task) / optima
     standing = ratio[~run.failure.numpy()] - 1
     return Score(
         cost_ratio=float(priced.mean()),
@@ -170,9 +174,36 @@ _COLUMNS = (
 
 def validate(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Validation:
     """Measures a policy on the validation set, which shares no episode with the certified ones nor with `evaluate_fresh`."""
-    states, constants = fresh.draw(task, range(VALIDATION_EPISODES), _VALIDATION_SEED, "validation", robot)
-    batch = BallbotBatch(task, VALIDATION_EPISODES, compile=False, robot=robot)
+    (run,) = _runs(network, task, robot, _validation_set(task, robot))
+    return _validation(run, task)
+
+
+def score_and_validate(network: PolicyNetwork, task: Task, robot: str = PAPER) -> tuple[Score, Validation]:
+    """`score` and `validate` in one batch, in half the time."""
+    episodes = certified.load(task, robot=robot)
+    sets = (episodes.states, episodes.constants), _validation_set(task, robot)
+    scored, validated = _runs(network, task, robot, *sets)
+    return _score(scored, task, episodes.costs), _validation(validated, task)
+
+
+def _validation_set(task: Task, robot: str) -> tuple[np.ndarray, np.ndarray]:
+    """Initial states (B, 8) and constants (B, nc) of the validation set."""
+    return fresh.draw(task, range(VALIDATION_EPISODES), _VALIDATION_SEED, "validation", robot)
+
+
+def _runs(
+    network: PolicyNetwork, task: Task, robot: str, *sets: tuple[np.ndarray, np.ndarray]
+) -> tuple[BatchEpisodes, ...]:
+    """Runs all episodes of some sets of states (B, 8) and constants (B, nc) in one batch."""
+    states, constants = map(np.concatenate, zip(*sets, strict=True))
+    batch = BallbotBatch(task, len(states), compile=False, robot=robot)
     run = run_episodes(batch, network, states, constants)
+    lengths = [len(x) for x, _ in sets]
+    columns = [part.split(lengths) for part in run if part is not None]  # all but the states
+    return tuple(BatchEpisodes(*parts, states=None) for parts in zip(*columns, strict=True))
+
+
+def _validation(run: BatchEpisodes, task: Task) -> Validation:
     return Validation(
         cost=float(fresh.priced(run.cost.numpy(), run.success.numpy(), task).mean()),
         success=float(run.success.double().mean()),
@@ -297,8 +328,8 @@ class _Run:
             The figures by their name in TensorBoard.
         """
         network = self.learner.network
-        certified_score = asdict(score(network, self.task, self.robot))
-        validation = validate(network, self.task, self.robot)
+        scored, validation = score_and_validate(network, self.task, self.robot)
+        certified_score = asdict(scored)
         named = {f"validation_{name}": value for name, value in asdict(validation).items()}
         self.rows.append(
             {
