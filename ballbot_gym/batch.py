@@ -34,6 +34,16 @@ _log = logging.getLogger(__name__)
 COMPILE_FROM = 1024
 """Batch size from which compile="auto" compiles. For smaller batches half a minute of compiling seldom pays."""
 
+# By default a loop holds at most 64 operations, and results pass from one loop to the next through memory. And by default the
+# compiler writes an operation anew into each that reads its result: within one loop it keeps the result anyway, and
+# compiling takes twice as long.
+COMPILE_OPTIONS: dict[str, Any] = {
+    "max_fusion_size": 1000,
+    "realize_opcount_threshold": 2,
+    "realize_reads_threshold": 1,
+}
+"""Options of torch.compile for code that steps a batch."""
+
 _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The fields of `BatchStep` that are bools."""
 
@@ -531,9 +541,8 @@ def _compiled(transition: Any) -> Any:
     """
     function = transition.__func__
     own = types.FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
-    # By default a loop holds at most 64 operations, and results pass from one loop to the next through memory.
-    options: dict[str, Any] = {"max_fusion_size": 1000}
-    return torch.compile(types.MethodType(own, transition.__self__), fullgraph=True, dynamic=False, options=options)
+    bound = types.MethodType(own, transition.__self__)
+    return torch.compile(bound, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
 
 def _rows(state: BatchState) -> _Rows:
