@@ -9,6 +9,7 @@ from typing import get_args
 import casadi
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from ballbot_baselines import certification, righting
@@ -30,6 +31,8 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
 from ballbot_train.console import RobotName
 from ballbot_train.evaluation import transfer as matrix
+from ballbot_train.learning import training
+from ballbot_train.learning.learners import shac
 from ballbot_train.policy import load_policy
 from ballbot_train.policy_files import PolicyError, PolicySpec, shipped_policies
 
@@ -454,3 +457,32 @@ def test_a_policy_is_of_one_robot(rolling):
 
 def test_every_robot_can_be_named_on_the_command_line():
     assert get_args(RobotName) == tuple(ROBOTS)
+
+
+def taught(robot, **settings):
+    """shac on Stabilize after some iterations, from LQR."""
+    config = shac.ShacConfig(num_envs=64, hidden=(16,), odd=True, compile=False, **settings)
+    learner = shac.Shac(make_task("stabilize", robot), named_robot(robot), config)
+    for _ in range(config.total_iterations):
+        learner.iterate()
+    return learner.network
+
+
+def test_the_penalty_on_slipping_is_for_robots_that_can_slip():
+    def same(robot):
+        networks = [taught(robot, total_iterations=1, horizon=5, grip_penalty=penalty) for penalty in (3000.0, 0.0)]
+        return all(torch.equal(*pair) for pair in zip(*(network.parameters() for network in networks), strict=True))
+
+    assert same("paper")
+    assert not same("rolling")
+
+
+@pytest.mark.slow
+def test_shac_learns_to_keep_its_grip():
+    """The penalty's gradient leads away from slipping, which without it is only counted."""
+
+    def failures(grip_penalty):
+        network = taught("rolling", total_iterations=40, horizon=15, grip_penalty=grip_penalty)
+        return training.validate(network, make_task("stabilize", "rolling"), "rolling").failures
+
+    assert failures(3000.0) < 0.8 * failures(0.0)

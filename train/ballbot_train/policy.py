@@ -136,8 +136,8 @@ def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[s
     return files.write(description_path, json.dumps({"spec": asdict(network.spec), **description}, indent=1) + "\n")
 
 
-def load_network(path: str | Path, task: Task, robot: str = PAPER) -> PolicyNetwork:
-    """The network of a policy file made for this very task and robot.
+def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> PolicyNetwork:
+    """The network of a policy file made for this very task and robot; None admits every robot.
 
     Raises:
         PolicyError: a file is missing or damaged, or made for another task, robot, observation or shape.
@@ -152,7 +152,7 @@ def load_network(path: str | Path, task: Task, robot: str = PAPER) -> PolicyNetw
         raise PolicyError(f"{description_path} is not a policy: {error}") from error
     if spec.task != task.problem():
         raise PolicyError(f"{description_path} was trained on {spec.task}, not on {task.problem()}")
-    if spec.robot != robot:
+    if robot is not None and spec.robot != robot:
         raise PolicyError(f"{description_path} was trained on the robot {spec.robot!r}, not on {robot!r}")
     if spec.observation_version != OBSERVATION_VERSION:
         raise PolicyError(

@@ -72,7 +72,7 @@ def train(
         learner: name of a learner in `LEARNERS`.
         task: name of a task.
         demos: folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards.
-        start: policy file whose weights training starts from; only for shac.
+        start: policy file whose weights training starts from, of any robot; only for shac.
         seed: seed of everything that is drawn.
         settings: the learner's settings; default, those tuned for the task.
         threads: threads of torch; default, torch's own choice. Another number changes the last digits.
@@ -141,7 +141,7 @@ def train(
     if start is not None:
         if not isinstance(made, training.Finetunable):
             raise ValueError(f"{learner} cannot start from a policy")
-        made.start_from(load_network(start, problem, robot))
+        made.start_from(load_network(start, problem, robot=None))
     physics = physics_or_default(None)
     row = training.train(made, problem, config, out, resume, test_episodes)
     console.print(

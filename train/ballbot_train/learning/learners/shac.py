@@ -6,8 +6,8 @@ window plus the cost that a learnt critic expects after it. Its gradient runs th
 the critic expects from the episode's start, because regret is relative too.
 
 Two parts of a task have no gradient and get one here. A penalty on coming closer to a margin than `margin_clearance` stands
-for failures. For the first exit, an episode ends gradually: at each step a share of it ends that grows with the depth in the
-goal.
+for failures, and one on a ball that nearly slips where friction is limited. For the first exit, an episode ends gradually: at
+each step a share of it ends that grows with the depth in the goal.
 """
 
 import math
@@ -19,7 +19,8 @@ from typing import Any, NamedTuple, cast
 import torch
 
 from ballbot_baselines.lqr import equilibrium_gain
-from ballbot_gym.batch import BallbotBatch, BatchState
+from ballbot_gym import dynamics
+from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -71,6 +72,10 @@ class ShacConfig:
     """Distance from the margins at which the penalty starts, in the margins' units."""
     margin_penalty: float = 0.0
     """Penalty per second and squared shortfall of the clearance; 0: none."""
+    grip_clearance: float = 0.05
+    """Reserve of `dynamics.limits` below which its penalty starts; a robot with unlimited friction has none."""
+    grip_penalty: float = 3000.0
+    """Penalty per second and squared shortfall of that reserve; 0: none."""
     exit_softness: float = 0.0
     """Width of the gradual first exit, in units of the goal functions; 0: episodes end at once."""
     compile: bool = True
@@ -153,20 +158,21 @@ class Shac:
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), config.learning_rate, betas=(0.7, 0.95))
         self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
         self._start = self._batch.reset(seed=seed)  # (B, no) first observations of the running episodes
-        step = self._one_step
-        self._step = torch.compile(step, fullgraph=True, dynamic=False) if config.compile else step
+        self._step = self._one_step
+        if config.compile:
+            self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     @property
     def network(self) -> PolicyNetwork:
         return self._network
 
     def start_from(self, network: PolicyNetwork) -> None:
-        """Takes the weights of a policy, to be improved.
+        """Takes the weights of a policy, to be improved; it may have been trained on another robot.
 
         Raises:
             ValueError: its network differs in shape from this one.
         """
-        if network.spec != self._network.spec:
+        if replace(network.spec, robot=self._network.spec.robot) != self._network.spec:
             raise ValueError(
                 f"a policy of {network.spec} cannot start one of {self._network.spec}; give --hidden, --odd or --no-odd"
             )
@@ -254,14 +260,19 @@ class Shac:
         config, task = self.config, self.task
         observation = self._batch.observe(state)
         new, result = self._batch.transition(state, self._network(observation))
+        before, force = state.x.unbind(0), result.force.unbind(0)
         x, c = result.final_x.unbind(0), state.c.unbind(0)
-        cost = task.cost(state.x.unbind(0), result.force.unbind(0), c) * task.control_dt
+        cost = task.cost(before, force, c) * task.control_dt
         cost = cost + config.failure_penalty * result.failure
         shaped = cost
         if config.margin_penalty:
             for margin in task.margins(x, c):
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 shaped = shaped + config.margin_penalty * task.control_dt * shortfall**2
+        if config.grip_penalty:
+            for limit in dynamics.limits(self._batch.params, before, force, hold=task.control_dt):
+                shortfall = (config.grip_clearance - limit).clamp(min=0)
+                shaped = shaped + config.grip_penalty * task.control_dt * shortfall**2
         loss = loss + discount * alive * shaped
         if config.exit_softness:
             alive = alive * torch.sigmoid(torch.stack(task.goal(x, c)).amax(0) / config.exit_softness)
