@@ -54,17 +54,6 @@ def parameters(learner):
     return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
 
 
-def run(*arguments, **keywords):
-    command = [sys.executable, "-m", "ballbot_train.cli", "train", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **keywords)
-
-
-def finishes(*arguments):
-    process = run(*arguments)
-    printed, _ = process.communicate()
-    assert process.returncode == 0, printed
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
     task, params = TASKS[name](), default_params()
@@ -116,6 +105,8 @@ def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()
     assert not torch.equal(parameters(learner), parameters(donor))
+    donor.network.spec = replace(donor.network.spec, robot="rolling")
+    shac.Shac(task, params, config).start_from(donor.network)
     with pytest.raises(ValueError, match="cannot start"):
         shac.Shac(task, params, replace(config, hidden=(9,))).start_from(donor.network)
 
@@ -140,26 +131,29 @@ def test_odd_policies_are_odd():
     assert torch.equal(network(-observation), -network(observation))
 
 
-def test_a_killed_run_resumes_to_the_same_result(tmp_path):
+def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     common = ["shac", "--threads", 1, *SETTINGS]
-    finishes(*common, "--out", whole)
-    process = run(*common, "--out", killed, env=os.environ | {"BALLBOT_CHECKPOINT_SECONDS": "0"})
+    assert typed("train", *common, "--out", whole)[0] == 0
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ballbot_train.cli", "train", *map(str, common), "--out", killed],
+        stdout=subprocess.DEVNULL,
+        env=os.environ | {"BALLBOT_CHECKPOINT_SECONDS": "0"},
+    )
     while not (killed / "checkpoint.pt").exists() and process.poll() is None:
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    refused = run(*common, "--out", killed)
-    assert refused.wait() == 1
-    assert "--resume" in refused.stdout.read()
-    finishes(*common, "--out", killed, "--resume")
+    ended, printed = typed("train", *common, "--out", killed)
+    assert (ended, "--resume" in printed) == (1, True), printed
+    ended, printed = typed("train", *common, "--out", killed, "--resume")
+    assert ended == 0, printed
     assert (killed / "policy.safetensors").read_bytes() == (whole / "policy.safetensors").read_bytes()
     measured = [json.loads((out / "policy.json").read_text())["measured"] for out in (whole, killed)]
     assert measured[0] == measured[1]
     assert (measured[0]["physics"], measured[0]["episodes"]) == ("bullet", 8)
-    different = run(*common, "--seed", 1, "--out", killed, "--resume")
-    assert different.wait() == 1
-    assert "holds a run of seed" in " ".join(different.stdout.read().split())
+    ended, printed = typed("train", *common, "--seed", 1, "--out", killed, "--resume")
+    assert (ended, "holds a run of seed" in printed) == (1, True), printed
 
 
 @pytest.mark.parametrize(
@@ -217,10 +211,11 @@ def evaluations(folder):
 def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_test_it(
     short_run, tmp_path, monkeypatch
 ):
-    costs = iter((30.0, 20.0, 25.0))
-    monkeypatch.setattr(training, "validate", lambda *policy: training.Validation(next(costs), 1.0, 0, 1.0))
-    ratios = iter((1.5, 1.4, 1.1))
-    monkeypatch.setattr(training, "score", lambda *policy: training.Score(next(ratios), 0.1, 0.1, 1.0, 0))
+    figures = iter(
+        (training.Score(ratio, 0.1, 0.1, 1.0, 0), training.Validation(cost, 1.0, 0, 1.0))
+        for ratio, cost in ((1.5, 30.0), (1.4, 20.0), (1.1, 25.0))
+    )
+    monkeypatch.setattr(training, "score_and_validate", lambda *policy: next(figures))
     short_run()
     rows = evaluations(tmp_path)
     assert [float(row["validation_cost"]) for row in rows] == [30.0, 20.0, 25.0]
