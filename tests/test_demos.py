@@ -1,7 +1,6 @@
 """Demonstrations: what a dataset promises, and that a kill neither loses nor doubles an episode."""
 
 import json
-import os
 import random
 import shlex
 import signal
@@ -195,20 +194,18 @@ def test_an_expert_without_a_plan_keeps_its_last_one(monkeypatch):
     env.close()
 
 
-def test_killed_at_any_time_it_resumes_to_the_identical_dataset(tmp_path):
-    """SIGKILL while episodes are being recorded in two processes, twice, then to the end."""
-    options = ["--expert", "lqr", "--physics", "rk4", "--episodes", "20", "--workers", "2"]
-
-    def start(out):
-        command = [sys.executable, "-m", "ballbot_train.cli", "demos", *options, "--out", str(out)]
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
-
+def test_killed_at_any_time_it_resumes_to_the_identical_dataset(tmp_path, typed):
+    """SIGKILL while episodes are being recorded in two processes, twice, then to the end in one."""
+    command = ["demos", "--expert", "lqr", "--physics", "rk4", "--episodes", "20"]
     killed, whole = tmp_path / "killed-v0", tmp_path / "whole-v0"
-    assert start(whole).wait() == 0
+    assert typed(*command, "--workers", 1, "--out", whole)[0] == 0
     lines = tmp_path / ".killed-v0.unfinished" / "unfinished"
     for _ in range(2):
-        process = start(killed)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ballbot_train.cli", *command, "--workers", "2", "--out", killed],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         seen = sum(path.read_text().count("\n") for path in lines.glob("*.jsonl")) if lines.exists() else 0
         while process.poll() is None:
             now = sum(path.read_text().count("\n") for path in lines.glob("*.jsonl")) if lines.exists() else 0
@@ -218,7 +215,7 @@ def test_killed_at_any_time_it_resumes_to_the_identical_dataset(tmp_path):
         time.sleep(random.uniform(0, 0.3))
         process.send_signal(signal.SIGKILL)
         process.wait()
-    assert start(killed).wait() == 0
+    assert typed(*command, "--workers", 1, "--out", killed)[0] == 0
     assert content(killed) == content(whole)
     seeds = [json.loads(str(m["seed"])) for m in _metadata(killed)]
     assert seeds == [1_000_000 + i for i in range(20)]

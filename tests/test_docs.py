@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ballbot_train.executors import Workers
 from ballbot_train.policy import SHIPPED
 
 ROOT = Path(__file__).parent.parent
@@ -32,7 +33,8 @@ def test_python_runs(page, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_commands_run(page, tmp_path):
+def test_commands_run(page, typed, monkeypatch):
+    monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():
         command = shlex.split(line, comments=True)
@@ -42,10 +44,8 @@ def test_commands_run(page, tmp_path):
             assert re.search(rf"^{command[1]}:", makefile, flags=re.MULTILINE), line
             continue
         assert command[0] == "ballbot", f"{line}: how is this tested?"
-        done = subprocess.run(
-            [sys.executable, "-m", "ballbot_train.cli", *command[1:]], cwd=tmp_path, capture_output=True, text=True
-        )
-        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        ended, printed = typed(*command[1:])
+        assert ended == 0, f"{line}\n{printed}"
 
 
 def test_no_block_is_of_a_kind_that_nothing_runs():
