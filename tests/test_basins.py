@@ -3,8 +3,11 @@ import math
 import numpy as np
 import pytest
 
+from ballbot_baselines.optimum import find_optimum
 from ballbot_baselines.recovery import largest_leans
-from ballbot_gym.rollout import FunctionController, rollout
+from ballbot_gym.env import make_task
+from ballbot_gym.robots import ROBOTS, named_robot
+from ballbot_gym.rollout import FunctionController, PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.evaluation import basins
 from ballbot_train.report import figures
@@ -40,6 +43,21 @@ def test_the_full_force_rights_what_is_within_the_boundary_and_not_what_is_beyon
         assert (leans.min() < 0) == righted
 
 
+def test_a_floor_that_lets_the_ball_slip_allows_less_lean_and_that_much_can_be_planned(limits):
+    task, robot = make_task("stabilize", "rolling"), named_robot("rolling")
+    (lean,) = np.degrees(largest_leans(task, robot, LEAN_RATE, np.array([0.0])))
+    assert math.degrees(math.atan(robot.friction)) < lean < limits[0] - 10
+
+    def planned(degrees):
+        x = np.zeros(8)
+        x[2] = math.radians(degrees)
+        return find_optimum(task, robot, x, np.zeros(0))
+
+    assert planned(lean - 1).cost > 0
+    with pytest.raises(PlanError):
+        planned(lean + 1)
+
+
 @pytest.fixture
 def bounds():
     """40° either way at every value."""
@@ -68,8 +86,9 @@ def test_a_state_from_which_a_controller_recovers_is_recoverable(bounds):
     assert basin.fraction("lqr") == pytest.approx(3 / 17)
 
 
-def test_lqr_recovers_upright_and_slow_but_not_fast(bounds, tmp_path):
-    work = [job for job in basins.cell_jobs(bounds, ["lqr"], 3, "rk4") if job.arguments[0] == "speed"]
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_lqr_recovers_upright_and_slow_but_not_fast(robot, bounds, tmp_path):
+    work = [job for job in basins.cell_jobs(bounds, ["lqr"], 3, "rk4", robot) if job.arguments[0] == "speed"]
     done = basins.jobs.run(work, tmp_path, 1, lambda name, count: None)
     recovered = {(e["i"], e["j"]): e["recovered"] for entries in done for e in entries}
     assert recovered == {(1, 1): True, (2, 1): False}  # 0 and 15 m/s
@@ -77,17 +96,20 @@ def test_lqr_recovers_upright_and_slow_but_not_fast(bounds, tmp_path):
 
 def test_maps_are_read_back_as_they_were_written_and_drawn(bounds, tmp_path):
     maps = basins.maps_of(bounds, [entry(2, 2, True), entry(2, 1, True, "lean rate")], ["lqr"], 5)
-    basins.write(maps, {"commit": "none"}, tmp_path)
+    basins.write(maps, {"commit": "none", "robot": "rolling"}, tmp_path)
     for wrote, read in zip(maps, basins.read(tmp_path), strict=True):
         np.testing.assert_array_equal(wrote.recovered["lqr"], read.recovered["lqr"])
         np.testing.assert_array_equal(wrote.boundary, read.boundary)
-    assert basins.recovered_fractions(tmp_path) == ({("stabilize", "lqr"): pytest.approx(3 / 30)}, "")
+    assert basins.recovered_fractions(tmp_path, "rolling") == ({("stabilize", "lqr"): pytest.approx(3 / 30)}, "")
+    assert basins.recovered_fractions(tmp_path) == ({}, "")  # of the paper's robot
     assert basins.recovered_fractions(tmp_path / "nowhere") == ({}, "")
     assert len((tmp_path / "basins.csv").read_text().splitlines()) == 1 + 2 * 25
     assert figures.save(figures.basin_figure(maps), tmp_path / "basins.png").exists()
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"rows": [{"task": "stabilize"}]}', "[" * 100_000])
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", '{"about": []}', '{"about": {}}', '{"rows": [{"task": "stabilize"}]}', "[" * 100_000]
+)
 def test_damaged_maps_are_named_and_no_error(content, tmp_path):
     (tmp_path / "basins.json").write_text(content)
     fractions, why = basins.recovered_fractions(tmp_path)

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
+from ballbot_gym.robots import PAPER
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, console, physics_or_default, print_table, progress_bars
+from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table, progress_bars
 from ballbot_train.evaluation import basins as maps
 from ballbot_train.evaluation.benchmark import controllers_of, open_run
 from ballbot_train.executors import Workers
@@ -18,8 +19,9 @@ def basins(
     physics: Physics | None = None,
     out: Path = Path("runs/basins"),
     workers: WorkersOption = Workers(),
+    robot: RobotName = PAPER,
 ) -> None:
-    """Maps for Stabilize from which leans, speeds and lean rates each controller recovers, within what 350 N allow.
+    """Maps for Stabilize from which leans, speeds and lean rates each controller recovers, within what the robot allows.
 
     Args:
         controllers: as of `ballbot benchmark`.
@@ -28,18 +30,19 @@ def basins(
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
         workers: who does the work.
+        robot: whose limits and controllers.
     """
     points = min(points, 9) if quick else points
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")
-    chosen = controllers_of([maps.TASK], controllers)
+    chosen = controllers_of([maps.TASK], controllers, robot)
     physics = physics_or_default(physics)
     names = chosen[maps.TASK]
-    facts = open_run(out, chosen, workers, physics, points=points)
+    facts = open_run(out, chosen, workers, physics, robot=robot, points=points)
     with progress_bars({maps.BOUNDARY: len(maps.AXES)}) as bars:
-        bounds = maps.boundaries(out, workers, bars.advance)
+        bounds = maps.boundaries(out, workers, bars.advance, robot)
         bars.add(maps.states_to_run(bounds, names, points, physics))
-        made = maps.run(bounds, names, points, physics, out, workers, bars.advance)
+        made = maps.run(bounds, names, points, physics, out, workers, bars.advance, robot)
     maps.write(made, facts, out)
     picture = figures.save(figures.basin_figure(made), out / "basins.png")
     jobs.release(out)

@@ -60,7 +60,7 @@ def benchmark(
         done = run_benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance), seed, robot)
     facts |= loads.facts()
     busy = bool(facts["busy"])
-    recovered, damaged = basins.recovered_fractions(runs / "basins") if robot == PAPER else ({}, "")
+    recovered, damaged = basins.recovered_fractions(runs / "basins", robot)
     if damaged:
         console.print(f"skipped: {damaged}")
     rows = [

@@ -18,7 +18,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_train import jobs
 from ballbot_train.evaluation.controllers import make_packed, packed
@@ -69,25 +69,28 @@ class BasinMap:
         return float(np.sum(self.recovered[controller]) / np.sum(self.recoverable))
 
 
-def boundaries(out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]) -> dict[str, np.ndarray]:
+def boundaries(
+    out: Path, workers: int | Workers, on_progress: Callable[[str, int], None], robot: str = PAPER
+) -> dict[str, np.ndarray]:
     """The boundary of what is recoverable along every axis, (m, 2) lean, degrees, and value, resumably.
 
     Args:
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         on_progress: called with `BOUNDARY` and a number of finished axes.
+        robot: by name.
     """
-    work = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (), (name,), BOUNDARY) for name in AXES]
+    work = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (robot,), (name,), BOUNDARY) for name in AXES]
     done = jobs.run(work, out, workers, on_progress)
     return {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, done, strict=True)}
 
 
-def _boundary(names: Sequence[str]) -> Iterator[jobs.Entry]:
+def _boundary(robot: str, names: Sequence[str]) -> Iterator[jobs.Entry]:
     from ballbot_baselines.recovery import largest_leans  # it imports CasADi
 
     for name in names:
         values = grid(name, _BOUNDARY_POINTS)[1]
-        highest = np.degrees(largest_leans(make_task(TASK), default_params(), AXES[name].component, values))
+        highest = np.degrees(largest_leans(make_task(TASK, robot), named_robot(robot), AXES[name].component, values))
         known = np.isfinite(highest)
         right = np.column_stack([highest, values])[known]
         # −right starts where right ends
@@ -109,14 +112,14 @@ def grid(axis: str, points: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cell_jobs(
-    bounds: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str
+    bounds: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str, robot: str = PAPER
 ) -> list[jobs.Job]:
     """Every state to run, row by row of every map: those within the boundaries or little beyond, of half a map."""
     work = []
     for name, boundary in bounds.items():
         worth = _within(boundary, *grid(name, points), _DOUBT)
         for controller in controllers:
-            arguments = name, controller, physics, points, packed(controller)
+            arguments = name, controller, physics, points, packed(controller), robot
             for i in range(points // 2, points):
                 items = tuple((i, int(j)) for j in np.flatnonzero(worth[i]))
                 stem = f"{_slug(name)}-{_slug(controller)}-{zlib.crc32(controller.encode()):08x}-{physics}-{points}-{i:02d}"
@@ -140,6 +143,7 @@ def run(
     out: Path,
     workers: int | Workers,
     on_progress: Callable[[str, int], None],
+    robot: str = PAPER,
 ) -> list[BasinMap]:
     """Runs the controllers from every state within the boundaries, resumably, and makes a map for each axis.
 
@@ -151,8 +155,9 @@ def run(
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         on_progress: called with a controller and a number of finished states.
+        robot: by name.
     """
-    done = jobs.run(cell_jobs(bounds, controllers, points, physics), out, workers, on_progress)
+    done = jobs.run(cell_jobs(bounds, controllers, points, physics, robot), out, workers, on_progress)
     return maps_of(bounds, (entry for entries in done for entry in entries), controllers, points)
 
 
@@ -162,9 +167,10 @@ def _cells(
     physics: str,
     points: int,
     policy_files: Mapping[str, bytes],
+    robot: str,
     items: Sequence[tuple[int, int]],
 ) -> Iterator[jobs.Entry]:
-    env = BallbotEnv(TASK, physics=physics, arena_radius=_ARENA_RADIUS)
+    env = BallbotEnv(TASK, physics=physics, robot=robot, arena_radius=_ARENA_RADIUS)
     made = make_packed(controller, policy_files, env.task, env.params)
     leans, values = grid(axis, points)
     for i, j in items:
@@ -254,19 +260,23 @@ def read(folder: Path) -> list[BasinMap]:
     ]
 
 
-def recovered_fractions(folder: Path) -> tuple[dict[tuple[str, str], float], str]:
-    """The shares that a folder of `ballbot basins` holds.
+def recovered_fractions(folder: Path, robot: str = PAPER) -> tuple[dict[tuple[str, str], float], str]:
+    """The shares that a folder of `ballbot basins` holds of a robot.
 
     Returns:
-        The shares by task and controller, none where the folder holds none; and why its file cannot be read, or "".
+        The shares by task and controller, none where the folder holds none of this robot; and why its file cannot
+        be read, or "".
     """
     path = folder / "basins.json"
     if not path.exists():
         return {}, ""
     try:
-        rows = files.read_json(path)["rows"]
+        document = files.read_json(path)
+        if document["about"].get("robot", PAPER) != robot:
+            return {}, ""
+        rows = document["rows"]
         return {(str(row["task"]), str(row["controller"])): float(row["recovered"]) for row in rows}, ""
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         return {}, f"{path} is damaged: {error!r}"
 
 

@@ -198,7 +198,7 @@ def transfer_figure(rows: Sequence[TransferRow]) -> Figure:
 
 
 def basin_figure(maps: Sequence[BasinMap]) -> Figure:
-    """The initial states from which each controller recovers, coloured, on those that the force limit allows, grey."""
+    """The initial states from which each controller recovers, coloured, on those that the robot's limits allow, grey."""
     controllers = list(maps[0].recovered)
     size = (max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps))
     figure = Figure(figsize=size, layout="constrained")
@@ -219,7 +219,10 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
         line[0].set_ylabel(AXES[basin.axis].label)
     for axis in axes[-1]:
         axis.set_xlabel("lean γ, degrees")
-    figure.supxlabel("black: the boundary of what 350 N can recover; per cent: share of it recovered", fontsize=9)
+    figure.supxlabel(
+        "black: the boundary of what forces within the robot's limits can recover; per cent: share of it recovered",
+        fontsize=9,
+    )
     return figure
 
 

@@ -66,7 +66,7 @@ def leaderboard_sections(
         pictures_section(
             "Basins of attraction",
             [path for path in (runs / "basins" / "basins.png",) if path.exists()],
-            "From where each controller recovers, within what 350 N allow.",
+            "From where each controller recovers, within what the robot allows.",
         ),
         folder_section("Robustness", runs / "robustness" / "figures", "The same episodes under growing disturbances."),
         pictures_section(
