@@ -81,6 +81,14 @@ def _fresh(out: Path) -> Made:
     return {"fresh.csv": (out / "fresh.csv").read_text()} | _episodes(out / "certified")
 
 
+def _search(out: Path) -> Made:
+    """How many trials a search has, and what the first of them reached, whose settings are the learner's own."""
+    with (out / "trials.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["state"] in ("complete", "pruned")]
+    own = {"trial", "cpu_minutes"}  # what a trial that began anew does not share
+    return {"trials": len(rows), "first": {key: value for key, value in rows[0].items() if key not in own}}
+
+
 def _policy(out: Path) -> Made:
     return {"weights": (out / "policy.safetensors").read_bytes()}
 
@@ -107,6 +115,10 @@ COMMANDS = {
     "basins": _command("basins --controllers lqr --points 5 --physics rk4", _basins),
     "certify": _command("certify --tasks turn --episodes 6", _sets),
     "evaluate": _command("evaluate shac --fresh 20 --optima 4 --bins 2 --episodes 4 --physics rk4", _fresh),
+    "transfer": _command(
+        "transfer --tasks turn --controllers lqr --made-for paper rolling --episodes 8 --physics rk4", _episodes
+    ),
+    "tune": _command("tune rsl_ppo --task turn --trials 3 --seeds 1 --env-steps 8192 --evaluations 2", _search),
     "demos": _command("demos --task turn --expert lqr --episodes 12 --physics rk4", _dataset),
     "bc": _train("bc", "--total-iterations 6 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(

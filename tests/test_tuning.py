@@ -114,6 +114,25 @@ def test_a_killed_search_goes_on_with_the_trial_that_was_running(fakes, tmp_path
     assert fakes[before].learning_rate == pytest.approx(interrupted.params["learning_rate"])
 
 
+def test_a_search_that_is_killed_before_it_proposes_still_starts_with_the_tuned_settings(fakes, tmp_path, monkeypatch):
+    def killed(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tuning, "_proposed", killed)
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                tuning.run(SEARCH, 1, tmp_path)
+    tuning.run(SEARCH, 1, tmp_path)
+    assert fakes[0].learning_rate == LEARNERS["ppo"].settings("stabilize").learning_rate
+
+
+def test_a_damaged_study_is_named(fakes, tmp_path):
+    (tmp_path / "study.db").write_bytes(b"no database" * 100)
+    with pytest.raises(ValueError, match=r"study\.db cannot be read or written \(.*file is not a database"):
+        tuning.run(SEARCH, 1, tmp_path)
+
+
 def test_another_search_is_not_mixed_into_a_folder(fakes, tmp_path):
     tuning.run(SEARCH, 1, tmp_path)
     with pytest.raises(ValueError, match="env_steps"):

@@ -46,12 +46,14 @@ from ballbot_train.learning.learners import LEARNERS
 
 try:
     import optuna
+    import sqlalchemy.exc  # Optuna's
 except ImportError as error:
     raise ImportError(f'{error}; pip install "ballbot-gym[tune]" installs what ballbot tune needs') from error
 
 _STARTUP_TRIALS = 8  # drawn at random before the estimator proposes, and before any trial is pruned
 _ITERATIONS = ("rl_iterations", "total_iterations")  # names of the setting that bounds a training
 _INTERRUPTED = "interrupted"
+_STUDY = "study.db"
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,8 @@ def run(
         The contents of best.json.
 
     Raises:
-        ValueError: the learner has no space, the folder belongs to another search or is in use, or no trial came to its end.
+        ValueError: the learner has no space, the folder belongs to another search or is in use, its study is damaged or
+            cannot be written, or no trial came to its end.
     """
     if search.learner not in SPACES:
         raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
@@ -188,6 +191,12 @@ def run(
         with open_pool(workers, serial=workers.here == 1, per_core=1) as pool:
             _search(study, search, trials, out, pool, on_trial)
         return write_tables(study, search, out)
+    except (sqlalchemy.exc.DBAPIError, optuna.exceptions.StorageInternalError) as error:
+        cause = error.__cause__ or error
+        raise files.FileError(
+            f"{out / _STUDY} cannot be read or written ({cause}); if there is room on the disk, the study is damaged: "
+            "delete the folder"
+        ) from error
     finally:
         jobs.unlock(out)
 
@@ -195,7 +204,7 @@ def run(
 def open_study(search: Search, out: Path) -> "optuna.Study":
     """The study of a folder. Its first trial has the settings that are tuned for the task."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = f"sqlite:///{(out / 'study.db').absolute()}"
+    storage = f"sqlite:///{(out / _STUDY).absolute()}"
     study = optuna.create_study(storage=storage, study_name="tune", direction="minimize", load_if_exists=True)
     # The sampler's numbers depend on how many trials there are, so that a search that goes on proposes new ones.
     study.sampler = optuna.samplers.TPESampler(
@@ -205,10 +214,17 @@ def open_study(search: Search, out: Path) -> "optuna.Study":
     if not study.trials:
         study.enqueue_trial(encoded(SPACES[search.learner], LEARNERS[search.learner].settings(search.task)))
     for stale in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):  # of a search that was killed
+        waiting = [_given(trial) for trial in study.get_trials(states=(optuna.trial.TrialState.WAITING,))]
+        if _given(stale) not in waiting:  # a kill may have come before the next lines
+            study.enqueue_trial(_given(stale))
         study._storage.set_trial_user_attr(stale._trial_id, _INTERRUPTED, True)
         study.tell(stale.number, state=optuna.trial.TrialState.FAIL)
-        study.enqueue_trial(stale.params)
     return study
+
+
+def _given(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
+    """The parameters of a trial as far as they are known: a kill may have come before all were proposed."""
+    return {**trial.system_attrs.get("fixed_params", {}), **trial.params}
 
 
 def encoded(space: Mapping[str, Range | Choice], settings: Any) -> dict[str, Any]:
