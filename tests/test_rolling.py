@@ -33,7 +33,7 @@ from ballbot_train.console import RobotName
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import shac
-from ballbot_train.policy import load_policy
+from ballbot_train.policy import load_network, load_policy
 from ballbot_train.policy_files import PolicyError, PolicySpec, shipped_policies
 
 START = (0.0, 0.0, 0.2, -0.15, 0.5, -1.0, 0.3, -0.4)
@@ -453,6 +453,16 @@ def test_a_policy_is_of_one_robot(rolling):
     assert not set(shipped_policies(make_task("turn"))) & set(ROBOTS)
     with pytest.raises(PolicyError, match="was trained on the robot 'paper', not on 'rolling'"):
         load_policy(shipped_policies(make_task("turn"))["dagger"], make_task("turn", "rolling"), rolling)
+
+
+def test_weights_to_start_from_may_be_of_another_robot_and_its_episodes():
+    path = shipped_policies(make_task("orbit"))["dagger"]
+    there = make_task("orbit", "rolling")
+    with pytest.raises(PolicyError, match="was trained on Orbit"):
+        load_network(path, there, "rolling")
+    assert load_network(path, there, robot=None).spec.robot == "paper"
+    with pytest.raises(PolicyError, match="was trained on Orbit, not on Turn"):
+        load_network(path, make_task("turn"), robot=None)
 
 
 def test_every_robot_can_be_named_on_the_command_line():

@@ -105,7 +105,7 @@ def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
     assert torch.equal(parameters(learner), parameters(donor))
     learner.iterate()
     assert not torch.equal(parameters(learner), parameters(donor))
-    donor.network.spec = replace(donor.network.spec, robot="rolling")
+    donor.network.spec = replace(donor.network.spec, robot="rolling", task=replace(task, max_speed=3.0).problem())
     shac.Shac(task, params, config).start_from(donor.network)
     with pytest.raises(ValueError, match="cannot start"):
         shac.Shac(task, params, replace(config, hidden=(9,))).start_from(donor.network)

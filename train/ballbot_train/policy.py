@@ -137,7 +137,12 @@ def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[s
 
 
 def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> PolicyNetwork:
-    """The network of a policy file made for this very task and robot; None admits every robot.
+    """The network of a policy file made for this very task and robot.
+
+    Args:
+        path: of either of its files.
+        task: what it must have been trained on.
+        robot: by name; None admits every robot, and with it other fields of the task.
 
     Raises:
         PolicyError: a file is missing or damaged, or made for another task, robot, observation or shape.
@@ -150,7 +155,8 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
         raise PolicyError(f"{description_path} is not a policy: its spec has no {error}") from error
     except (ValueError, TypeError) as error:
         raise PolicyError(f"{description_path} is not a policy: {error}") from error
-    if spec.task != task.problem():
+    trained_on, wanted = (text.split("(")[0] if robot is None else text for text in (spec.task, task.problem()))
+    if trained_on != wanted:
         raise PolicyError(f"{description_path} was trained on {spec.task}, not on {task.problem()}")
     if robot is not None and spec.robot != robot:
         raise PolicyError(f"{description_path} was trained on the robot {spec.robot!r}, not on {robot!r}")

@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
+from ballbot_baselines.trajopt import EXECUTED
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.params import BallbotParams
@@ -73,7 +74,7 @@ class DaggerConfig:
     """Greatest distance from the plan at which TVLQR labels such a state, in units of the tube's standard deviations."""
     label_seconds: float = 4.0
     """Length of an optimum's part that becomes samples, s; after it the robot rests."""
-    backoff: Backoff = Backoff()
+    backoff: Backoff = Backoff(grip=EXECUTED.grip)
     """What optima keep from their limits, so that the learner's errors do not violate them."""
     gradient_steps: int = 150
     """Gradient steps per iteration."""
@@ -102,7 +103,7 @@ TUNED: dict[str, DaggerConfig] = {
         tube_samples=3,
         label_seconds=6.0,
         gradient_steps=400,
-        backoff=Backoff(goal=0.5, force=0.02),
+        backoff=Backoff(goal=0.5, force=0.02, grip=EXECUTED.grip),
     ),
     "orbit": DaggerConfig(
         total_iterations=80,
@@ -114,10 +115,13 @@ TUNED: dict[str, DaggerConfig] = {
         label_seconds=6.0,
         gradient_steps=400,
         hidden=(256, 256),
-        backoff=Backoff(force=0.1),  # plans at the force limit leave no force for corrections
+        backoff=Backoff(force=0.1, grip=EXECUTED.grip),  # plans at the force limit leave no force for corrections
     ),
     "weave": DaggerConfig(
-        episodes_per_iteration=5, max_guesses=3, label_seconds=5.0, backoff=Backoff(margin=0.05, force=0.02)
+        episodes_per_iteration=5,
+        max_guesses=3,
+        label_seconds=5.0,
+        backoff=Backoff(margin=0.05, force=0.02, grip=EXECUTED.grip),
     ),
 }
 """Settings by name of task; every other task takes the defaults."""

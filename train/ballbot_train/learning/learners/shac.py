@@ -167,15 +167,14 @@ class Shac:
         return self._network
 
     def start_from(self, network: PolicyNetwork) -> None:
-        """Takes the weights of a policy, to be improved; it may have been trained on another robot.
+        """Takes the weights of a policy, to be improved; it may have been trained on another robot and its episodes.
 
         Raises:
             ValueError: its network differs in shape from this one.
         """
-        if replace(network.spec, robot=self._network.spec.robot) != self._network.spec:
-            raise ValueError(
-                f"a policy of {network.spec} cannot start one of {self._network.spec}; give --hidden, --odd or --no-odd"
-            )
+        mine = self._network.spec
+        if replace(network.spec, task=mine.task, robot=mine.robot) != mine:
+            raise ValueError(f"a policy of {network.spec} cannot start one of {mine}; give --hidden, --odd or --no-odd")
         self._network.load_state_dict(network.state_dict())
         self._finetuning = True
 
