@@ -157,7 +157,7 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
         raise PolicyError(f"{description_path} is not a policy: {error}") from error
     trained_on, wanted = (text.split("(")[0] if robot is None else text for text in (spec.task, task.problem()))
     if trained_on != wanted:
-        raise PolicyError(f"{description_path} was trained on {spec.task}, not on {task.problem()}")
+        raise PolicyError(f"{description_path} was trained on {trained_on}, not on {wanted}")
     if robot is not None and spec.robot != robot:
         raise PolicyError(f"{description_path} was trained on the robot {spec.robot!r}, not on {robot!r}")
     if spec.observation_version != OBSERVATION_VERSION:
