@@ -3,16 +3,17 @@
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
 from ballbot_gym import certified, dynamics, files
-from ballbot_gym.env import make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.robots import named_robot
-from ballbot_gym.rollout import PlanError
+from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
 
@@ -103,17 +104,69 @@ def sweep(out: Path) -> None:
     figure.savefig(out / "sweep.png", dpi=110)
 
 
-def main(out: Path = Path("runs/friction"), costs: bool = False) -> None:
+class _Floor(BallbotEnv):
+    """Keeps what the floor gives in each step, and how fast the ball slips after it."""
+
+    def reset(self, **arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        self.grips: list[np.ndarray] = []
+        self.slips: list[float] = []
+        return super().reset(**arguments)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        result = super().step(action)
+        self.grips.append(result[-1]["grip"])
+        self.slips.append(self.slip)
+        return result
+
+
+def contact(out: Path, episodes: int) -> None:
+    """What the simulated floor gives the rolling robot under tracked plans."""
+    from ballbot_baselines.trajopt import TrajoptController
+
+    robot, rows = named_robot("rolling"), []
+    for name in TASKS:
+        task, stored = make_task(name, "rolling"), certified.load(name, robot="rolling")
+        env = _Floor(task, physics="bullet", robot="rolling")
+        for i in range(episodes):
+            run = rollout(env, TrajoptController(task, robot), options=stored.options(i))
+            *_, normal, needed = np.array(env.grips).T
+            rows.append(
+                {
+                    "task": name,
+                    "episode": i,
+                    "success": int(run.success),
+                    "least_normal_force": normal.min() / robot.weight,
+                    "greatest_friction": needed.max(),
+                    "greatest_slip": max(env.slips),
+                }
+            )
+        env.close()
+        of = [row for row in rows if row["task"] == name]
+        print(
+            f"{name}: {sum(row['success'] for row in of)} of {episodes} succeed; the floor presses with at least "
+            f"{min(row['least_normal_force'] for row in of):.0%} of the weight and gives a friction of at most "
+            f"{max(row['greatest_friction'] for row in of):.2f}; the ball slips at most "
+            f"{max(row['greatest_slip'] for row in of):.3f} m/s",
+            flush=True,
+        )
+    files.write_csv(out / "contact.csv", rows)
+
+
+def main(out: Path = Path("runs/friction"), costs: bool = False, contact_episodes: int = 0) -> None:
     """Measures what the stored optima of the paper's robot need, and writes demand.csv and friction.png.
 
     Args:
         out: folder of the results.
+        contact_episodes: of each task's certified ones, in which the rolling robot tracks its plans in PyBullet's contact;
+            contact.csv says what the floor gave.
         costs: also find optima of the rolling robot at several coefficients of friction, which takes minutes, and write
             sweep.csv and sweep.png with their cost and greatest lean.
     """
     demand(out)
     if costs:
         sweep(out)
+    if contact_episodes:
+        contact(out, contact_episodes)
 
 
 if __name__ == "__main__":
