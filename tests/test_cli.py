@@ -53,11 +53,11 @@ def test_benchmark_prints_a_leaderboard_and_writes_table_figures_and_report(tmp_
     assert not (out / "unfinished").exists()  # it only serves an interrupted run
 
 
-def test_robustness_writes_tables_and_curves(tmp_path):
+def test_robustness_writes_tables_and_curves(tmp_path, typed):
     arguments = ("--tasks", "turn", "--controllers", "lqr", "--episodes", 2, "--workers", 1)
-    run = ballbot("robustness", *arguments, "--stresses", "delay", cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert "0 · 20 · 40 · 60" in run.stdout
+    ended, printed = typed("robustness", *arguments, "--stresses", "delay")
+    assert ended == 0, printed
+    assert "0 · 20 · 40 · 60" in printed
     out = tmp_path / "runs" / "robustness"
     assert {path.name for path in out.iterdir()} == {
         "episodes.csv",
@@ -83,26 +83,24 @@ def test_compare_refuses_what_is_no_benchmark(tmp_path):
         compare(tmp_path, tmp_path)
 
 
-def test_a_folder_with_another_unfinished_run_is_refused(tmp_path):
+def test_a_folder_with_another_unfinished_run_is_refused(tmp_path, typed):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "unfinished.json").write_text('{"episodes": 3}')
-    run = ballbot("benchmark", "--tasks", "stabilize", "--episodes", 1, "--out", "out", cwd=tmp_path)
-    assert run.returncode == 1
-    assert "unfinished run" in run.stderr
+    ended, printed = typed("benchmark", "--tasks", "stabilize", "--episodes", 1, "--out", "out")
+    assert (ended, "unfinished run" in printed) == (1, True), printed
 
 
-def test_paper_writes_plans_and_figures(tmp_path):
-    run = ballbot("paper", "--only", "stabilize-1", "--out", "figures", cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert "106.3652" in run.stdout
+def test_paper_writes_plans_and_figures(tmp_path, typed):
+    ended, printed = typed("paper", "--only", "stabilize-1", "--out", "figures")
+    assert (ended, "106.3652" in printed) == (0, True), printed
     names = {path.name for path in (tmp_path / "figures").iterdir()}
     assert names == {"fig2-stabilize-1.png", "fig2-stabilize-1-lqr-and-trajopt.png", "stabilize-1.npz"}
 
 
-def test_optimize_writes_a_trajectory_that_starts_where_it_was_told(tmp_path):
+def test_optimize_writes_a_trajectory_that_starts_where_it_was_told(tmp_path, typed):
     state = [-1, 0, 0, 0, 0, 1, 0, 0]
-    run = ballbot("optimize", "stabilize", "--state", *state, "--duration", 4, "--out", "plan", cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
+    ended, printed = typed("optimize", "stabilize", "--state", *state, "--duration", 4, "--out", "plan")
+    assert ended == 0, printed
     trajectory = Trajectory.load(tmp_path / "plan" / "trajectory.npz")
     np.testing.assert_array_equal(trajectory.x[0], state)
     assert trajectory.duration == pytest.approx(4)
@@ -206,22 +204,20 @@ def test_only_the_command_that_is_called_is_imported():
         (["compare"], 2, "ballbot compare"),
     ],
 )
-def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, message, tmp_path):
-    run = ballbot(*arguments, cwd=tmp_path)
-    assert run.returncode == status
-    assert message in run.stdout + run.stderr
+def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, message, typed):
+    ended, printed = typed(*arguments)
+    assert (ended, message in printed) == (status, True), printed
 
 
-def test_names_and_paths_are_printed_as_they_are(tmp_path):
+def test_names_and_paths_are_printed_as_they_are(tmp_path, typed):
     for out in ("runs/a[/b]c", "[red]x:smile:"):
         arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
-        run = ballbot(*arguments, "--workers", 1, "--out", out, cwd=tmp_path)
-        assert run.returncode == 0, run.stderr
-        assert f"report: {out}/report.html" in run.stdout
+        ended, printed = typed(*arguments, "--workers", 1, "--out", out)
+        assert (ended, f"report: {out}/report.html" in printed) == (0, True), printed
         assert (tmp_path / out / "report.html").exists()
 
 
-def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path):
+def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path, typed):
     runs = tmp_path / "runs"
     (runs / "basins").mkdir(parents=True)
     (runs / "basins" / "basins.json").write_text("{")
@@ -229,14 +225,14 @@ def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path):
     (runs / "train" / "config.json").write_text("{")
     (runs / "train" / "evaluations.csv").write_text("seconds,regret_mean\n1,2\n")
     arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
-    run = ballbot(*arguments, "--workers", 1, cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert "skipped: runs/basins/basins.json is damaged" in run.stdout
-    assert "skipped: runs/train/config.json" in run.stdout
+    ended, printed = typed(*arguments, "--workers", 1)
+    assert ended == 0, printed
+    assert "skipped: runs/basins/basins.json is damaged" in printed
+    assert "skipped: runs/train/config.json" in printed
     assert (runs / "benchmark" / "leaderboard.csv").exists()
 
 
-def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_path):
+def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_path, typed):
     arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "trajopt", "--workers", "1", "--out", "out")
     first = subprocess.Popen(
         [sys.executable, "-m", "ballbot_train.cli", *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL
@@ -244,11 +240,10 @@ def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_pa
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (tmp_path / "out" / "unfinished").exists():
         time.sleep(0.05)
-    second = ballbot(*arguments, cwd=tmp_path)
+    ended, printed = typed(*arguments)
     first.send_signal(signal.SIGKILL)
     first.wait()
-    assert second.returncode == 1
-    assert "another run is using out right now" in second.stderr
+    assert (ended, "another run is using out right now" in printed) == (1, True), printed
     assert not (tmp_path / "out" / "leaderboard.csv").exists()
 
 
