@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.export import export
 from ballbot_train.onnx_export import export_onnx, observation_table
@@ -41,7 +42,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     runtime = session(tmp_path / "policy.onnx")
     policy = load_policy(SHIPPED / f"{name}.json")
     # in the closed form a ball that would slip ends the episode
-    physics = "bullet" if policy.params.grips else "rk4"
+    physics = "bullet" if named_robot(robot).grips else "rk4"
     seen = observations_of_an_episode(BallbotEnv(task, physics=physics, robot=robot), policy)
     assert len(seen) > 50
     one_by_one = [runtime.run(None, {"observation": row[None]})[0][0] for row in seen]
