@@ -219,10 +219,7 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
         line[0].set_ylabel(AXES[basin.axis].label)
     for axis in axes[-1]:
         axis.set_xlabel("lean γ, degrees")
-    figure.supxlabel(
-        "black: the boundary of what forces within the robot's limits can recover; per cent: share of it recovered",
-        fontsize=9,
-    )
+    figure.supxlabel("black: the boundary of what the robot can recover; per cent: share of it recovered", fontsize=9)
     return figure
 
 
