@@ -203,7 +203,7 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
     size = (max(6.0, 1.2 + 3.1 * len(controllers)), 0.8 + 3.1 * len(maps))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(maps), len(controllers), squeeze=False, sharex=True, sharey="row")
-    figure.suptitle("Stabilize: initial states from which the robot comes to rest at the origin", fontsize=13)
+    figure.suptitle("Stabilize: from where the robot comes to rest at the origin", fontsize=13)
     for basin, line in zip(maps, axes, strict=True):
         for k, (controller, axis) in enumerate(zip(controllers, line, strict=True)):
             cells = np.where(basin.recovered[controller], 2.0, np.where(basin.recoverable, 1.0, 0.0))
