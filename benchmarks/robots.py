@@ -70,7 +70,7 @@ def main(
                 speeds[robot].append(speed(batch, seconds))
         rows += _report("batch", task, {robot: statistics.median(found) for robot, found in speeds.items()}, "steps/s")
         del batches
-        rows += _report("nmpc, median", task, {robot: nmpc_step(task, robot, episodes) for robot in names}, "ms")
+        rows += _report("nmpc, median", task, nmpc_steps(task, names, episodes), "ms")
     files.write_csv(out / "robots.csv", [asdict(row) for row in rows])
     print(f"written to {out}")
 
@@ -88,23 +88,29 @@ def speed(batch: BallbotBatch, seconds: float) -> float:
     return steps * batch.num_envs / (time.process_time() - begin)
 
 
-def nmpc_step(task: str, robot: str, episodes: int) -> float:
-    """Median time of NMPC's `act`, ms, on the first certified episodes in the closed form."""
-    env = BallbotEnv(task, robot=robot, physics="rk4")
-    sets, spent = certified.load(env.task, robot=robot), []
-    nmpc = NmpcController(env.task, env.params)
-    act = nmpc.act
+def nmpc_steps(task: str, robots: list[str], episodes: int) -> dict[str, float]:
+    """Median time of NMPC's `act` by robot, ms, on the first certified episodes in the closed form; robots alternate."""
+    envs = {robot: BallbotEnv(task, robot=robot, physics="rk4") for robot in robots}
+    controllers = {robot: _Timed(env) for robot, env in envs.items()}
+    for i in range(episodes):
+        for robot, env in envs.items():
+            sets = certified.load(env.task, robot=robot)
+            rollout(env, controllers[robot], options={"state": sets.states[i], "constants": sets.constants[i]})
+    return {robot: 1e3 * statistics.median(nmpc.spent) for robot, nmpc in controllers.items()}
 
-    def timed(t: float, x: np.ndarray) -> np.ndarray:
+
+class _Timed(NmpcController):
+    """NMPC that notes how long each of its steps takes, s of the processor."""
+
+    def __init__(self, env: BallbotEnv):
+        super().__init__(env.task, env.params)
+        self.spent: list[float] = []
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
         begin = time.thread_time()
-        u = act(t, x)
-        spent.append(time.thread_time() - begin)
+        u = super().act(t, x)
+        self.spent.append(time.thread_time() - begin)
         return u
-
-    nmpc.act = timed
-    for x, c in zip(sets.states[:episodes], sets.constants[:episodes], strict=True):
-        rollout(env, nmpc, options={"state": x, "constants": c})
-    return 1e3 * statistics.median(spent)
 
 
 def _report(what: str, task: str, found: dict[str, float], unit: str) -> list[Row]:

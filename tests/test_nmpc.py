@@ -1,4 +1,4 @@
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 
 import numpy as np
 import pytest
@@ -368,6 +368,6 @@ def test_without_a_new_plan_it_goes_on_with_the_old_one(params, monkeypatch):
 
 @pytest.mark.slow
 def test_another_process_makes_the_new_plan(params):
-    controller, first, x = far_from_its_plan(params, lambda controller: controller._planning.result())
+    controller, first, x = far_from_its_plan(params, lambda controller: wait([controller._planning]))
     assert controller.plan is not first
     assert np.abs(x).max() < 0.1

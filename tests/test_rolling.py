@@ -471,7 +471,7 @@ def test_every_robot_can_be_named_on_the_command_line():
 
 def taught(robot, **settings):
     """shac on Stabilize after some iterations, from LQR."""
-    config = shac.ShacConfig(num_envs=64, hidden=(16,), odd=True, compile=False, **settings)
+    config = shac.ShacConfig(num_envs=64, hidden=(16,), symmetry="odd", compile=False, **settings)
     learner = shac.Shac(make_task("stabilize", robot), named_robot(robot), config)
     for _ in range(config.total_iterations):
         learner.iterate()

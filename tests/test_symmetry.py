@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import dynamics
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_train.learning.actors import spec_for
+from ballbot_train.learning.fitting import Fit
+from ballbot_train.learning.learners.shac import Shac, ShacConfig
 from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
 
 MIRRORED = [(name, i) for name, kind in TASKS.items() for i in range(len(kind().mirrors))]
@@ -114,6 +118,20 @@ def test_the_slalom_frame_forgets_obstacles_that_are_passed(params, rng):
         assert features[9] >= 0  # the next one is on the left
 
 
+@pytest.mark.parametrize(("speed", "loops"), [(4.46, -1), (4.5, 1)])
+def test_the_gate_frame_says_whether_the_best_way_loops(params, speed, loops):
+    task = TASKS["turn"]()
+    x, c = task.sample(np.random.default_rng(0), params)
+    x[5] = c[0] = speed
+    found = find_optimum(task, params, x, c).trajectory.x
+    heading = np.unwrap(np.arctan2(found[:, 5], found[:, 4]))
+    features, back = FRAMES[task.frame].features(tuple(task.observe(x, c)))
+    assert np.sign(heading[-1] - heading[0]) == loops  # a loop turns left
+    assert len(features) == FRAMES[task.frame].size
+    assert features[9] == loops
+    assert back((1.0, 2.0)) == (1.0, 2.0)
+
+
 @pytest.mark.parametrize(("name", "index"), MIRRORED)
 def test_a_policy_that_is_averaged_over_mirror_images_mirrors_exactly(name, index, rng):
     task = TASKS[name]()
@@ -122,6 +140,15 @@ def test_a_policy_that_is_averaged_over_mirror_images_mirrors_exactly(name, inde
     observation = torch.as_tensor(rng.normal(size=(50, len(task.observation_scale))), dtype=torch.float32)
     signs, action_signs = (torch.tensor(part) for part in mirrors[index])
     torch.testing.assert_close(network(signs * observation), action_signs * network(observation))
+
+
+@pytest.mark.parametrize(("name", "symmetry"), [("weave", "frame"), ("weave", "mirrors"), ("turn", "frame")])
+def test_policies_that_are_fitted_or_follow_gradients_have_the_symmetry_that_is_asked_for(name, symmetry, params):
+    task = TASKS[name]()
+    config = ShacConfig(num_envs=2, hidden=(8,), symmetry=symmetry, compile=False)
+    for network in (Fit(task, params, symmetry, (8,), 0).network, Shac(task, params, config).network):
+        assert network.spec == spec_for(task, symmetry, (8,), linear=True)
+        assert network.spec.squash == "tanh"
 
 
 @pytest.mark.parametrize("fields", [{"mirrors": True}, {"frame": "radial"}])

@@ -87,6 +87,7 @@ class Turn(Task):
     """Largest speed that an episode may have, m/s."""
 
     id = "BallbotTurn-v0"
+    frame = "gate"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 5.0)
     constant_names = ("speed",)
     constant_draws = 1

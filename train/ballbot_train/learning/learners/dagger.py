@@ -32,6 +32,7 @@ from ballbot_gym.paths import then_stay
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import Symmetry
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.policy import PolicyNetwork
@@ -80,6 +81,9 @@ class DaggerConfig:
     """Gradient steps per iteration."""
     batch_size: int = 1024
     """Samples per gradient step."""
+    symmetry: Symmetry = "none"
+    """How the policy respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
+    over the task's mirror images, or it sees and acts in the task's frame."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the policy's hidden layers."""
     learning_rate: float = 3e-3
@@ -137,7 +141,7 @@ class Dagger:
         self.config, self.iteration = config, 0
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
-        self._fit = Fit(task, params, config.hidden, seed)
+        self._fit = Fit(task, params, config.symmetry, config.hidden, seed)
         none = np.zeros((0, len(task.observation_scale)))
         self._samples = Samples.of(none, np.zeros((0, 2))) if samples is None else samples
 

@@ -24,8 +24,9 @@ from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import Symmetry, spec_for
 from ballbot_train.learning.fitting import start_as_lqr
-from ballbot_train.policy import PolicyNetwork, PolicySpec
+from ballbot_train.policy import PolicyNetwork
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,9 @@ class ShacConfig:
     """Share of the envs that start a new episode after each window, because the first second costs most."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers of policy and critic."""
-    odd: bool = False
-    """Whether opposite observations get opposite actions; only right if the goal is the origin and nothing is in the way."""
+    symmetry: Symmetry = "none"
+    """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
+    over the task's mirror images, or it sees and acts in the task's frame."""
     learning_rate: float = 3e-3
     """Learning rate of policy and critic at the start."""
     finetune_learning_rate: float = 5e-4
@@ -86,7 +88,7 @@ _SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
 _ENDLESS = 10**6  # control steps: longer than any episode in training
 
 TUNED: dict[str, ShacConfig] = {
-    "stabilize": ShacConfig(odd=True),
+    "stabilize": ShacConfig(symmetry="odd"),
     "turn": ShacConfig(exit_softness=0.3),
     "orbit": ShacConfig(gamma=0.998),
     "weave": ShacConfig(
@@ -149,7 +151,7 @@ class Shac:
         self.config, self.iteration, self._finetuning = config, 0, False
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
-        self._network = PolicyNetwork(PolicySpec.of(task, hidden=config.hidden, odd=config.odd))
+        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
         start_as_lqr(self._network, task, params)
         self.critic = Critic(task, params, config.hidden)
         self.target = Critic(task, params, config.hidden)
@@ -174,7 +176,7 @@ class Shac:
         """
         mine = self._network.spec
         if replace(network.spec, task=mine.task, robot=mine.robot) != mine:
-            raise ValueError(f"a policy of {network.spec} cannot start one of {mine}; give --hidden, --odd or --no-odd")
+            raise ValueError(f"a policy of {network.spec} cannot start one of {mine}; give --hidden or --symmetry")
         self._network.load_state_dict(network.state_dict())
         self._finetuning = True
 
