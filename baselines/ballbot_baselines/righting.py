@@ -62,7 +62,7 @@ def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, fo
     with np.errstate(all="ignore"):  # members that fall may overflow, and are left out
         if params.grips:
             force = min(force, _GRIPPING * params.friction * params.weight)
-        x, u = _simulate(params, x0, gains, _target(task, x0, c, params), task.steps, task.control_dt, force)
+        x, u = simulate(params, x0, gains, _target(task, x0, c, params), task.steps, task.control_dt, force)
         margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in _margins(task, x, c)], axis=0)
         safe = np.logical_and.accumulate(margins >= 0, axis=0)
         if params.grips:
@@ -99,7 +99,7 @@ def guesses(task: Task, params: BallbotParams, member: Member, c: np.ndarray) ->
     return [(np.concatenate([member.x[:k], x]), np.concatenate([member.u[:k], u]))]
 
 
-def _simulate(
+def simulate(
     params: BallbotParams,
     x0: np.ndarray,
     gains: np.ndarray,
@@ -108,16 +108,30 @@ def _simulate(
     dt: float,
     force: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States (steps+1, n, 8) and forces (steps, n, 2) of all members."""
+    """Runs members of the family.
+
+    Args:
+        params: the robot.
+        x0: (8,) or (n, 8) initial state.
+        gains: (4, n) of each member: the bandwidth of the lean's loop, rad/s; the time constant of the ball's loop, s; how
+            far it leans to the left of the fall at first, rad; and the time in which that fades, s.
+        target: (2,) where to steer the ball, m.
+        steps: control steps.
+        dt: control step, s.
+        force: largest force per axis, N.
+
+    Returns:
+        States (steps+1, n, 8) and forces (steps, n, 2), N.
+    """
     bandwidth, seconds, lean, fade = (part[:, None] for part in gains)
-    falling = x0[2:4] + 0.2 * x0[6:8]  # rad: where the body leans, or is about to
-    size = np.hypot(*falling)
-    along = falling / size if size > 1e-9 else np.array([1.0, 0.0])
-    aside = lean * np.array([-along[1], along[0]])
+    falling = x0[..., 2:4] + 0.2 * x0[..., 6:8]  # rad: where the body leans, or is about to
+    size = np.hypot(falling[..., :1], falling[..., 1:])
+    along = np.where(size > 1e-9, falling / np.maximum(size, 1e-9), [1.0, 0.0])
+    aside = lean * np.stack([-along[..., 1], along[..., 0]], -1)
     h, mass = params.first_moment, params.moving_mass
     inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
     turning = mass * params.ball_radius if params.rolls else 0.0  # the torque that drives the ball turns the body too
-    x = np.tile(np.asarray(x0, np.float64), (gains.shape[1], 1))
+    x = np.array(np.broadcast_to(np.asarray(x0, np.float64), (gains.shape[1], 8)))
     states, forces = [x], []
     for k in range(steps):
         position, leans, speed, rate = x[:, :2] - target, x[:, 2:4], x[:, 4:6], x[:, 6:8]
