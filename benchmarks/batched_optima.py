@@ -69,10 +69,12 @@ def main(episodes: int = 8192, checked: int = 300, seed: int = 0, out: Path = Pa
     network = load_network(shipped_policies(task)["sac"], task)
     run = run_episodes(BallbotBatch(task, episodes, compile=False), network, x0, c, record=True)
     assert run.states is not None
+    met = torch.cat(
+        [torch.as_tensor(x0)[None], run.states.transpose(1, 2).double()[:-1]]
+    )  # before each step, (n, B, 8)
     with torch.no_grad():
-        observations = task.observe(run.states.double(), torch.as_tensor(c))
-        actions = network(observations.float()).double().transpose(0, 1).numpy()
-    warm = find_optima(task, params, x0, forces=params.force_limit * actions)
+        actions = network(task.observe(met, torch.as_tensor(c)).float()).double()
+    warm = find_optima(task, params, x0, forces=params.force_limit * actions.transpose(0, 1).numpy())
     warm_seconds = time.process_time() - begin
     least = np.nanmin([one_by_one, cold.costs[:checked], warm.costs[:checked]], axis=0)
     mean = statistics.mean(times)

@@ -123,7 +123,7 @@ COMMANDS = {
     "bc": _train("bc", "--total-iterations 6 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(
         "dagger",
-        "--total-iterations 4 --gathering-iterations 2 --episodes-per-iteration 2 --candidate-episodes 0 "
+        "--total-iterations 4 --gathering-iterations 2 --batch-episodes 0 --episodes-per-iteration 2 --candidate-episodes 0 "
         "--tracked-rollouts-per-plan 1 --gradient-steps 20",
     ),
     "ppo": _train("ppo", _RL),

@@ -100,6 +100,7 @@ def test_dagger_labels_what_it_meets_on_every_task(name):
         "episodes_per_iteration",
         "candidate_episodes",
         "rollouts_per_plan",
+        "batch_episodes",
         "max_rollout_seconds",
         "gradient_steps",
         "batch_size",
@@ -169,6 +170,21 @@ def test_tracked_rollouts_are_labelled_by_feedback_about_the_plan_and_only_near_
     np.testing.assert_allclose(samples.actions.numpy(), np.clip(expected, -1, 1), atol=1e-6)
 
 
+def test_thousands_of_optima_at_once_give_the_labels_that_optima_one_by_one_give():
+    task, params = make_task("stabilize"), default_params()
+    learner = dagger.Dagger(task, params, replace(TINY_DAGGER, batch_episodes=6, batch_states=4))
+    figures = learner.iterate()
+    observations, actions, weights = learner.state_dict()["samples"]
+    solved = round(6 * figures["train/labelled"])
+    assert solved >= 3  # some of those that the learner reaches cannot be recovered
+    assert 4 * solved < len(actions) <= 8 * solved  # those of the optima, and most of those around them
+    assert (weights > 0).all()
+    for i in range(0, 4 * solved, 7):
+        x = observations[i].double().numpy() * task.observation_scale
+        expected = find_optimum(task, params, x, np.zeros(0)).trajectory.u[0] / params.force_limit
+        np.testing.assert_allclose(actions[i], expected, atol=0.01)
+
+
 def test_dagger_falls_far_less_than_lqr_after_two_rounds():
     """LQR, within the limits of tanh, is where it starts; eight planned episodes and their surroundings halve its falls."""
     task, params = make_task("stabilize"), default_params()
@@ -180,7 +196,7 @@ def test_dagger_falls_far_less_than_lqr_after_two_rounds():
         "batch_size": 256,
         "hidden": (64,),
     }
-    learner = dagger.Dagger(task, params, replace(LEARNERS["dagger"].settings("stabilize"), **small))
+    learner = dagger.Dagger(task, params, replace(dagger.DaggerConfig(), **small))
     before = training.score(learner.network, task)
     for _ in range(small["total_iterations"]):
         learner.iterate()

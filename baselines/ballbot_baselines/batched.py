@@ -91,7 +91,8 @@ def find_optima(
         task: one that `solves` admits.
         params: the robot.
         x0: (B, 8) initial states.
-        forces: (B, k, 2) N, of episodes to start from, k at least `optimized_steps(task)`; default, simulated recoveries.
+        forces: (B, k, 2) N, of episodes to start from where they are cheaper than the simulated recoveries, as those of a
+            policy; k at least `optimized_steps(task)`.
         device: of torch, where the episodes are optimized.
 
     Raises:
@@ -108,8 +109,10 @@ def find_optima(
     solver = _Solver(task, params, device)
     parts = []
     for rows in _chunks(len(x0)):
-        start = _recoveries(task, params, x0[rows]) if forces is None else forces[rows, :steps].transpose(1, 2, 0)
-        parts.append(solver.solve(x0[rows], start))
+        starts = [_recoveries(task, params, x0[rows])]
+        if forces is not None:
+            starts.append(forces[rows, :steps].transpose(1, 2, 0))
+        parts.append(solver.solve(x0[rows], starts))
     return BatchOptima(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in BatchOptima.__annotations__)
     )
@@ -157,14 +160,20 @@ class _Solver:
         self._device = device
 
     @torch.no_grad()
-    def solve(self, x0: np.ndarray, forces: np.ndarray) -> BatchOptima:
-        """Args: x0 (B, 8); forces (T, 2, B) to start from."""
-        count, steps = len(x0), len(forces)
-        start, u = torch.tensor(x0.T, device=self._device), torch.tensor(forces, device=self._device)
-        gains, x = u.new_zeros(steps, 2, 8, count), u.new_zeros(steps + 1, 8, count)
-        slopes, cost = u.new_zeros(steps, 8, count), u.new_zeros(count)
+    def solve(self, x0: np.ndarray, starts: list[np.ndarray]) -> BatchOptima:
+        """Args: x0 (B, 8); forces (T, 2, B), of which the cheapest are the start."""
+        count, steps = len(x0), len(starts[0])
+        start = torch.tensor(x0.T, device=self._device)
+        u, x = start.new_zeros(steps, 2, count), start.new_zeros(steps + 1, 8, count)
+        gains, slopes = u.new_zeros(steps, 2, 8, count), u.new_zeros(steps, 8, count)
+        cost = u.new_full((count,), torch.inf)
         for few in torch.arange(count, device=self._device).split(_AT_ONCE):
-            x[..., few], u[..., few], cost[few] = self._roll(start[:, few], u[..., few], gains[..., few], x[..., few])
+            for forces in starts:
+                held = torch.tensor(forces, device=self._device)[..., few]
+                new_x, new_u, new = self._roll(start[:, few], held, gains[..., few], x[..., few])
+                lower = new < cost[few]
+                at = few[lower]
+                x[..., at], u[..., at], cost[at] = new_x[..., lower], new_u[..., lower], new[lower]
         iterations = torch.zeros(count, dtype=torch.int64, device=self._device)
         converged = torch.zeros(count, dtype=torch.bool, device=self._device)
         left = torch.nonzero(cost.isfinite())[:, 0]

@@ -11,6 +11,10 @@ Every state of an optimum becomes a sample, not only its first. TVLQR labels fur
 because its gain is the derivative of the optimal force with respect to the state. It labels `tube_samples` states drawn
 around each state of an optimum, and the states of whole episodes under the learner as far as they lie within `max_distance`
 of the episode's plan. Errors are weighted by one over the cost of the episode's optimum, as regret is.
+
+Where `ballbot_baselines.batched` solves the task, thousands of optima are found at once (`batch_episodes`): half of them from
+the beginnings of episodes, half from states that the learner reaches from there. They bring the feedback about them, so
+states around them are labelled too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
 
+from ballbot_baselines import batched
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
@@ -73,6 +79,10 @@ class DaggerConfig:
     """Rollouts of the learner over the whole plan, whose states TVLQR labels."""
     max_distance: float = 2.0
     """Greatest distance from the plan at which TVLQR labels such a state, in units of the tube's standard deviations."""
+    batch_episodes: int = 0
+    """Optima that are found at once per gathering iteration, in place of those one by one; 0 where that does not work."""
+    batch_states: int = 32
+    """States of each of these optima that become samples, each with `tube_samples` around it."""
     label_seconds: float = 4.0
     """Length of an optimum's part that becomes samples, s; after it the robot rests."""
     backoff: Backoff = Backoff(grip=EXECUTED.grip)
@@ -95,6 +105,16 @@ class DaggerConfig:
 
 
 TUNED: dict[str, DaggerConfig] = {
+    "stabilize": DaggerConfig(
+        total_iterations=30,
+        gathering_iterations=20,
+        evaluations=15,
+        batch_episodes=4096,
+        label_seconds=3.0,
+        symmetry="odd",
+        gradient_steps=3000,
+        batch_size=2048,
+    ),
     # Turn's episodes differ in one number only, so feedback about their plans is all that has to be learnt.
     "turn": DaggerConfig(
         total_iterations=100,
@@ -175,6 +195,8 @@ class Dagger:
 
     def _gather(self, rng: np.random.Generator) -> dict[str, float]:
         """Plans episodes, rolls the learner out, and labels the states that it reaches."""
+        if self.config.batch_episodes:
+            return self._gather_batch(rng)
         plans = self._planned(rng)
         gains = [tube_gains(self._task, self._params, plan, c) for plan, c in plans]
         for (plan, c), k in zip(plans, gains, strict=True):
@@ -190,6 +212,56 @@ class Dagger:
                 k = tube_gains(self._task, self._params, found, c)
                 self._samples.add(self._labelled(found, k, c, plan.cost, rng))
         return {"train/labelled": labelled / max(1, len(starts))}
+
+    def _gather_batch(self, rng: np.random.Generator) -> dict[str, float]:
+        """Labels states along thousands of optima and around them; half of the optima start where the learner gets to."""
+        config, task = self.config, self._task
+        begins = [task.sample(rng, self._params) for _ in range(config.batch_episodes // 2)]
+        x0, c = (np.array(part) for part in zip(*begins, strict=True))
+        longest = max(1, round(self._share * config.max_rollout_seconds / task.control_dt))
+        history, over, _ = self._roll(x0, c, longest)
+        lasted = np.where(over[-1], over.argmax(0), longest + 1)
+        reached = history[rng.integers(lasted), np.arange(len(x0))]
+        starts = np.concatenate([x0, reached])
+        optima = batched.find_optima(task, self._params, starts, self._forces(starts, np.tile(c, (2, 1))))
+        of_episodes = np.tile(optima.costs[: len(x0)], 2)  # a state counts as its episode does
+        costs = np.where(np.isnan(of_episodes), optima.costs, of_episodes)
+        rows = np.repeat(np.flatnonzero(optima.solved), config.batch_states)
+        steps = rng.integers(round(config.label_seconds / task.control_dt), size=len(rows))
+        x, u, gains = optima.states[rows, steps], optima.forces[rows, steps], optima.gains[rows, steps]
+        near_x, near_u, of = self._around(x, u, gains, rng)
+        of = np.concatenate([rows, rows[of]])
+        forces = np.concatenate([u, near_u])
+        self._samples.add(self._samples_of(np.concatenate([x, near_x]), forces, c[of % len(x0)], costs[of]))
+        return {"train/labelled": float(optima.solved.mean())}
+
+    def _forces(self, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """(B, n, 2) N, of the learner in episodes from states (B, 8), as far as `batched.find_optima` takes them."""
+        steps = batched.optimized_steps(self._task)
+        history, _, _ = self._roll(x, c, steps)
+        with torch.no_grad():
+            actions = self.network(torch.as_tensor(self._task.observe(history[:-1], c), dtype=torch.float32))
+        return self._params.force_limit * actions.transpose(0, 1).double().numpy()
+
+    @property
+    def _share(self) -> float:
+        """How far the gathering has come."""
+        return min(1.0, (self.iteration + 1) / self.config.gathering_iterations)
+
+    def _around(
+        self, x: np.ndarray, u: np.ndarray, gains: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`tube_samples` states around each of n states (n, 8), where the feedback (n, 2, 8) about it tells their forces.
+
+        Returns:
+            m states (m, 8), their forces (m, 2), N, and around which of the n each of them is, (m,).
+        """
+        shape = self.config.tube_samples, len(x)
+        off = _SPREAD * rng.standard_normal((*shape, 8)) * rng.random((*shape, 1))
+        change = -np.einsum("kij,tkj->tki", gains, off)
+        # a derivative is no guide to greater changes
+        small = np.abs(change).max(-1) < _SMALL * self._params.force_limit
+        return (x + off)[small], (u + change)[small], np.nonzero(small)[1]
 
     def _planned(self, rng: np.random.Generator) -> list[tuple[Optimum, np.ndarray]]:
         """Draws episodes, up to half of them ones that the learner fails; returns their optima and constants (nc,)."""
@@ -233,7 +305,7 @@ class Dagger:
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
             off, k = met - plan.trajectory.x[nearest], gains[i // config.tracked_rollouts_per_plan]
             forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", k[nearest], off)
-            self._samples.add(self._samples_of(met, forces, c, plan.cost))
+            self._samples.add(self._samples_of(met, forces, np.broadcast_to(c, (len(met), len(c))), plan.cost))
 
     def _optimum(self, x: np.ndarray, c: np.ndarray, path: np.ndarray) -> Optimum | None:
         """The optimum from state x (8,), or None; guessed from a ground path (n, 2), or by the task if that is too short."""
@@ -257,9 +329,8 @@ class Dagger:
             time, or, if the episode ended before that time, at a random time before its end.
         """
         config, dt = self.config, self._task.control_dt
-        share = min(1.0, (self.iteration + 1) / config.gathering_iterations)
-        longest = max(1, round(share * config.max_rollout_seconds / dt))
-        on_plan = rng.random(len(plans)) < config.beta * (1 - 0.8 * share)
+        longest = max(1, round(self._share * config.max_rollout_seconds / dt))
+        on_plan = rng.random(len(plans)) < config.beta * (1 - 0.8 * self._share)
         starts = [
             int(rng.integers(len(plan.trajectory.u))) if on else 0 for (plan, _), on in zip(plans, on_plan, strict=True)
         ]
@@ -306,18 +377,14 @@ class Dagger:
         n = min(len(plan.trajectory.u), round(config.label_seconds / task.control_dt))
         x, u = plan.trajectory.x[:n], plan.trajectory.u[:n]
         if config.tube_samples:
-            off = _SPREAD * rng.standard_normal((config.tube_samples, n, 8)) * rng.random((config.tube_samples, n, 1))
-            change = -np.einsum("kij,tkj->tki", gains[:n], off)
-            small = (
-                np.abs(change).max(-1) < _SMALL * self._params.force_limit
-            )  # a derivative is no guide to greater changes
-            x, u = np.concatenate([x, (x + off)[small]]), np.concatenate([u, (u + change)[small]])
-        return self._samples_of(x, u, c, cost)
+            near_x, near_u, _ = self._around(x, u, gains[:n], rng)
+            x, u = np.concatenate([x, near_x]), np.concatenate([u, near_u])
+        return self._samples_of(x, u, np.broadcast_to(c, (len(x), len(c))), cost)
 
-    def _samples_of(self, x: np.ndarray, u: np.ndarray, c: np.ndarray, cost: float) -> Samples:
-        """Samples of states (n, 8) and forces (n, 2), N, of an episode whose optimum costs `cost`."""
-        observations = np.asarray(self._task.observe(x, np.broadcast_to(c, (len(x), len(c)))))
-        weights = np.full(len(x), 1 / max(cost, self.config.min_cost))
+    def _samples_of(self, x: np.ndarray, u: np.ndarray, c: np.ndarray, cost: float | np.ndarray) -> Samples:
+        """Samples of states (n, 8) and forces (n, 2), N, with constants (n, nc), of episodes whose optima cost `cost`."""
+        observations = np.asarray(self._task.observe(x, c))
+        weights = np.broadcast_to(1 / np.maximum(cost, self.config.min_cost), len(x))
         return Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights)
 
 
