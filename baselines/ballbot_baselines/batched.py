@@ -35,7 +35,9 @@ except ModuleNotFoundError as error:
 _SECONDS = 3.0  # optimized; LQR's cost-to-go counts for the rest
 _AT_ONCE = 4096  # episodes that are optimized together; of fewer, the time for calling torch counts
 _CHUNK = 16_384  # episodes whose trajectories are in memory together, some 60 kB each
-_FAMILY = tuple(itertools.product((7.0, 14.0), (1.0, 1.4)))  # bandwidths, rad/s, and time constants, s, of recoveries
+# of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s
+_FAMILY = tuple(itertools.product((7.0, 14.0), (1.0, 1.4), (0.0,), (1.0,)))
+_SIDEWAYS_FAMILY = tuple(itertools.product((7.0, 10.0, 14.0), (1.0, 1.8), (-0.6, -0.3, 0.3, 0.6), (0.3,)))
 _MOST_ITERATIONS = 15
 _SHORTER_STEPS = (0.5, 0.2, 0.05, 0.01)  # shares of a step that are tried where the whole step raises the cost
 _TOLERANCE = 1e-5  # relative: an iteration that lowers the cost by less is the last
@@ -128,19 +130,24 @@ def _chunks(count: int) -> Iterator[slice]:
 
 
 def _recoveries(task: Task, params: BallbotParams, x0: np.ndarray) -> np.ndarray:
-    """(steps, 2, B) forces of the cheapest simulated recovery of each episode; of any where none survives."""
-    steps, count = optimized_steps(task), len(x0)
-    target = task.reference(x0[0], np.zeros(0), params).x[-1, :2] if count else np.zeros(2)
-    best, chosen = np.full(count, np.inf), np.zeros((steps, 2, count))
-    for bandwidth, seconds in _FAMILY:
-        gains = np.tile([[bandwidth], [seconds], [0.0], [1.0]], (1, count))
+    """(steps, 2, B) forces of the cheapest simulated recovery of each episode; none where none survives.
+
+    Where none in the plane of the fall survives, recoveries to its sides are tried.
+    """
+    steps, dt = optimized_steps(task), task.control_dt
+    target = task.reference(np.zeros(8), np.zeros(0), params).x[-1, :2]
+    best, chosen = np.full(len(x0), np.inf), np.zeros((steps, 2, len(x0)))
+    for member in (*_FAMILY, *_SIDEWAYS_FAMILY):
+        rows = np.arange(len(x0)) if member in _FAMILY else np.flatnonzero(best == np.inf)
+        gains = np.tile(np.array(member)[:, None], (1, len(rows)))
         with np.errstate(all="ignore"):  # members that fall may overflow
-            x, u = righting.simulate(params, x0, gains, target, steps, task.control_dt, params.force_limit)
+            x, u = righting.simulate(params, x0[rows], gains, target, steps, dt, params.force_limit)
             costs = np.asarray(task.cost(x[:-1], u, np.zeros(0))).sum(0)
-            safe = np.min([np.broadcast_to(m, x.shape[:2]).min(0) for m in task.margins(x, np.zeros(0))], axis=0) >= 0
-        better = (np.where(safe, costs, np.finfo(float).max) < best) & np.isfinite(costs)
-        best = np.where(better, np.where(safe, costs, np.finfo(float).max), best)
-        chosen = np.where(better, u.transpose(0, 2, 1), chosen)
+            margins = [np.broadcast_to(margin, x.shape[:2]) for margin in task.margins(x, np.zeros(0))]
+            costs = np.where((np.array(margins) >= 0).all((0, 1)), costs, np.inf)
+        better = costs < best[rows]
+        best[rows[better]] = costs[better]
+        chosen[..., rows[better]] = u[:, better].transpose(0, 2, 1)
     return chosen
 
 
