@@ -185,6 +185,11 @@ def test_thousands_of_optima_at_once_give_the_labels_that_optima_one_by_one_give
         np.testing.assert_allclose(actions[i], expected, atol=0.01)
 
 
+def test_optima_at_once_are_refused_where_they_cannot_be_found():
+    with pytest.raises(ValueError, match=r"optima of BallbotTurn-v0 with this robot .* give --batch-episodes 0"):
+        dagger.Dagger(make_task("turn"), default_params(), replace(TINY_DAGGER, batch_episodes=2))
+
+
 def test_dagger_falls_far_less_than_lqr_after_two_rounds():
     """LQR, within the limits of tanh, is where it starts; eight planned episodes and their surroundings halve its falls."""
     task, params = make_task("stabilize"), default_params()

@@ -66,6 +66,7 @@ class Algorithm:
 
 
 _MAY_BE_ZERO = {
+    "batch_episodes",
     "candidate_episodes",
     "clone_iterations",
     "critic_gradient_steps",

@@ -157,7 +157,15 @@ class Dagger:
     def __init__(
         self, task: Task, params: BallbotParams, config: DaggerConfig, seed: int = 0, samples: Samples | None = None
     ):
-        """Args: samples: the first samples, such as those of demonstrations; default, none."""
+        """Args: samples: the first samples, such as those of demonstrations; default, none.
+
+        Raises:
+            ValueError: optima are to be found at once, and this task or robot does not allow it.
+        """
+        if config.batch_episodes and not batched.solves(task, params):
+            raise ValueError(
+                f"optima of {task.id} with this robot are not found at once; give --batch-episodes 0, which plans each alone"
+            )
         self.config, self.iteration = config, 0
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
@@ -216,7 +224,7 @@ class Dagger:
     def _gather_batch(self, rng: np.random.Generator) -> dict[str, float]:
         """Labels states along thousands of optima and around them; half of the optima start where the learner gets to."""
         config, task = self.config, self._task
-        begins = [task.sample(rng, self._params) for _ in range(config.batch_episodes // 2)]
+        begins = [task.sample(rng, self._params) for _ in range((config.batch_episodes + 1) // 2)]
         x0, c = (np.array(part) for part in zip(*begins, strict=True))
         longest = max(1, round(self._share * config.max_rollout_seconds / task.control_dt))
         history, over, _ = self._roll(x0, c, longest)
