@@ -2,7 +2,7 @@
 
 Every episode starts from its cheapest simulated recovery (`righting.simulate`). Each iteration linearizes the control steps
 along all episodes, sweeps backwards with the box-constrained Riccati recursion of Tassa et al., "Control-limited differential
-dynamic programming" (2014), and rolls the new feedback out with the first step size that lowers the cost. Episodes that no
+dynamic programming" (2014), and rolls the new feedback out, with shorter steps where the cost rises. Episodes that no
 longer improve leave the batch. Matrices of all episodes are multiplied at once, on a CPU or a GPU.
 
 An episode is optimized for its first seconds, and LQR's cost-to-go counts for what is left: there the robot is nearly at
