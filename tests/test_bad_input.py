@@ -805,7 +805,7 @@ TYPED = [
         "train rsl_ppo --num-mini-batches 7 --num-envs 3 --num-steps 2",
         "num_mini_batches 7 is more than the 6 env steps",
     ),
-    ("train rsl_ppo --task turn --symmetry frame", "has no frame"),
+    ("train rsl_ppo --task stabilize --symmetry frame", "has no frame"),
     ("train rsl_ppo --symmetry dance", "invalid choice 'dance'"),
     ("train rsl_ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("train rsl_ppo --episode-seconds 1e9", "must be 1 to 1,000,000 control steps"),
