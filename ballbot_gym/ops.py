@@ -53,9 +53,17 @@ def arccos(a: Any) -> Any:
     return math.acos(a) if isinstance(a, float | int) else _library(a).arccos(a)
 
 
+def arctan(a: Any) -> Any:
+    """Arc tangent, elementwise."""
+    return math.atan(a) if isinstance(a, float | int) else _library(a).arctan(a)
+
+
 def clip(a: Any, low: float, high: float) -> Any:
-    """The nearest number in [low, high], elementwise; NaN stays NaN. Not for CasADi."""
-    return max(min(a, high), low) if isinstance(a, float | int) else _library(a).clip(a, low, high)
+    """The nearest number in [low, high], elementwise; NaN stays NaN, but not with CasADi."""
+    if isinstance(a, float | int):
+        return max(min(a, high), low)
+    library = _library(a)
+    return library.fmax(library.fmin(a, high), low) if _is_casadi(a) else library.clip(a, low, high)
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:

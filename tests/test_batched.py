@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("casadi")
-pytest.importorskip("torch")
 
 from ballbot_baselines import batched
 from ballbot_baselines.optimum import find_optimum

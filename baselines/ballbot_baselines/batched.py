@@ -1,9 +1,9 @@
-"""Optima of thousands of episodes at once, by iLQR with force limits on batches, for tasks that come to rest freely.
+"""Optima of thousands of episodes, by iLQR with force limits in compiled code, for tasks that come to rest freely.
 
-Every episode starts from its cheapest simulated recovery (`righting.simulate`). Each iteration linearizes the control steps
-along all episodes, sweeps backwards with the box-constrained Riccati recursion of Tassa et al., "Control-limited differential
-dynamic programming" (2014), and rolls the new feedback out, with shorter steps where the cost rises. Episodes that no
-longer improve leave the batch. Matrices of all episodes are multiplied at once, on a CPU or a GPU.
+Every episode starts from its cheapest simulated recovery (`righting.steering`). Each iteration sweeps backwards with the
+box-constrained Riccati recursion of Tassa et al., "Control-limited differential dynamic programming" (2014), and rolls the
+new feedback out, with shorter steps where the cost rises. Each of both is one call of compiled code, which takes a fraction
+of a millisecond.
 
 An episode is optimized for its first seconds, and LQR's cost-to-go counts for what is left: there the robot is nearly at
 rest. The cost that is returned is that of the whole episode in the closed form, under these forces and LQR's after them. So
@@ -13,36 +13,29 @@ It knows no margins: episodes that violate one, and those that no recovery survi
 see `benchmarks/batched_optima.py`.
 """
 
+import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi
 import numpy as np
 
 from ballbot_baselines import righting
-from ballbot_baselines.linearize import quadratic_cost
+from ballbot_baselines.compiled import compiled
 from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
-from ballbot_gym import dynamics
-from ballbot_gym.lazy import missing
+from ballbot_gym import dynamics, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
-try:
-    import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
-
 _SECONDS = 3.0  # optimized; LQR's cost-to-go counts for the rest
-_AT_ONCE = 4096  # episodes that are optimized together; of fewer, the time for calling torch counts
-_CHUNK = 16_384  # episodes whose trajectories are in memory together, some 60 kB each
 # of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s
 _FAMILY = tuple(itertools.product((7.0, 14.0), (1.0, 1.4), (0.0,), (1.0,)))
 _SIDEWAYS_FAMILY = tuple(itertools.product((7.0, 10.0, 14.0), (1.0, 1.8), (-0.6, -0.3, 0.3, 0.6), (0.3,)))
 _MOST_ITERATIONS = 15
-_SHORTER_STEPS = (0.5, 0.2, 0.05, 0.01)  # shares of a step that are tried where the whole step raises the cost
-_TOLERANCE = 1e-5  # relative: an iteration that lowers the cost by less is the last
-_FORCE_UNIT = 100.0  # N: scales the forces, so that all derivatives are of about the same size
-_SHIFT = 1e-6  # of the differences, in rad, rad/s and `_FORCE_UNIT`
+_SHORTER_STEPS = (0.5, 0.2, 0.05, 0.01)  # shares of a step that are tried in turn where the whole step raises the cost
+_TOLERANCE = 1e-5  # relative: an iteration that promises to lower the cost by less is the last
+_SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
 _FORCE_BACKOFF = 1e-7  # of the force limit, as in `optimum.Backoff`
 
 
@@ -80,14 +73,8 @@ def solves(task: Task, params: BallbotParams) -> bool:
     return free and not len(c) and len(reference.x) == 1 and is_equilibrium(params, reference.x[0], reference.u[0])
 
 
-def find_optima(
-    task: Task,
-    params: BallbotParams,
-    x0: np.ndarray,
-    forces: np.ndarray | None = None,
-    device: str = "cpu",
-) -> BatchOptima:
-    """Optimizes B episodes.
+def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.ndarray | None = None) -> BatchOptima:
+    """Optimizes B episodes, one after the other, on one core.
 
     Args:
         task: one that `solves` admits.
@@ -95,7 +82,6 @@ def find_optima(
         x0: (B, 8) initial states.
         forces: (B, k, 2) N, of episodes to start from where they are cheaper than the simulated recoveries, as those of a
             policy; k at least `optimized_steps(task)`.
-        device: of torch, where the episodes are optimized.
 
     Raises:
         ValueError: the task is none that it solves, or an array has the wrong shape.
@@ -105,19 +91,29 @@ def find_optima(
     x0 = np.asarray(x0, np.float64)
     if x0.ndim != 2 or x0.shape[1] != 8:
         raise ValueError(f"x0 must have the shape (B, 8), not {x0.shape}")
-    steps = optimized_steps(task)
-    if forces is not None and (forces.shape[::2] != (len(x0), 2) or forces.shape[1] < steps):
-        raise ValueError(f"forces must have the shape ({len(x0)}, at least {steps}, 2), not {forces.shape}")
-    solver = _Solver(task, params, device)
-    parts = []
-    for rows in _chunks(len(x0)):
-        starts = [_recoveries(task, params, x0[rows])]
-        if forces is not None:
-            starts.append(forces[rows, :steps].transpose(1, 2, 0))
-        parts.append(solver.solve(x0[rows], starts))
-    return BatchOptima(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in BatchOptima.__annotations__)
+    steps, count = optimized_steps(task), len(x0)
+    if forces is not None and (forces.shape[::2] != (count, 2) or forces.shape[1] < steps):
+        raise ValueError(f"forces must have the shape ({count}, at least {steps}, 2), not {forces.shape}")
+    solver = _solver(task, params)
+    n = task.steps
+    optima = BatchOptima(
+        costs=np.full(count, np.nan),
+        solved=np.zeros(count, bool),
+        states=np.zeros((count, n + 1, 8)),
+        forces=np.zeros((count, n, 2)),
+        gains=np.zeros((count, n, 2, 8)),
+        slopes=np.zeros((count, n, 8)),
+        iterations=np.zeros(count, int),
     )
+    for i in range(count):
+        optima.solved[i] = solver.solve(x0[i], None if forces is None else forces[i, :steps], optima, i)
+    margins = np.min(
+        [np.broadcast_to(m, (count, n + 1)) for m in task.margins(optima.states, np.zeros(0))], axis=(0, 2)
+    )
+    costs = np.sum(task.cost(optima.states[:, :-1], optima.forces, np.zeros(0)), axis=1) * task.control_dt
+    optima.solved[:] &= (margins >= 0) & np.isfinite(costs)
+    optima.costs[optima.solved] = costs[optima.solved]
+    return optima
 
 
 def optimized_steps(task: Task) -> int:
@@ -125,247 +121,212 @@ def optimized_steps(task: Task) -> int:
     return min(task.steps, round(_SECONDS / task.control_dt))
 
 
-def _chunks(count: int) -> Iterator[slice]:
-    return (slice(start, start + _CHUNK) for start in range(0, max(count, 1), _CHUNK))
+@dataclass(frozen=True)
+class _Episode:
+    """A simulated episode: states (n+1, 8), forces (n, 2), and its cost, infinite where a margin is violated."""
 
-
-def _recoveries(task: Task, params: BallbotParams, x0: np.ndarray) -> np.ndarray:
-    """(steps, 2, B) forces of the cheapest simulated recovery of each episode; none where none survives.
-
-    Where none in the plane of the fall survives, recoveries to its sides are tried.
-    """
-    steps, dt = optimized_steps(task), task.control_dt
-    target = task.reference(np.zeros(8), np.zeros(0), params).x[-1, :2]
-    best, chosen = np.full(len(x0), np.inf), np.zeros((steps, 2, len(x0)))
-    for member in (*_FAMILY, *_SIDEWAYS_FAMILY):
-        rows = np.arange(len(x0)) if member in _FAMILY else np.flatnonzero(best == np.inf)
-        gains = np.tile(np.array(member)[:, None], (1, len(rows)))
-        with np.errstate(all="ignore"):  # members that fall may overflow
-            x, u = righting.simulate(params, x0[rows], gains, target, steps, dt, params.force_limit)
-            costs = np.asarray(task.cost(x[:-1], u, np.zeros(0))).sum(0)
-            margins = [np.broadcast_to(margin, x.shape[:2]) for margin in task.margins(x, np.zeros(0))]
-            costs = np.where((np.array(margins) >= 0).all((0, 1)), costs, np.inf)
-        better = costs < best[rows]
-        best[rows[better]] = costs[better]
-        chosen[..., rows[better]] = u[:, better].transpose(0, 2, 1)
-    return chosen
+    x: np.ndarray
+    u: np.ndarray
+    cost: float
 
 
 class _Solver:
-    """The batched optimizer of one task. Within, the episodes are the last axis: x (8, B), u (2, B)."""
+    """The optimizer of one task."""
 
-    def __init__(self, task: Task, params: BallbotParams, device: str):
-        self._task, self._params = task, params
+    def __init__(self, task: Task, params: BallbotParams):
+        self._task, self._steps = task, optimized_steps(task)
         rest = task.reference(np.zeros(8), np.zeros(0), params)
-        self._rest = torch.tensor(rest.x[-1], dtype=torch.float64, device=device)[:, None]
-        self._limit = params.force_limit * (1 - _FORCE_BACKOFF)
-        k, p = discrete_lqr(task, params, rest.x[-1], rest.u[-1], np.zeros(0))
-        q, r = quadratic_cost(task, rest.x[-1:], rest.u[-1:], np.zeros(0))
-        self._lqr, self._p, self._q, self._r = (
-            torch.tensor(each, device=device) for each in (k, p, q[0] * task.control_dt, r[0] * task.control_dt)
+        self._rest = rest.x[-1]
+        self._lqr, self._p = discrete_lqr(task, params, rest.x[-1], rest.u[-1], np.zeros(0))
+        limit = params.force_limit * (1 - _FORCE_BACKOFF)
+        n, rest_steps = self._steps, task.steps - self._steps
+        functions = compiled(
+            f"{task.id}-batch",
+            (
+                _following(task, params, limit).mapaccum("follow", n),
+                _following(task, params, limit).mapaccum("follow_to_end", max(rest_steps, 1)),
+                _steering(task, params, limit, self._rest[:2]).mapaccum("steer", n),
+                _sweeping(task, params, limit).mapaccum("sweep", n),
+            ),
         )
-        self._device = device
+        self._follow, self._follow_to_end, self._steer, self._sweep = map(_Call, functions)
+        self._no_gains = np.zeros((n, 16))
+        self._lqr_gains = np.tile(self._lqr.ravel(), (rest_steps, 1))
+        self._at_rest, self._no_forces = np.tile(self._rest, (rest_steps, 1)), np.zeros((rest_steps, 2))
+        self._end_value = np.array([2 * self._p[i, j] for i, j in _UPPER])
+        times = task.control_dt * np.arange(n)[:, None]
+        self._fading = {fade: np.exp(-times / fade) for *_, fade in (*_FAMILY, *_SIDEWAYS_FAMILY)}
 
-    @torch.no_grad()
-    def solve(self, x0: np.ndarray, starts: list[np.ndarray]) -> BatchOptima:
-        """Args: x0 (B, 8); forces (T, 2, B), of which the cheapest are the start."""
-        count, steps = len(x0), len(starts[0])
-        start = torch.tensor(x0.T, device=self._device)
-        u, x = start.new_zeros(steps, 2, count), start.new_zeros(steps + 1, 8, count)
-        gains, slopes = u.new_zeros(steps, 2, 8, count), u.new_zeros(steps, 8, count)
-        cost = u.new_full((count,), torch.inf)
-        for few in torch.arange(count, device=self._device).split(_AT_ONCE):
-            for forces in starts:
-                held = torch.tensor(forces, device=self._device)[..., few]
-                new_x, new_u, new = self._roll(start[:, few], held, gains[..., few], x[..., few])
-                lower = new < cost[few]
-                at = few[lower]
-                x[..., at], u[..., at], cost[at] = new_x[..., lower], new_u[..., lower], new[lower]
-        iterations = torch.zeros(count, dtype=torch.int64, device=self._device)
-        converged = torch.zeros(count, dtype=torch.bool, device=self._device)
-        left = torch.nonzero(cost.isfinite())[:, 0]
-        while len(left):
-            few = left[:_AT_ONCE]  # where some are done, others take their places
-            before = cost[few]
-            change, feedback, slope, promised = self._backward(x[..., few], u[..., few])
-            gains[..., few], slopes[..., few] = feedback, slope
-            new_x, new_u, new = self._roll(start[:, few], u[..., few] + change, feedback, x[..., few])
-            worse = torch.nonzero(new >= before)[:, 0]
-            if len(worse):
-                shorter = self._with_shorter_steps(few[worse], start, x, u, change[..., worse], feedback[..., worse])
-                new_x[..., worse], new_u[..., worse], new[worse] = shorter
-            lower = new < before
-            at = few[lower]
-            x[..., at], u[..., at], cost[at] = new_x[..., lower], new_u[..., lower], new[lower]
-            iterations[few] += 1
-            done = lower & (promised < _TOLERANCE * before)
-            converged[few[done]] = True
-            given_up = ~lower | (iterations[few] >= _MOST_ITERATIONS)
-            left = torch.cat([few[~(done | given_up)], left[_AT_ONCE:]])
-        return self._finish(x, u, gains, slopes, converged.cpu().numpy(), iterations.cpu().numpy())
+    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, row: int) -> bool:
+        """Optimizes one episode from x0 (8,), and writes it into a row of `optima`; the cost is left out.
 
-    def _with_shorter_steps(
-        self,
-        rows: torch.Tensor,
-        start: torch.Tensor,
-        x: torch.Tensor,
-        u: torch.Tensor,
-        change: torch.Tensor,
-        feedback: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """As `_roll`, for each of the rows with the best of `_SHORTER_STEPS`; all are tried at once."""
-        tries, count = len(_SHORTER_STEPS), len(rows)
-        shares = u.new_tensor(_SHORTER_STEPS).repeat_interleave(count)
-        forces = u[..., rows].repeat(1, 1, tries) + shares * change.repeat(1, 1, tries)
-        about, gains = x[..., rows].repeat(1, 1, tries), feedback.repeat(1, 1, 1, tries)
-        states, forces, costs = self._roll(start[:, rows].repeat(1, tries), forces, gains, about)
-        best = costs.view(tries, count).argmin(0) * count + torch.arange(count, device=rows.device)
-        return states[..., best], forces[..., best], costs[best]
+        Args:
+            x0: (8,).
+            forces: (T, 2) to start from where they are cheaper than recoveries.
+            optima: to be filled.
+            row: of these.
 
-    def _step(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        dt = self._task.control_dt
-        return torch.stack(dynamics.step(self._params, x.unbind(0), u.unbind(0), dt, dynamics.substeps_for(dt)))
-
-    def _cost(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        return self._task.control_dt * self._task.cost(x.unbind(0), u.unbind(0), ())
-
-    def _roll(
-        self, start: torch.Tensor, u: torch.Tensor, gains: torch.Tensor, about: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Simulates u − K (x − about): states (T+1, 8, B), forces (T, 2, B), and the cost with LQR's after them (B,)."""
-        x, cost = [start], torch.zeros_like(start[0])
-        forces = []
-        for k in range(len(u)):
-            force = u[k] - (gains[k] * (x[-1] - about[k])).sum(1)
-            forces.append(force.clamp(-self._limit, self._limit))
-            cost = cost + self._cost(x[-1], forces[-1])
-            x.append(self._step(x[-1], forces[-1]))
-        states, off = torch.stack(x), x[-1] - self._rest
-        cost = cost + (off * (self._p @ off)).sum(0)
-        upright = dynamics.cos_tilt(states.unbind(1)).amin(0) > np.cos(self._task.max_tilt)  # NaN is not
-        return states, torch.stack(forces), torch.where(upright, cost, torch.inf)
-
-    def _slopes_of_accelerations(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        """(B, 4, 6) slopes of the accelerations in leans, lean rates and forces / `_FORCE_UNIT`; nothing else moves them.
-
-        Differences are some ten times faster here than automatic differentiation, and exact to 1e-6.
+        Returns:
+            Whether it converged.
         """
-        at = torch.stack([x[2], x[3], x[6], x[7], u[0] / _FORCE_UNIT, u[1] / _FORCE_UNIT])
-        shifts = _SHIFT * torch.eye(6, 7, dtype=x.dtype, device=x.device)  # the last of 7 points is not shifted
-        gamma, theta, gamma_dot, theta_dot, fx, fy = (at[:, None] + shifts[:, :, None]).unbind(0)
-        zero = torch.zeros_like(gamma)
-        state = zero, zero, gamma, theta, zero, zero, gamma_dot, theta_dot
-        found = torch.stack(dynamics.accelerations(self._params, state, (_FORCE_UNIT * fx, _FORCE_UNIT * fy)))
-        return ((found[:, :6] - found[:, 6:]) / _SHIFT).permute(2, 0, 1)
+        best = self._recovery(x0)
+        if forces is not None:
+            given = self._roll(x0, forces, self._no_gains, np.zeros((self._steps, 8)))
+            best = min(best, given, key=lambda episode: episode.cost)
+        converged, gains, slopes = False, self._no_gains, np.zeros((self._steps, 8))
+        while np.isfinite(best.cost) and not converged and optima.iterations[row] < _MOST_ITERATIONS:
+            change, gains, slopes, promised = self._backward(best)
+            optima.iterations[row] += 1
+            tried = (self._roll(x0, best.u + share * change, gains, best.x[:-1]) for share in (1.0, *_SHORTER_STEPS))
+            lower = next((episode for episode in tried if episode.cost < best.cost), None)
+            if lower is None:
+                break
+            converged = promised < _TOLERANCE * best.cost
+            best = lower
+        n = self._steps
+        x, u = optima.states[row], optima.forces[row]
+        x[: n + 1], u[:n], optima.slopes[row, :n] = best.x, best.u, slopes
+        optima.gains[row, :n], optima.gains[row, n:] = gains.reshape(n, 2, 8), self._lqr
+        if len(self._no_forces):
+            x[n + 1 :], u[n:], *_ = self._follow_to_end(x[n], self._no_forces, self._lqr_gains, self._at_rest)
+        optima.slopes[row, n:] = 2 * (x[n:-1] - self._rest) @ self._p
+        return converged
 
-    def _linearized(self, x: torch.Tensor, after: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        """[A B] (B, 8, 10) of the control step, from its derivatives in its middle: their error is of third order."""
-        dt, slopes = self._task.control_dt, self._slopes_of_accelerations(0.5 * (x + after), u)
-        rates = x.new_zeros(x.shape[1], 8, 10)
-        rates[:, range(4), range(4, 8)] = dt
-        rates[:, 4:, 2:4], rates[:, 4:, 6:8] = dt * slopes[..., :2], dt * slopes[..., 2:4]
-        rates[:, 4:, 8:] = dt / _FORCE_UNIT * slopes[..., 4:]
-        total, power = rates.clone(), rates
-        for k in (2, 3):
-            power = torch.bmm(rates[..., :8], power) / k
-            total += power
-        total[:, range(8), range(8)] += 1.0
-        return total
+    def _recovery(self, x0: np.ndarray) -> _Episode:
+        """The cheapest simulated recovery. Where none in the plane of the fall survives, those to its sides are tried."""
+        best = _Episode(np.zeros((self._steps + 1, 8)), np.zeros((self._steps, 2)), np.inf)
+        side = righting.leaning_aside(x0, np.ones(1))[:, 0]
+        for family in (_FAMILY, _SIDEWAYS_FAMILY):
+            for bandwidth, seconds, lean, fade in family:
+                found = self._episode(x0, self._steer(x0, lean * self._fading[fade] * side, [bandwidth, seconds]))
+                best = min(best, found, key=lambda episode: episode.cost)
+            if np.isfinite(best.cost):
+                break
+        return best
 
-    def _backward(self, x: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Changes of the forces (T, 2, B), feedback K (T, 2, 8, B), slopes of the cost-to-go (T, 8, B), and by how much the
-        linear model says that the changes lower the cost (B,).
+    def _roll(self, x0: np.ndarray, u: np.ndarray, gains: np.ndarray, about: np.ndarray) -> _Episode:
+        """Simulates u − K (x − about)."""
+        return self._episode(x0, self._follow(x0, u, gains, about))
+
+    def _episode(self, x0: np.ndarray, simulated: Sequence[np.ndarray]) -> _Episode:
+        """An episode of the optimized steps, with LQR's cost-to-go after them."""
+        after, u, costs, room = simulated
+        cost = np.inf
+        if room.min() > 0:  # NaN is not
+            off = after[-1] - self._rest
+            cost = float(costs.sum() + off @ self._p @ off)
+        return _Episode(np.concatenate([x0[None], after]), u, cost)
+
+    def _backward(self, episode: _Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Changes of the forces (T, 2), feedback K (T, 16), slopes of the cost-to-go (T, 8), and by how much the linear model
+        says that the changes lower the cost.
         """
-        count = x.shape[-1]
-        slope = 2 * (self._p @ (x[-1] - self._rest)).T
-        value, promised = 2 * self._p.expand(count, 8, 8), torch.zeros_like(slope[:, 0])
-        changes, feedbacks, slopes = [], [], []
-        for k in range(len(u) - 1, -1, -1):
-            linear = self._linearized(x[k], x[k + 1], u[k])
-            hessian = torch.bmm(linear.transpose(1, 2), torch.bmm(value, linear))
-            gradient = torch.bmm(linear.transpose(1, 2), slope[:, :, None])[:, :, 0]
-            hessian[:, :8, :8] += 2 * self._q
-            hessian[:, 8:, 8:] += 2 * self._r
-            gradient[:, :8] += 2 * (self._q @ (x[k] - self._rest)).T
-            gradient[:, 8:] += 2 * (self._r @ u[k]).T
-            of_force, mixed = hessian[:, 8:, 8:], hessian[:, 8:, :8]
-            change, inverse = _box_step(of_force, gradient[:, 8:], -self._limit - u[k].T, self._limit - u[k].T)
-            feedback = torch.bmm(inverse, mixed)
-            moved = torch.bmm(of_force, change[:, :, None])[:, :, 0] + gradient[:, 8:]
-            promised = promised - 0.5 * (change * (moved + gradient[:, 8:])).sum(1)
-            slope = (
-                gradient[:, :8]
-                + torch.bmm(mixed.transpose(1, 2), change[:, :, None])[:, :, 0]
-                - torch.bmm(feedback.transpose(1, 2), moved[:, :, None])[:, :, 0]
-            )
-            value = hessian[:, :8, :8] - torch.bmm(mixed.transpose(1, 2), feedback)
-            value = 0.5 * (value + value.transpose(1, 2))
-            changes.append(change.T)
-            feedbacks.append(feedback.permute(1, 2, 0))
-            slopes.append(slope.T)
-        return torch.stack(changes[::-1]), torch.stack(feedbacks[::-1]), torch.stack(slopes[::-1]), promised
-
-    def _finish(
-        self,
-        x: torch.Tensor,
-        u: torch.Tensor,
-        gains: torch.Tensor,
-        slopes: torch.Tensor,
-        converged: np.ndarray,
-        iterations: np.ndarray,
-    ) -> BatchOptima:
-        """Goes on with LQR to the episodes' end, and counts the cost of all of it."""
-        rest, states, forces = self._task.steps - len(u), [x[-1]], []
-        for _ in range(rest):
-            forces.append((self._lqr @ (self._rest - states[-1])).clamp(-self._limit, self._limit))
-            states.append(self._step(states[-1], forces[-1]))
-        ends = torch.stack(states)
-        slopes = torch.cat([slopes, 2 * torch.einsum("ij,kjb->kib", self._p, ends[:-1] - self._rest)])
-        gains = torch.cat([gains, self._lqr[None, :, :, None].expand(rest, 2, 8, x.shape[-1])])
-        x, u = torch.cat([x[:-1], ends]), torch.cat([u, *(force[None] for force in forces)])
-        cost = self._cost(x[:-1].transpose(0, 1), u.transpose(0, 1)).sum(0)
-        within = torch.stack([m.expand(x.shape[::2]).amin(0) for m in self._task.margins(x.unbind(1), ())]).amin(0) >= 0
-        solved = converged & within.cpu().numpy() & cost.isfinite().cpu().numpy()
-        return BatchOptima(
-            costs=np.where(solved, cost.cpu().numpy(), np.nan),
-            solved=solved,
-            states=x.permute(2, 0, 1).cpu().numpy(),
-            forces=u.permute(2, 0, 1).cpu().numpy(),
-            gains=gains.permute(3, 0, 1, 2).cpu().numpy(),
-            slopes=slopes.permute(2, 0, 1).cpu().numpy(),
-            iterations=iterations,
-        )
+        end = np.concatenate([self._end_value, 2 * self._p @ (episode.x[-1] - self._rest), [0.0]])
+        ahead, change, gains = self._sweep(end, episode.x[-2::-1], episode.u[::-1])
+        return change[::-1], gains[::-1], ahead[::-1, 36:44], float(ahead[-1, 44])
 
 
-def _box_step(
-    hessian: torch.Tensor, gradient: torch.Tensor, low: torch.Tensor, high: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The d (B, 2) within [low, high] that minimizes ½ dᵀHd + gᵀd, and the inverse of H (B, 2, 2) in its free components.
+@functools.lru_cache(maxsize=4)
+def _solver(task: Task, params: BallbotParams) -> _Solver:
+    return _Solver(task, params)
+
+
+class _Call:
+    """A CasADi function that reads and writes NumPy arrays (n, k), which CasADi sees as (k, n), without a copy of its own."""
+
+    def __init__(self, function: casadi.Function):
+        self._buffer, self._evaluate = function.buffer()
+        self._arguments = [np.zeros(function.size_in(i)[::-1]) for i in range(function.n_in())]
+        self._results = [np.zeros(function.size_out(i)[::-1]) for i in range(function.n_out())]
+        # CasADi's type stubs ask for a size too, and NumPy's do not know that arrays are buffers.
+        for i, array in enumerate(self._arguments):
+            self._buffer.set_arg(i, memoryview(array))  # pyright: ignore[reportArgumentType, reportCallIssue]
+        for i, array in enumerate(self._results):
+            self._buffer.set_res(i, memoryview(array))  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+    def __call__(self, *arguments: np.ndarray | Sequence[float]) -> list[np.ndarray]:
+        for kept, given in zip(self._arguments, arguments, strict=True):
+            kept[:] = given
+        self._evaluate()
+        return [result.copy() for result in self._results]
+
+
+# The functions of one control step. `mapaccum` calls them for one step after the other, with the first result as the first
+# argument of the next.
+
+
+def _held(task: Task, params: BallbotParams, x: casadi.SX, u: Sequence[casadi.SX]) -> list[casadi.SX]:
+    """State after the step, force, cost, and the least margin."""
+    force = casadi.vertcat(*u)
+    after = dynamics.step(params, x, force, task.control_dt, dynamics.substeps_for(task.control_dt))
+    room = casadi.mmin(casadi.vertcat(*task.margins(after, casadi.SX(0, 1))))
+    return [after, force, task.control_dt * task.cost(x, force, casadi.SX(0, 1)), room]
+
+
+def _following(task: Task, params: BallbotParams, limit: float) -> casadi.Function:
+    """u − K (x − about) held."""
+    x, u, k, about = (casadi.SX.sym(name, size) for name, size in (("x", 8), ("u", 2), ("k", 16), ("about", 8)))
+    forces = u - casadi.reshape(k, 8, 2).T @ (x - about)
+    clipped = [ops.clip(forces[i], -limit, limit) for i in range(2)]
+    return casadi.Function("follow_step", [x, u, k, about], _held(task, params, x, clipped))
+
+
+def _steering(task: Task, params: BallbotParams, limit: float, target: np.ndarray) -> casadi.Function:
+    """The cascade's force held; gains are its bandwidth and time constant."""
+    x, aside, gains = (casadi.SX.sym(name, size) for name, size in (("x", 8), ("aside", 2), ("gains", 2)))
+    u = righting.steering(params, x, aside, gains[0], gains[1], tuple(map(float, target)), limit)
+    return casadi.Function("steer_step", [x, aside, gains], _held(task, params, x, u))
+
+
+def _sweeping(task: Task, params: BallbotParams, limit: float) -> casadi.Function:
+    """One control step of the Riccati recursion.
+
+    What is ahead, and comes out for the step before: 36 second derivatives of the cost-to-go in the order of `_UPPER`, its 8
+    slopes, and by how much the changes lower the cost. The other results are the change of the force (2,) and K (16,).
+    """
+    ahead, x, u = (casadi.SX.sym(name, size) for name, size in (("ahead", 45), ("x", 8), ("u", 2)))
+    z, dt = casadi.vertcat(x, u), task.control_dt
+    linear = casadi.jacobian(dynamics.step(params, x, u, dt, _SUBSTEPS), z)
+    of_cost, slope_of_cost = casadi.hessian(dt * task.cost(x, u, casadi.SX(0, 1)), z)
+    value = casadi.SX(8, 8)
+    for k, (i, j) in enumerate(_UPPER):
+        value[i, j] = value[j, i] = ahead[k]
+    hessian = of_cost + linear.T @ value @ linear
+    slope = slope_of_cost + linear.T @ ahead[36:44]
+    of_force, mixed = hessian[8:, 8:], hessian[8:, :8]
+    change, inverse = _box_step(of_force, slope[8:], -limit - u, limit - u)
+    feedback = inverse @ mixed
+    moved = of_force @ change + slope[8:]
+    before = hessian[:8, :8] - mixed.T @ feedback
+    promised = ahead[44] - 0.5 * casadi.dot(change, moved + slope[8:])
+    slope_before = slope[:8] + mixed.T @ change - feedback.T @ moved
+    out = casadi.vertcat(*(before[i, j] for i, j in _UPPER), slope_before, promised)
+    return casadi.Function("sweep_step", [ahead, x, u], [out, change, casadi.vec(feedback.T)], {"cse": True})
+
+
+_UPPER = [(i, j) for i in range(8) for j in range(i, 8)]
+
+
+def _box_step(hessian: casadi.SX, gradient: casadi.SX, low: casadi.SX, high: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
+    """The d (2,) within [low, high] that minimizes ½ dᵀHd + gᵀd, and the inverse of H (2, 2) in its free components.
 
     In two dimensions it is the free minimum, or else the least of the minima on the four edges.
     """
-    a, b, c = hessian[:, 0, 0], hessian[:, 0, 1], hessian[:, 1, 1]
-    g0, g1 = gradient.unbind(1)
+    a, b, c = hessian[0, 0], hessian[0, 1], hessian[1, 1]
     determinant = a * c - b * b
-    free = torch.stack([b * g1 - c * g0, b * g0 - a * g1], 1) / determinant[:, None]
-    inside = ((free >= low) & (free <= high)).all(1)
-    edges = []
+    inverse = casadi.vertcat(casadi.horzcat(c, -b), casadi.horzcat(-b, a)) / determinant
+    free = -inverse @ gradient
+    inside = casadi.logic_and(casadi.mmin(free - low) >= 0, casadi.mmin(high - free) >= 0)
+    step, least = casadi.SX.nan(2), casadi.SX.inf()
     for edge in (low, high):
-        d0, d1 = edge.unbind(1)
-        edges += [
-            torch.stack([d0, (-(g1 + b * d0) / c).clamp(low[:, 1], high[:, 1])], 1),
-            torch.stack([(-(g0 + b * d1) / a).clamp(low[:, 0], high[:, 0]), d1], 1),
-        ]
-    tried = torch.stack(edges)
-    d0, d1 = tried.unbind(-1)
-    costs = 0.5 * (a * d0 * d0 + c * d1 * d1) + b * d0 * d1 + g0 * d0 + g1 * d1
-    best = tried[costs.argmin(0), torch.arange(len(a), device=a.device)]
-    step = torch.where(inside[:, None], free, best)
-    moves = (step > low) & (step < high)
-    both = moves.all(1)
-    bottom = torch.where(both, determinant, 1.0)
-    zero = torch.zeros_like(a)
-    first = torch.where(both, c / bottom, torch.where(moves[:, 0], 1 / a, zero))
-    second = torch.where(both, a / bottom, torch.where(moves[:, 1], 1 / c, zero))
-    mixed = torch.where(both, -b / bottom, zero)
-    return step, torch.stack([first, mixed, mixed, second], 1).view(-1, 2, 2)
+        first = casadi.vertcat(edge[0], casadi.fmax(casadi.fmin(-(gradient[1] + b * edge[0]) / c, high[1]), low[1]))
+        second = casadi.vertcat(casadi.fmax(casadi.fmin(-(gradient[0] + b * edge[1]) / a, high[0]), low[0]), edge[1])
+        for tried in (first, second):
+            cost = 0.5 * casadi.dot(tried, hessian @ tried) + casadi.dot(gradient, tried)
+            step = casadi.if_else(cost < least, tried, step)
+            least = casadi.fmin(cost, least)
+    step = casadi.if_else(inside, free, step)
+    moves = [casadi.logic_and(step[i] > low[i], step[i] < high[i]) for i in range(2)]
+    both = casadi.logic_and(*moves)
+    alone = casadi.diag(casadi.vertcat(casadi.if_else(moves[0], 1 / a, 0), casadi.if_else(moves[1], 1 / c, 0)))
+    return step, casadi.if_else(both, inverse, alone)

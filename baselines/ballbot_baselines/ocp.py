@@ -131,9 +131,25 @@ class OcpSolver:
     """
 
     def __init__(
-        self, ocp: Ocp, intervals: int, solver: str = "fatrop", tolerance: float = 1e-8, max_iterations: int = 200
+        self,
+        ocp: Ocp,
+        intervals: int,
+        solver: str = "fatrop",
+        tolerance: float = 1e-8,
+        max_iterations: int = 200,
+        barrier: float = 0.1,
     ):
-        """Args: solver is "fatrop" (structured, fast) or "ipopt" (more robust far from a solution)."""
+        """Makes the solver.
+
+        Args:
+            ocp: the problem.
+            intervals: N.
+            solver: "fatrop" (structured, fast) or "ipopt" (more robust far from a solution).
+            tolerance: of the solver.
+            max_iterations: after which it gives up.
+            barrier: the interior-point method's barrier parameter at the start. From near a solution, less takes fewer
+                iterations.
+        """
         began = time.perf_counter()
         self.ocp, self.intervals, self.solver = ocp, intervals, solver
         s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", ocp.states), ("w", ocp.inputs), ("p", ocp.params)))
@@ -167,11 +183,17 @@ class OcpSolver:
                 "nu": [ocp.inputs] * intervals + [0],
                 "ng": [paths + initials] + [paths] * (intervals - 1) + [finals],
                 "equality": equality,
-                "fatrop": {"print_level": 0, "tol": tolerance, "max_iter": max_iterations},
+                "fatrop": {"print_level": 0, "tol": tolerance, "max_iter": max_iterations, "mu_init": barrier},
             }
         else:
             options |= for_ipopt
-            options["ipopt"] = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": max_iterations}
+            options["ipopt"] = {
+                "print_level": 0,
+                "sb": "yes",
+                "tol": tolerance,
+                "max_iter": max_iterations,
+                "mu_init": barrier,
+            }
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
         spent.setup += time.perf_counter() - began

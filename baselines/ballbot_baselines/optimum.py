@@ -37,6 +37,10 @@ FROM_RIGHTING = -1
 _FREE_TIME_INTERVALS = 60
 _MOST_ITERATIONS = 200
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
+_BARRIER, _NEAR_BARRIER = (
+    0.1,
+    1e-3,
+)  # of the first iterate; near a solution of nearly the same problem, half the iterations
 _COARSE = 2  # control steps per interval when several guesses are compared
 _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
@@ -271,9 +275,10 @@ def _solver(
     solver: str,
     coarseness: int = 1,
     iterations: int = _MOST_ITERATIONS,
+    barrier: float = _BARRIER,
 ) -> OcpSolver:
     ocp = shooting_ocp(task, params, coarseness)
-    return OcpSolver(ocp, steps, solver, _tolerance(params), max_iterations=iterations)
+    return OcpSolver(ocp, steps, solver, _tolerance(params), max_iterations=iterations, barrier=barrier)
 
 
 @lru_cache(maxsize=8)
@@ -294,12 +299,17 @@ def _bounds(ocp: Ocp, n: int, x0: np.ndarray, backoff: Backoff) -> Bounds:
 
 
 def _solve_from(
-    task: Task, params: BallbotParams, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff
+    task: Task, params: BallbotParams, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff, near: bool = False
 ) -> list[OcpSolution]:
-    """Solves with fatrop from guessed states (n+1, 8) and actions (n, 2). If fatrop fails, ipopt tries the same guess."""
+    """Solves with fatrop from guessed states (n+1, 8) and actions (n, 2). If fatrop fails, ipopt tries the same guess.
+
+    `near` says that the guess solves nearly the same problem.
+    """
+    tries = [("fatrop", _NEAR_BARRIER)] if near else []
     solutions = []
-    for name in ("fatrop", "ipopt"):
-        solutions.append(_solve_with(_solver(task, params, len(a), name), params, x, a, c, backoff))
+    for name, barrier in (*tries, ("fatrop", _BARRIER), ("ipopt", _BARRIER)):
+        solver = _solver(task, params, len(a), name, barrier=barrier)
+        solutions.append(_solve_with(solver, params, x, a, c, backoff))
         if is_feasible(solutions[-1]):
             break
     return solutions
@@ -320,10 +330,11 @@ def _solve_fixed_time(
     With several paths, each is first solved with forces held for two control steps. That takes half the time and suffices to
     compare the paths. Only the paths that may be the best are then solved in full.
     """
-    starts = _starts(task, params, x0, paths)
+    starts, fine = _starts(task, params, x0, paths), []
     if len(paths) > 1 and task.steps % _COARSE == 0:
-        starts = _contenders(task, params, x0, c, backoff, starts)
-    return [(i, s) for i, x, a in starts for s in _solve_from(task, params, x, a, c, backoff)]
+        fine = _contenders(task, params, x0, c, backoff, starts)
+    near = bool(fine)
+    return [(i, s) for i, x, a in fine or starts for s in _solve_from(task, params, x, a, c, backoff, near)]
 
 
 def _solve_quickly(
@@ -440,7 +451,8 @@ def _solve_likely_sides(
             predicted = solution.cost + prediction.costs[order] - here
             along, predicted_y = path[:, 0], prediction.y[order]
     fine = _refined(task, [(i, s) for i, s in solved.items() if is_feasible(s)])
-    return [(i, s) for i, x, a in fine or starts[:most] for s in _solve_from(task, params, x, a, c, backoff)]
+    near = bool(fine)
+    return [(i, s) for i, x, a in fine or starts[:most] for s in _solve_from(task, params, x, a, c, backoff, near)]
 
 
 def _side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
@@ -457,7 +469,7 @@ def _contenders(
     backoff: Backoff,
     starts: list[tuple[int, np.ndarray, np.ndarray]],
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Starts at the coarse solutions within `_BASIN_DOUBT` of the best; all starts, if no coarse solution is feasible."""
+    """Starts at the coarse solutions within `_BASIN_DOUBT` of the best; none, if no coarse solution is feasible."""
     n = task.steps // _COARSE
     solver = _solver(task, params, n, "fatrop", _COARSE)
     solved = []
@@ -465,7 +477,7 @@ def _contenders(
         solution = _solve_with(solver, params, x[::_COARSE], a[::_COARSE], c, backoff)
         if is_feasible(solution):
             solved.append((index, solution))
-    return _refined(task, solved) or starts
+    return _refined(task, solved)
 
 
 def _refined(task: Task, solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, np.ndarray, np.ndarray]]:
@@ -562,4 +574,4 @@ def _at_steps(
 ) -> list[OcpSolution]:
     x = guess.resampled(relaxed.states[:, :8], steps)
     a = guess.resampled(np.vstack([relaxed.inputs, relaxed.inputs[-1:]]), steps)[:-1]
-    return _solve_from(task, params, x, a, c, backoff)
+    return _solve_from(task, params, x, a, c, backoff, near=True)

@@ -12,11 +12,13 @@ one side of the fall.
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ballbot_baselines import guess
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, ops
+from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
@@ -123,28 +125,56 @@ def simulate(
     Returns:
         States (steps+1, n, 8) and forces (steps, n, 2), N.
     """
-    bandwidth, seconds, lean, fade = (part[:, None] for part in gains)
-    falling = x0[..., 2:4] + 0.2 * x0[..., 6:8]  # rad: where the body leans, or is about to
-    size = np.hypot(falling[..., :1], falling[..., 1:])
-    along = np.where(size > 1e-9, falling / np.maximum(size, 1e-9), [1.0, 0.0])
-    aside = lean * np.stack([-along[..., 1], along[..., 0]], -1)
-    h, mass = params.first_moment, params.moving_mass
-    inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
-    turning = mass * params.ball_radius if params.rolls else 0.0  # the torque that drives the ball turns the body too
+    bandwidth, seconds, lean, fade = gains
+    aside = leaning_aside(x0, lean)
     x = np.array(np.broadcast_to(np.asarray(x0, np.float64), (gains.shape[1], 8)))
     states, forces = [x], []
     for k in range(steps):
-        position, leans, speed, rate = x[:, :2] - target, x[:, 2:4], x[:, 4:6], x[:, 6:8]
-        wanted = np.arctan(-(2 / seconds * speed + position / seconds**2) / params.gravity)
-        wanted = np.clip(wanted, -_LARGEST_LEAN, _LARGEST_LEAN) + aside * np.exp(-k * dt / fade)
-        acceleration = -(bandwidth**2) * (leans - wanted) - 2 * bandwidth * rate
-        # of a body in a vertical plane: inertia · lean acceleration = h g sin(lean) − (h/M) F cos(lean)
-        moment = h * params.gravity * np.sin(leans) - inertia * acceleration
-        u = np.clip(moment * mass / (h * np.cos(leans) + turning), -force, force)
+        u = np.stack(
+            steering(params, tuple(x.T), aside * np.exp(-k * dt / fade), bandwidth, seconds, target, force), -1
+        )
         forces.append(u)
         x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
         states.append(x)
     return np.array(states), np.array(forces)
+
+
+def leaning_aside(x0: np.ndarray, lean: np.ndarray) -> np.ndarray:
+    """(2, n) leans to the left of the fall, of the size `lean` (n,), rad, for initial states (8,) or (n, 8)."""
+    x0 = np.atleast_2d(x0)
+    falling = x0[:, 2:4] + 0.2 * x0[:, 6:8]  # rad: where the body leans, or is about to
+    size = np.hypot(falling[:, :1], falling[:, 1:])
+    along = np.where(size > 1e-9, falling / np.maximum(size, 1e-9), [1.0, 0.0])
+    return lean * np.stack([-along[:, 1], along[:, 0]])
+
+
+def steering(
+    params: BallbotParams, x: Vector, aside: Vector, bandwidth: Any, seconds: Any, target: Vector, force: float
+) -> tuple[Any, ...]:
+    """The cascade's force (Fx, Fy), N, for floats, arrays and tensors: components of one shape.
+
+    Args:
+        params: the robot.
+        x: 8 components of the state.
+        aside: 2 components of what is added to the leans that the ball's loop asks for, rad.
+        bandwidth: of the lean's loop, rad/s.
+        seconds: time constant of the ball's loop, s.
+        target: 2 components of where to steer the ball, m.
+        force: largest force per axis, N.
+    """
+    h, mass = params.first_moment, params.moving_mass
+    inertia = params.pivot_inertia - h * h / mass  # of the lean, with a ball that is free to move
+    turning = mass * params.ball_radius if params.rolls else 0.0  # the torque that drives the ball turns the body too
+    forces = []
+    for axis in range(2):
+        position, lean, speed, rate = x[axis] - target[axis], x[2 + axis], x[4 + axis], x[6 + axis]
+        wanted = ops.arctan(-(2 / seconds * speed + position / seconds**2) / params.gravity)
+        wanted = ops.clip(wanted, -_LARGEST_LEAN, _LARGEST_LEAN) + aside[axis]
+        acceleration = -(bandwidth**2) * (lean - wanted) - 2 * bandwidth * rate
+        # of a body in a vertical plane: inertia · lean acceleration = h g sin(lean) − (h/M) F cos(lean)
+        moment = h * params.gravity * ops.sin(lean) - inertia * acceleration
+        forces.append(ops.clip(moment * mass / (h * ops.cos(lean) + turning), -force, force))
+    return tuple(forces)
 
 
 def _gripping(params: BallbotParams, x: np.ndarray, u: np.ndarray, hold: float) -> np.ndarray:
