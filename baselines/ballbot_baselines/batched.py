@@ -107,11 +107,10 @@ def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.nd
     )
     for i in range(count):
         optima.solved[i] = solver.solve(x0[i], None if forces is None else forces[i, :steps], optima, i)
-    margins = np.min(
-        [np.broadcast_to(m, (count, n + 1)) for m in task.margins(optima.states, np.zeros(0))], axis=(0, 2)
-    )
-    costs = np.sum(task.cost(optima.states[:, :-1], optima.forces, np.zeros(0)), axis=1) * task.control_dt
-    optima.solved[:] &= (margins >= 0) & np.isfinite(costs)
+    with np.errstate(all="ignore"):  # episodes of robots that fall may overflow
+        room = [np.broadcast_to(m, (count, n + 1)) for m in task.margins(optima.states, np.zeros(0))]
+        costs = np.sum(task.cost(optima.states[:, :-1], optima.forces, np.zeros(0)), axis=1) * task.control_dt
+    optima.solved[:] &= (np.min(room, axis=(0, 2)) >= 0) & np.isfinite(costs)
     optima.costs[optima.solved] = costs[optima.solved]
     return optima
 
