@@ -281,7 +281,7 @@ def _draw(
     axis.plot(cost[order], 100 * (limit / cost - 1)[order], "kx", ms=5, label="extrapolated")
     axis.plot(cost[order], 100 * (simulated / cost - 1)[order], "k+", ms=5, label="its forces, simulated")
     axis.axhline(0, color="k", lw=0.6)
-    axis.set(xscale="log", xlabel="certified optimum", ylabel="dynamic programming, % more", ylim=(-6, 6))
+    axis.set(xscale="log", xlabel="certified optimum", ylabel="dynamic programming, % more", ylim=(-1, 6))
     axis.legend(fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
 

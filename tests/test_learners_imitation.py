@@ -8,6 +8,7 @@ import torch
 
 from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
@@ -183,6 +184,19 @@ def test_thousands_of_optima_at_once_give_the_labels_that_optima_one_by_one_give
         x = observations[i].double().numpy() * task.observation_scale
         expected = find_optimum(task, params, x, np.zeros(0)).trajectory.u[0] / params.force_limit
         np.testing.assert_allclose(actions[i], expected, atol=0.01)
+
+
+def test_a_share_of_the_beginnings_is_what_costs_the_learner_most():
+    task, params = make_task("stabilize"), default_params()
+    learner = dagger.Dagger(task, params, replace(TINY_DAGGER, batch_episodes=32, batch_dear_share=0.25))
+    learner.iteration = 1  # an untrained learner's costs tell nothing
+    x, c = learner._beginnings(16, np.random.default_rng(0))
+    assert x.shape == (16, 8)
+    run = run_episodes(BallbotBatch(task, 16, compile=False), learner.network, x, c)
+    cost = np.where(run.failure.numpy(), np.inf, run.cost.numpy())
+    assert cost[12:].min() >= np.median(cost[:12])
+    learner.iteration = 0
+    assert len(learner._beginnings(16, np.random.default_rng(0))[0]) == 16
 
 
 def test_optima_at_once_are_refused_where_they_cannot_be_found():

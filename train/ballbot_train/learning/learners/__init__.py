@@ -77,7 +77,7 @@ _MAY_BE_ZERO = {
     "tube_samples",
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
-_SHARES = {"beta", "final_gamma", "gae_lambda", "gamma", "tau"}
+_SHARES = {"batch_dear_share", "beta", "final_gamma", "gae_lambda", "gamma", "tau"}
 _POSITIVE = {"demo_std", "final_learning_rate", "final_std", "learning_rate", "reward_scale", "std"}
 _MOST = 10**9  # of whole numbers
 _MOST_OF = {"critic_hidden": 2**14, "hidden": 2**14, "horizon": 10**5, "num_envs": 2**20, "num_steps": 10**6}

@@ -46,6 +46,7 @@ from ballbot_train.policy import PolicyNetwork
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3])  # standard deviations of a tube, in a state's SI units
 _ACTIVE = 0.05  # a goal function this close to the greatest one still limits the optimum
 _SMALL = 0.3  # of the force limit
+_DEAR_AMONG = 16  # episodes that are drawn for each of the dearest
 _MIN_STEPS = 2  # plans with fewer remaining control steps are not used as a guess
 
 
@@ -81,6 +82,8 @@ class DaggerConfig:
     """Greatest distance from the plan at which TVLQR labels such a state, in units of the tube's standard deviations."""
     batch_episodes: int = 0
     """Optima that are found at once per gathering iteration, in place of those one by one; 0 where that does not work."""
+    batch_dear_share: float = 0.0
+    """Share of the beginnings of these that are the dearest of many that are drawn: those that cost the learner most."""
     batch_states: int = 32
     """States of each of these optima that become samples, each with `tube_samples` around it."""
     label_seconds: float = 4.0
@@ -110,6 +113,7 @@ TUNED: dict[str, DaggerConfig] = {
         gathering_iterations=20,
         evaluations=15,
         batch_episodes=4096,
+        batch_dear_share=0.25,
         label_seconds=3.0,
         symmetry="odd",
         gradient_steps=3000,
@@ -224,8 +228,7 @@ class Dagger:
     def _gather_batch(self, rng: np.random.Generator) -> dict[str, float]:
         """Labels states along thousands of optima and around them; half of the optima start where the learner gets to."""
         config, task = self.config, self._task
-        begins = [task.sample(rng, self._params) for _ in range((config.batch_episodes + 1) // 2)]
-        x0, c = (np.array(part) for part in zip(*begins, strict=True))
+        x0, c = self._beginnings((config.batch_episodes + 1) // 2, rng)
         longest = max(1, round(self._share * config.max_rollout_seconds / task.control_dt))
         history, over, _ = self._roll(x0, c, longest)
         lasted = np.where(over[-1], over.argmax(0), longest + 1)
@@ -242,6 +245,21 @@ class Dagger:
         forces = np.concatenate([u, near_u])
         self._samples.add(self._samples_of(np.concatenate([x, near_x]), forces, c[of % len(x0)], costs[of]))
         return {"train/labelled": float(optima.solved.mean())}
+
+    def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Initial states (count, 8) and constants (count, nc); some of them are the dearest of those drawn."""
+        dear = round(self.config.batch_dear_share * count) if self.iteration else 0
+        drawn = [self._task.sample(rng, self._params) for _ in range(count - dear + _DEAR_AMONG * dear)]
+        x, c = (np.array(part) for part in zip(*drawn, strict=True))
+        if not dear:
+            return x, c
+        among = slice(count - dear, None)
+        task = replace(self._task, duration=self.config.label_seconds)
+        batch = BallbotBatch(task, _DEAR_AMONG * dear, compile=False, params=self._params)
+        run = run_episodes(batch, self.network, x[among], c[among])
+        costs = np.where(run.failure.numpy(), np.inf, run.cost.numpy())
+        rows = np.concatenate([np.arange(count - dear), count - dear + np.argsort(costs)[-dear:]])
+        return x[rows], c[rows]
 
     def _forces(self, x: np.ndarray, c: np.ndarray) -> np.ndarray:
         """(B, n, 2) N, of the learner in episodes from states (B, 8), as far as `batched.find_optima` takes them."""
