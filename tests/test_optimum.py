@@ -12,7 +12,7 @@ import casadi
 from ballbot_baselines import compiled
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
-from ballbot_baselines.optimum import FEASIBLE, Backoff, find_optimum, is_feasible
+from ballbot_baselines.optimum import FEASIBLE, Backoff, find_optimum, is_feasible, plan_to_track
 from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
@@ -450,3 +450,12 @@ def test_other_robot_has_another_optimum(params):
     optimum = find_optimum(Stabilize(), weak, x0, ())
     assert np.abs(optimum.trajectory.u).max() <= 120.0
     assert optimum.cost >= find_optimum(Stabilize(), params, x0, ()).cost
+
+
+def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(params):
+    x0 = np.zeros(8)
+    x0[2], x0[4] = np.radians(-67.5), 12.0  # all but the whole force is too little
+    reserve = Backoff(goal=0.1, force=0.02)
+    with pytest.raises(PlanError):
+        find_optimum(Stabilize(), params, x0, [], reserve)
+    assert plan_to_track(Stabilize(), params, x0, [], reserve).is_optimal

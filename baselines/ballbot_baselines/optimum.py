@@ -176,20 +176,23 @@ def find_optimum(
 
 
 def plan_to_track(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff) -> Optimum:
-    """As `find_optimum`, for feedback to track: with less friction in reserve where there is no plan with more.
+    """As `find_optimum`, for feedback to track: with less friction or force in reserve where there is no plan with more.
 
-    Args: as of `find_optimum`. Without a limit of friction it is the same.
+    Args: as of `find_optimum`.
 
     Raises:
         PlanError: no try came to a feasible episode.
     """
-    reserves = [backoff.grip, 0.3 * backoff.grip, Backoff().grip] if params.grips else [backoff.grip]
-    for grip in reserves[:-1]:
+    least = Backoff()
+    grips = [backoff.grip, 0.3 * backoff.grip, least.grip] if params.grips else [backoff.grip]
+    tries = [replace(backoff, grip=grip) for grip in grips]
+    tries += [replace(backoff, force=least.force, grip=least.grip)] if backoff.force > least.force else []
+    for reserve in tries[:-1]:
         try:
-            return find_optimum(task, params, x0, c, replace(backoff, grip=grip))
+            return find_optimum(task, params, x0, c, reserve)
         except PlanError:
             pass
-    return find_optimum(task, params, x0, c, replace(backoff, grip=reserves[-1]))
+    return find_optimum(task, params, x0, c, tries[-1])
 
 
 def is_feasible(solution: OcpSolution) -> bool:
