@@ -45,6 +45,7 @@ _COARSE = 2  # control steps per interval when several guesses are compared
 _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
 _SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
+_RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 ALL_GUESSES = 2**10
 """`guesses` that make `find_optimum` solve every guess."""
 
@@ -184,15 +185,21 @@ def plan_to_track(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarr
         PlanError: no try came to a feasible episode.
     """
     least = Backoff()
-    grips = [backoff.grip, 0.3 * backoff.grip, least.grip] if params.grips else [backoff.grip]
-    tries = [replace(backoff, grip=grip) for grip in grips]
-    tries += [replace(backoff, force=least.force, grip=least.grip)] if backoff.force > least.force else []
-    for reserve in tries[:-1]:
+    tries = [
+        replace(
+            backoff,
+            force=min(backoff.force, max(share * backoff.force, least.force)),
+            grip=min(backoff.grip, max(share * backoff.grip, least.grip)) if params.grips else backoff.grip,
+        )
+        for share in _RESERVES
+    ]
+    *more, last = dict.fromkeys(tries)
+    for reserve in more:
         try:
             return find_optimum(task, params, x0, c, reserve)
         except PlanError:
             pass
-    return find_optimum(task, params, x0, c, tries[-1])
+    return find_optimum(task, params, x0, c, last)
 
 
 def is_feasible(solution: OcpSolution) -> bool:
