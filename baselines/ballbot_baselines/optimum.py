@@ -442,15 +442,17 @@ def _solve_likely_sides(
         if best is not None and predicted[likeliest] > best.cost * (1 + _SIDE_DOUBT):
             break
         unsolved.remove(likeliest)
-        _, x, a = starts[likeliest]
-        if best is None:
-            solution = _solve_with(solver, params, x[::_COARSE], a[::_COARSE], c, backoff)
-        else:
-            solution = _solve_with(quick, params, x[::_COARSE], a[::_COARSE], c, backoff)
-            if not is_feasible(solution):  # the path from rest to rest is far from this choice's
-                path = np.column_stack([along, predicted_y[likeliest]])
-                x, u = guess.along_path(params, path, task.control_dt, start=x0)
-                solution = _solve_with(quick, params, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
+        solution = solved.get(likeliest)
+        if solution is None:
+            _, x, a = starts[likeliest]
+            first = solver if best is None else quick
+            solution = _solve_with(first, params, x[::_COARSE], a[::_COARSE], c, backoff)
+        if best is not None and not is_feasible(solution):  # the path from rest to rest is far from this choice's
+            path = np.column_stack([along, predicted_y[likeliest]])
+            x, u = guess.along_path(params, path, task.control_dt, start=x0)
+            solution = _solve_with(quick, params, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
+        if best is None and is_feasible(solution):
+            unsolved += solved  # those that failed before there was a prediction, whose path is another start
         solved[likeliest] = solution
         if is_feasible(solution) and (best is None or solution.cost < best.cost):
             path = guess.resampled(solution.states[:, :2], task.steps)
