@@ -59,3 +59,12 @@ def test_likely_choices_hold_the_best_of_all_choices(params):
         x0, c = task.sample(np.random.default_rng(seed), params)
         best = find_optimum(task, params, x0, c, guesses=ALL_GUESSES).cost
         assert find_optimum(task, params, x0, c).cost == pytest.approx(best, rel=1e-3)
+
+
+def test_a_choice_on_which_the_solver_fails_is_tried_again(params):
+    """From rest to rest on the best sides the solver stops; from the path that another choice's solution predicts it ends."""
+    task = Weave()
+    x0, c = task.sample(np.random.default_rng([2026, 1, 156]), params)
+    found = find_optimum(task, params, x0, c)
+    assert sides_passed(found.trajectory.x[:, :2], c) == (1, -1, 1, -1)
+    assert found.cost == pytest.approx(75.8071, abs=1e-3)
