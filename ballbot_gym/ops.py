@@ -58,7 +58,7 @@ def arctan(a: Any) -> Any:
     return math.atan(a) if isinstance(a, float | int) else _library(a).arctan(a)
 
 
-def clip(a: Any, low: float, high: float) -> Any:
+def clip(a: Any, low: Any, high: Any) -> Any:
     """The nearest number in [low, high], elementwise; NaN stays NaN, but not with CasADi."""
     if isinstance(a, float | int):
         return max(min(a, high), low)

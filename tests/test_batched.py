@@ -1,5 +1,7 @@
 """Optima of many episodes at once agree with those found one by one, and say where they are none."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -119,3 +121,10 @@ def test_wrong_shapes_are_refused(x0, forces, message, params):
 
 def test_no_episodes_are_no_error(params):
     assert batched.find_optima(Stabilize(), params, np.zeros((0, 8))).costs.shape == (0,)
+
+
+def test_threads_do_not_disturb_each_other(optima, params):
+    starts = [optima.states[i : i + 4, 0] for i in (0, 4)]
+    with ThreadPoolExecutor(2) as threads:
+        found = list(threads.map(lambda x0: batched.find_optima(Stabilize(), params, x0).costs, starts))
+    np.testing.assert_array_equal(np.concatenate(found), optima.costs[:8])

@@ -15,6 +15,7 @@ see `benchmarks/batched_optima.py`.
 
 import functools
 import itertools
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -36,8 +37,10 @@ _MOST_ITERATIONS = 15
 _SHORTER_STEPS = (0.5, 0.2, 0.05, 0.01)  # shares of a step that are tried in turn where the whole step raises the cost
 _TOLERANCE = 1e-5  # relative: an iteration that promises to lower the cost by less is the last
 _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
-_CHUNK = 64  # episodes whose costs are computed together, while they are in the processor's cache
 _FORCE_BACKOFF = 1e-7  # of the force limit, as in `optimum.Backoff`
+
+
+_one_at_a_time = threading.Lock()  # a task's compiled functions read and write the same arrays in every call
 
 
 @dataclass(frozen=True)
@@ -106,16 +109,10 @@ def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.nd
         slopes=np.zeros((count, n, 8)),
         iterations=np.zeros(count, int),
     )
-    for start in range(0, count, _CHUNK):
-        rows = slice(start, min(start + _CHUNK, count))
-        for i in range(rows.start, rows.stop):
-            optima.solved[i] = solver.solve(x0[i], None if forces is None else forces[i, :steps], optima, i)
-        states, held = optima.states[rows], optima.forces[rows]
-        with np.errstate(all="ignore"):  # episodes of robots that fall may overflow
-            room = [np.broadcast_to(m, (len(states), n + 1)) for m in task.margins(states, np.zeros(0))]
-            costs = np.sum(task.cost(states[:, :-1], held, np.zeros(0)), axis=1) * task.control_dt
-        solved = optima.solved[rows] & (np.min(room, axis=(0, 2)) >= 0) & np.isfinite(costs)
-        optima.solved[rows], optima.costs[rows] = solved, np.where(solved, costs, np.nan)
+    with _one_at_a_time:
+        for i in range(count):
+            optima.costs[i] = solver.solve(x0[i], None if forces is None else forces[i, :steps], optima, i)
+    optima.solved[:] = np.isfinite(optima.costs)
     return optima
 
 
@@ -126,10 +123,14 @@ def optimized_steps(task: Task) -> int:
 
 @dataclass(frozen=True)
 class _Episode:
-    """A simulated episode: states (n+1, 8), forces (n, 2), and its cost, infinite where a margin is violated."""
+    """A simulated episode: states (n+1, 8), forces (n, 2), their cost, and that with LQR's cost-to-go after them.
+
+    The last is infinite where a margin is violated.
+    """
 
     x: np.ndarray
     u: np.ndarray
+    held: float
     cost: float
 
 
@@ -160,8 +161,8 @@ class _Solver:
         times = task.control_dt * np.arange(n)[:, None]
         self._fading = {fade: np.exp(-times / fade) for *_, fade in (*_FAMILY, *_SIDEWAYS_FAMILY)}
 
-    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, row: int) -> bool:
-        """Optimizes one episode from x0 (8,), and writes it into a row of `optima`; the cost is left out.
+    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, row: int) -> float:
+        """Optimizes one episode from x0 (8,), and writes it into a row of `optima`, but for the cost.
 
         Args:
             x0: (8,).
@@ -170,7 +171,7 @@ class _Solver:
             row: of these.
 
         Returns:
-            Whether it converged.
+            The cost of the whole episode; NaN if it did not converge, or violates a margin.
         """
         best = self._recovery(x0)
         if forces is not None:
@@ -190,14 +191,16 @@ class _Solver:
         x, u = optima.states[row], optima.forces[row]
         x[: n + 1], u[:n], optima.slopes[row, :n] = best.x, best.u, slopes
         optima.gains[row, :n], optima.gains[row, n:] = gains.reshape(n, 2, 8), self._lqr
+        cost, room = best.held, min(np.min(margin) for margin in self._task.margins(x0, np.zeros(0)))
         if len(self._no_forces):
-            x[n + 1 :], u[n:], *_ = self._follow_to_end(x[n], self._no_forces, self._lqr_gains, self._at_rest)
+            x[n + 1 :], u[n:], costs, rooms = self._follow_to_end(x[n], self._no_forces, self._lqr_gains, self._at_rest)
+            cost, room = cost + float(costs.sum()), min(room, rooms.min())
         optima.slopes[row, n:] = 2 * (x[n:-1] - self._rest) @ self._p
-        return converged
+        return cost if converged and room >= 0 else np.nan
 
     def _recovery(self, x0: np.ndarray) -> _Episode:
         """The cheapest simulated recovery. Where none in the plane of the fall survives, those to its sides are tried."""
-        best = _Episode(np.zeros((self._steps + 1, 8)), np.zeros((self._steps, 2)), np.inf)
+        best = _Episode(np.zeros((self._steps + 1, 8)), np.zeros((self._steps, 2)), 0.0, np.inf)
         side = righting.leaning_aside(x0, np.ones(1))[:, 0]
         for family in (_FAMILY, _SIDEWAYS_FAMILY):
             for bandwidth, seconds, lean, fade in family:
@@ -214,11 +217,11 @@ class _Solver:
     def _episode(self, x0: np.ndarray, simulated: Sequence[np.ndarray]) -> _Episode:
         """An episode of the optimized steps, with LQR's cost-to-go after them."""
         after, u, costs, room = simulated
-        cost = np.inf
+        held, cost = float(costs.sum()), np.inf
         if room.min() > 0:  # NaN is not
             off = after[-1] - self._rest
-            cost = float(costs.sum() + off @ self._p @ off)
-        return _Episode(np.concatenate([x0[None], after]), u, cost)
+            cost = held + float(off @ self._p @ off)
+        return _Episode(np.concatenate([x0[None], after]), u, held, cost)
 
     def _backward(self, episode: _Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """Changes of the forces (T, 2), feedback K (T, 16), slopes of the cost-to-go (T, 8), and by how much the linear model
@@ -322,8 +325,8 @@ def _box_step(hessian: casadi.SX, gradient: casadi.SX, low: casadi.SX, high: cas
     inside = casadi.logic_and(casadi.mmin(free - low) >= 0, casadi.mmin(high - free) >= 0)
     step, least = casadi.SX.nan(2), casadi.SX.inf()
     for edge in (low, high):
-        first = casadi.vertcat(edge[0], casadi.fmax(casadi.fmin(-(gradient[1] + b * edge[0]) / c, high[1]), low[1]))
-        second = casadi.vertcat(casadi.fmax(casadi.fmin(-(gradient[0] + b * edge[1]) / a, high[0]), low[0]), edge[1])
+        first = casadi.vertcat(edge[0], ops.clip(-(gradient[1] + b * edge[0]) / c, low[1], high[1]))
+        second = casadi.vertcat(ops.clip(-(gradient[0] + b * edge[1]) / a, low[0], high[0]), edge[1])
         for tried in (first, second):
             cost = 0.5 * casadi.dot(tried, hessian @ tried) + casadi.dot(gradient, tried)
             step = casadi.if_else(cost < least, tried, step)

@@ -37,10 +37,8 @@ FROM_RIGHTING = -1
 _FREE_TIME_INTERVALS = 60
 _MOST_ITERATIONS = 200
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
-_BARRIER, _NEAR_BARRIER = (
-    0.1,
-    1e-3,
-)  # of the first iterate; near a solution of nearly the same problem, half the iterations
+_BARRIER = 0.1  # of the first iterate
+_NEAR_BARRIER = 1e-3  # near a solution of nearly the same problem: about half the iterations
 _COARSE = 2  # control steps per interval when several guesses are compared
 _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first

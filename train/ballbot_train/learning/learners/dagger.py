@@ -32,7 +32,7 @@ from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_baselines.tvlqr import TvlqrController
-from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.batch import BallbotBatch, BatchEpisodes, run_episodes
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import then_stay
 from ballbot_gym.rollout import PlanError
@@ -254,9 +254,7 @@ class Dagger:
         if not dear:
             return x, c
         among = slice(count - dear, None)
-        task = replace(self._task, duration=self.config.label_seconds)
-        batch = BallbotBatch(task, _DEAR_AMONG * dear, compile=False, params=self._params)
-        run = run_episodes(batch, self.network, x[among], c[among])
+        run = self._run(x[among], c[among], round(self.config.label_seconds / self._task.control_dt), record=False)
         costs = np.where(run.failure.numpy(), np.inf, run.cost.numpy())
         rows = np.concatenate([np.arange(count - dear), count - dear + np.argsort(costs)[-dear:]])
         return x[rows], c[rows]
@@ -379,13 +377,17 @@ class Dagger:
             States (steps+1, B, 8); whether the episode had ended by then (steps+1, B), so that the state has no meaning;
             and whether it failed (B,).
         """
-        task = replace(self._task, duration=steps * self._task.control_dt)
-        batch = BallbotBatch(task, len(x), compile=False, params=self._params)
-        run = run_episodes(batch, self.network, x, c, record=True)
+        run = self._run(x, c, steps, record=True)
         assert run.states is not None
         history = np.concatenate([x[None], run.states.transpose(1, 2).double().numpy()])
         over = (np.arange(steps + 1)[:, None] >= run.steps.numpy()) & run.terminated.numpy()
         return history, over, run.failure.numpy()
+
+    def _run(self, x: np.ndarray, c: np.ndarray, steps: int, record: bool) -> BatchEpisodes:
+        """B episodes of so many steps under the learner."""
+        task = replace(self._task, duration=steps * self._task.control_dt)
+        batch = BallbotBatch(task, len(x), compile=False, params=self._params)
+        return run_episodes(batch, self.network, x, c, record=record)
 
     def _labelled(
         self, plan: Optimum, gains: np.ndarray, c: np.ndarray, cost: float, rng: np.random.Generator
