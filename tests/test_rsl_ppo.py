@@ -1,5 +1,6 @@
 """PPO by rsl_rl: it goes on from a state as if never stopped, sees what it should, and refuses what a task has not."""
 
+import copy
 import io
 from dataclasses import replace
 
@@ -9,8 +10,10 @@ from tensordict import TensorDict
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
+from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, value_of_living
 from ballbot_train.learning.learners import LEARNERS, rsl_ppo
+from ballbot_train.policy import PolicyNetwork
 
 TINY = {
     "total_iterations": 3,
@@ -55,6 +58,47 @@ def test_it_goes_on_from_its_state_as_if_never_stopped(task):
         torch.manual_seed(99)  # nothing depends on what else is drawn
         assert torch.equal(weights(run(second, 3 - stop)), weights(whole))
     assert not torch.equal(weights(run(make(name, seed=1), 3)), weights(whole))
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_from_a_policy_the_critic_is_trained_first_and_the_policy_keeps_its_shape(linear):
+    torch.manual_seed(4)
+    given = PolicyNetwork(spec_for(make_task("turn"), "frame", (5, 6), linear))
+
+    def started(seed=0):
+        learner = make("turn", seed, critic_warmup_iterations=2, total_iterations=4)
+        learner.start_from(given)
+        return learner
+
+    def same(one, other):
+        return all(
+            torch.equal(a, b) for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True)
+        )
+
+    learner = started()
+    critics = [copy.deepcopy(learner._critic)]
+    for _ in range(2):
+        learner.iterate()
+        critics.append(copy.deepcopy(learner._critic))
+        assert same(learner.network, given)
+    assert not same(critics[0], critics[1])
+    assert not same(critics[1], critics[2])
+    run(learner, 2)
+    assert not same(learner.network, given)
+    assert learner.network.spec == given.spec
+    second = started(seed=1)
+    second.load_state_dict(through_a_file(run(started(), 3).state_dict()))
+    assert torch.equal(weights(run(second, 1)), weights(learner))
+
+
+def test_the_mean_action_of_a_squashed_policy_is_squashed():
+    torch.manual_seed(5)
+    network = PolicyNetwork(spec_for(make_task("turn"), "none", (5,), linear=True))
+    learner = make("turn")
+    learner.start_from(network)
+    observation = 9 * torch.randn(50, 9)
+    seen = TensorDict({"policy": observation, "critic": observation}, batch_size=[50])
+    torch.testing.assert_close(learner._actor(seen), network(observation))
 
 
 def test_the_critic_alone_fits_a_quadratic_form_with_its_linear_path():

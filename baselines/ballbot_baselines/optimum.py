@@ -44,6 +44,9 @@ _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordere
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
 _SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
+
+_Start = tuple[int, np.ndarray, np.ndarray]  # index of a path, states (n+1, 8) and actions (n, 2) to start from
+
 ALL_GUESSES = 2**10
 """`guesses` that make `find_optimum` solve every guess."""
 
@@ -341,8 +344,14 @@ def _solve_fixed_time(
     starts, fine = _starts(task, params, x0, paths), []
     if len(paths) > 1 and task.steps % _COARSE == 0:
         fine = _contenders(task, params, x0, c, backoff, starts)
-    near = bool(fine)
-    return [(i, s) for i, x, a in fine or starts for s in _solve_from(task, params, x, a, c, backoff, near)]
+    return _solve_all(task, params, c, backoff, fine, starts)
+
+
+def _solve_all(
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, fine: list[_Start], starts: list[_Start]
+) -> list[tuple[int, OcpSolution]]:
+    """From `fine`, which are near solutions, or where there is none from `starts`."""
+    return [(i, s) for i, x, a in fine or starts for s in _solve_from(task, params, x, a, c, backoff, bool(fine))]
 
 
 def _solve_quickly(
@@ -353,9 +362,7 @@ def _solve_quickly(
     return [(i, _solve_with(solver, params, x, a, c, backoff)) for i, x, a in _starts(task, params, x0, paths)]
 
 
-def _starts(
-    task: Task, params: BallbotParams, x0: np.ndarray, paths: list[np.ndarray]
-) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def _starts(task: Task, params: BallbotParams, x0: np.ndarray, paths: list[np.ndarray]) -> list[_Start]:
     """Index, states (n+1, 8) and actions (n, 2) along each path."""
     starts = [guess.along_path(params, path, task.control_dt, start=x0) for path in paths]
     return [(i, x, u / params.force_limit) for i, (x, u) in enumerate(starts)]
@@ -461,8 +468,7 @@ def _solve_likely_sides(
             predicted = solution.cost + prediction.costs[order] - here
             along, predicted_y = path[:, 0], prediction.y[order]
     fine = _refined(task, [(i, s) for i, s in solved.items() if is_feasible(s)])
-    near = bool(fine)
-    return [(i, s) for i, x, a in fine or starts[:most] for s in _solve_from(task, params, x, a, c, backoff, near)]
+    return _solve_all(task, params, c, backoff, fine, starts[:most])
 
 
 def _side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
@@ -477,8 +483,8 @@ def _contenders(
     x0: np.ndarray,
     c: np.ndarray,
     backoff: Backoff,
-    starts: list[tuple[int, np.ndarray, np.ndarray]],
-) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    starts: list[_Start],
+) -> list[_Start]:
     """Starts at the coarse solutions within `_BASIN_DOUBT` of the best; none, if no coarse solution is feasible."""
     n = task.steps // _COARSE
     solver = _solver(task, params, n, "fatrop", _COARSE)
@@ -490,7 +496,7 @@ def _contenders(
     return _refined(task, solved)
 
 
-def _refined(task: Task, solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def _refined(task: Task, solved: list[tuple[int, OcpSolution]]) -> list[_Start]:
     """Starts at the coarse solutions within `_BASIN_DOUBT` of the best."""
     fine = []
     for index, solution in _distinct(solved):

@@ -31,7 +31,7 @@ class Run:
     demos: str | None = None
     """Folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards."""
     start: Path | None = None
-    """Policy file whose weights training starts from; only for shac."""
+    """Policy file whose weights training starts from; only for shac and rsl_ppo."""
     seed: int = 0
     """Seed of everything that is drawn."""
     seeds: str | None = None
@@ -72,7 +72,7 @@ def train(
         learner: name of a learner in `LEARNERS`.
         task: name of a task.
         demos: folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards.
-        start: policy file whose weights training starts from, of any robot; only for shac.
+        start: policy file whose weights training starts from, of any robot; only for shac and rsl_ppo.
         seed: seed of everything that is drawn.
         settings: the learner's settings; default, those tuned for the task.
         threads: threads of torch; default, torch's own choice. Another number changes the last digits.

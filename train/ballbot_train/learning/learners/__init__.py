@@ -78,7 +78,16 @@ _MAY_BE_ZERO = {
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
 _SHARES = {"batch_dear_share", "beta", "final_gamma", "gae_lambda", "gamma", "tau"}
-_POSITIVE = {"demo_std", "final_learning_rate", "final_std", "learning_rate", "reward_scale", "std"}
+_POSITIVE = {
+    "demo_std",
+    "final_learning_rate",
+    "final_std",
+    "finetune_learning_rate",
+    "finetune_std",
+    "learning_rate",
+    "reward_scale",
+    "std",
+}
 _MOST = 10**9  # of whole numbers
 _MOST_OF = {"critic_hidden": 2**14, "hidden": 2**14, "horizon": 10**5, "num_envs": 2**20, "num_steps": 10**6}
 _MOST_STEPS = 10**8  # env steps of an iteration, which are all in memory

@@ -1,4 +1,4 @@
-"""Proximal policy optimization by rsl_rl on thousands of batched envs, from scratch.
+"""Proximal policy optimization by rsl_rl on thousands of batched envs, from scratch or from a policy.
 
 What makes the tasks learnable, besides rewards that pay for living (see `ballbot_gym.tasks.base.Task`):
 
@@ -60,9 +60,9 @@ class RslPpoConfig:
     start of an episode that costs more later."""
     gae_lambda: float = 0.9
     """λ of generalized advantage estimation."""
-    relative_advantages: bool = False
-    """Whether an advantage counts relative to the cost to go that the critic expects, as regret does. Without it the first
-    second of an episode, which costs most, hides what the steps after it could save."""
+    relative_advantages: float = 0.0
+    """Power of the cost to go, as the critic expects it, by which an advantage is divided. With 1 it counts as regret does;
+    with 0, that is without it, the first second of an episode, which costs most, hides what the steps after it could save."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the actor's hidden layers."""
     critic_hidden: tuple[int, ...] = (64, 64)
@@ -84,6 +84,13 @@ class RslPpoConfig:
     """Passes over the rollouts of an iteration."""
     num_mini_batches: int = 16
     """Gradient steps of a pass."""
+    finetune_learning_rate: float = 3e-5
+    """In place of `learning_rate` if training starts from a policy file."""
+    finetune_std: float = 0.03
+    """In place of `std` if training starts from a policy file."""
+    critic_warmup_iterations: int = 40
+    """Iterations that train the critic alone if training starts from a policy file. The policy file also says the shape of
+    the actor, symmetry included; `symmetry` is then that of the critic's inputs."""
     clip_range: float = 0.2
     """Range to which the ratio of new and old probability is clipped, about 1."""
     max_grad_norm: float = 1.0
@@ -110,7 +117,7 @@ TUNED: dict[str, RslPpoConfig] = {
         symmetry="frame",
         total_iterations=600,
         gae_lambda=0.95,
-        relative_advantages=True,
+        relative_advantages=1.0,
         final_std=0.03,
         curriculum=Curriculum(short_episodes=0.3),
     ),
@@ -133,7 +140,7 @@ class Actor(MLPModel):
         }
         super().__init__(observations, _GROUPS, "actor", 2, (1,), distribution_cfg=distribution)
         self.network = network
-        self.mlp = _Raw(network)
+        self.mlp = _Mean(network)
 
     def set_std(self, std: float) -> None:
         """Sets the standard deviation of both actions."""
@@ -141,16 +148,17 @@ class Actor(MLPModel):
         self.distribution.std_param.data.fill_(std)
 
 
-def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float) -> torch.Tensor:
+def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float, power: float = 1.0) -> torch.Tensor:
     """Advantages relative to the cost to go, normalized: (T, B, 1) of returns and values (T, B, 1).
 
     Args:
         returns: estimates of the return.
         values: what the critic expects.
         living: value of a state without any cost, so that the cost to go is `living` minus the value.
+        power: of the cost to go by which they are divided.
     """
     cost = living - values
-    relative = (returns - values) / torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6))
+    relative = (returns - values) / torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6)) ** power
     return (relative - relative.mean()) / (relative.std() + 1e-8)
 
 
@@ -159,15 +167,16 @@ def last_layer(network: torch.nn.Module) -> torch.nn.Linear:
     return [layer for layer in network.modules() if isinstance(layer, torch.nn.Linear)][-1]
 
 
-class _Raw(torch.nn.Module):
-    """A policy network before its output is squashed."""
+class _Mean(torch.nn.Module):
+    """The mean action of a policy network; before its output is clipped, so that the gradient does not end there."""
 
     def __init__(self, network: PolicyNetwork):
         super().__init__()
         self._network = (network,)  # in a tuple, so that its parameters are registered once
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return self._network[0].raw(observation)
+        network = self._network[0]
+        return network(observation) if network.spec.squash == "tanh" else network.raw(observation)
 
 
 class Critic(MLPModel):
@@ -253,28 +262,44 @@ class RslPpo:
             inputs = CriticInputs(len(task.observation_scale), config.products, spec.frame)
             self._env = RslVecEnv(self._batch, seed, inputs)
             self._env.episode_length_buf = torch.randint(shorter.steps, (config.num_envs,))
-            self._seen = seen = self._env.get_observations()
-            value = self._value_of_living(config.gamma)
-            self._actor = Actor(seen, PolicyNetwork(spec), config.std)
+            self._seen = self._env.get_observations()
+            network = PolicyNetwork(spec)
             with torch.no_grad():  # so that the first policy does next to nothing
-                last_layer(self._actor.network.mlp).weight.mul_(0.1)
-            self._average = PolicyNetwork(spec)
-            self._average.load_state_dict(self._actor.network.state_dict())
-            self._critic = Critic(seen, config.critic_hidden, value)
-            self._ppo = PPO(
-                self._actor,
-                self._critic,
-                Storage("rl", config.num_envs, config.num_steps, seen, (2,)),
-                num_learning_epochs=config.update_epochs,
-                num_mini_batches=config.num_mini_batches,
-                clip_param=config.clip_range,
-                gamma=config.gamma,
-                lam=config.gae_lambda,
-                entropy_coef=0.0,
-                learning_rate=config.learning_rate,
-                max_grad_norm=config.max_grad_norm,
-                schedule="fixed",
-            )
+                last_layer(network.mlp).weight.mul_(0.1)
+            self._rate, self._std, self._warmup_iterations = config.learning_rate, config.std, 0
+            self._make(network)
+
+    def start_from(self, network: PolicyNetwork) -> None:
+        """Takes a policy of any shape as the actor; the critic is trained alone at first."""
+        self._rate, self._std = self.config.finetune_learning_rate, self.config.finetune_std
+        self._warmup_iterations = self.config.critic_warmup_iterations
+        mine = self._actor.network.spec
+        started = PolicyNetwork(replace(network.spec, task=mine.task, robot=mine.robot))
+        started.load_state_dict(network.state_dict())
+        with self._random:
+            self._make(started)
+
+    def _make(self, network: PolicyNetwork) -> None:
+        """Makes actor, critic and algorithm around a policy network."""
+        config, seen = self.config, self._seen
+        self._actor = Actor(seen, network, self._std)
+        self._average = PolicyNetwork(network.spec)
+        self._average.load_state_dict(network.state_dict())
+        self._critic = Critic(seen, config.critic_hidden, self._value_of_living(config.gamma))
+        self._ppo = PPO(
+            self._actor,
+            self._critic,
+            Storage("rl", config.num_envs, config.num_steps, seen, (2,)),
+            num_learning_epochs=config.update_epochs,
+            num_mini_batches=config.num_mini_batches,
+            clip_param=config.clip_range,
+            gamma=config.gamma,
+            lam=config.gae_lambda,
+            entropy_coef=0.0,
+            learning_rate=self._rate,
+            max_grad_norm=config.max_grad_norm,
+            schedule="fixed",
+        )
 
     @property
     def network(self) -> PolicyNetwork:
@@ -293,8 +318,8 @@ class RslPpo:
     def _iterate(self) -> dict[str, float]:
         config = self.config
         progress = self.iteration / max(1, self.iterations - 1)
-        rate = schedules.geometric(config.learning_rate, config.final_learning_rate, progress)
-        std = schedules.geometric(config.std, config.final_std, progress)
+        rate = schedules.geometric(self._rate, config.final_learning_rate, progress)
+        std = schedules.geometric(self._std, config.final_std, progress)
         for group in self._ppo.optimizer.param_groups:
             group["lr"] = rate
         self._actor.set_std(std)
@@ -311,7 +336,10 @@ class RslPpo:
             if config.relative_advantages:
                 storage = self._ppo.storage
                 living = self._value_of_living(self._ppo.gamma)
-                storage.advantages = relative_advantages(storage.returns, storage.values, living)
+                storage.advantages = relative_advantages(
+                    storage.returns, storage.values, living, config.relative_advantages
+                )
+        self._actor.requires_grad_(self.iteration >= self._warmup_iterations)
         losses = self._ppo.update()
         with torch.no_grad():
             share = max(1 - _RETAINED, 1 / (1 + self.iteration))  # the first iterations start the average
