@@ -1,15 +1,14 @@
-# make demo   install into .venv and run the benchmark on an eighth of the episodes: LQR, trajectory optimization, NMPC
+# make demo   install into .venv and run the benchmark on a twentieth of the episodes: LQR, trajectory optimization, NMPC
 # make test   install into .venv, then lint, check types and test
 # make clients  install other people's libraries into .venv-clients and run docs/clients.md with them
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
-TRIALS := benchmarks/soak.py benchmarks/faults.py benchmarks/fuzz.py
 
 .PHONY: demo test test-slow bench soak faults fuzz docs certify clients ray clean
 
 demo: $(VENV)/runs
-	$(BIN)/ballbot benchmark --episodes 25 --out runs/demo
+	$(BIN)/ballbot benchmark --episodes 10 --out runs/demo
 
 test: $(VENV)/installed
 	$(BIN)/ruff check .
@@ -20,9 +19,10 @@ test: $(VENV)/installed
 test-slow: $(VENV)/installed
 	$(BIN)/pytest -m slow
 
+# one page with all figures of speed, beside those of the last page of another commit
 bench: $(VENV)/installed
 	$(INSTALL) -e ".[bench]"
-	for script in $(filter-out $(TRIALS),$(wildcard benchmarks/*.py)); do $(BIN)/python $$script; done
+	$(BIN)/python benchmarks/page.py
 
 # millions of steps and a thousand environments: time and memory must not grow
 soak: $(VENV)/installed

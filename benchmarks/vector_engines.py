@@ -4,38 +4,50 @@
 Time is that of the processor, so that a busy machine does not spoil it; run it with OMP_NUM_THREADS=1.
 """
 
-import argparse
 import statistics
 import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
+import tyro
 
+from ballbot_gym import files
 from ballbot_gym.tasks import TASKS
 
-SIZES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 1024)
 
+def main(
+    task: str = "stabilize",
+    sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64, 128, 256, 1024),
+    runs: int = 5,
+    seconds: float = 0.5,
+    out: Path = Path("runs/vector_engines"),
+) -> None:
+    """Measures, prints steps per second, and writes vector_engines.csv.
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", choices=TASKS, default="stabilize")
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=0.5, help="of each run")
-    args = parser.parse_args()
-    print(f"{'envs':>5} {'sync':>12} {'loop':>12} {'torch':>12}   steps/s, median of {args.runs} runs")
-    for size in args.sizes:
+    Args:
+        task: name of the task.
+        sizes: numbers of envs.
+        runs: of which the median is taken.
+        seconds: of each run.
+        out: folder of the result.
+    """
+    rows = []
+    print(f"{'envs':>5} {'sync':>12} {'loop':>12} {'torch':>12}   steps/s, median of {runs} runs")
+    for size in sizes:
         sync = {"vectorization_mode": "sync", "physics": "rk4"}
         kinds = {"sync": sync, "loop": {"engine": "loop"}, "torch": {"engine": "torch", "compile": False}}
-        envs = {name: gymnasium.make_vec(TASKS[args.task].id, num_envs=size, **kind) for name, kind in kinds.items()}
+        envs = {name: gymnasium.make_vec(TASKS[task].id, num_envs=size, **kind) for name, kind in kinds.items()}
         speeds: dict[str, list[float]] = {name: [] for name in envs}
-        for _ in range(args.runs):
+        for _ in range(runs):
             for name, env in envs.items():
-                speeds[name].append(speed(env, args.seconds))
-        medians = (f"{statistics.median(values):12,.0f}" for values in speeds.values())
-        print(f"{size:5}", *medians, flush=True)
+                speeds[name].append(speed(env, seconds))
+        medians = {name: statistics.median(values) for name, values in speeds.items()}
+        print(f"{size:5}", *(f"{value:12,.0f}" for value in medians.values()), flush=True)
+        rows.append({"envs": size, **medians})
         for env in envs.values():
             env.close()
+    files.write_csv(out / "vector_engines.csv", rows)
 
 
 def speed(env: gymnasium.vector.VectorEnv, seconds: float) -> float:
@@ -51,4 +63,4 @@ def speed(env: gymnasium.vector.VectorEnv, seconds: float) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -1,0 +1,280 @@
+"""One page with all figures of speed: `make bench`. It runs the benchmarks below, one after another.
+
+Each figure stands beside its ratio to that of the last page of another commit. A benchmark during which other processes took
+more than 5 % of the cores is marked as busy. What is done is not done again for the same commit, so an interrupted page
+goes on where it was.
+"""
+
+import csv
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import tyro
+
+from ballbot_gym import files
+from ballbot_train.provenance import commit_of, provenance
+
+_HERE = Path(__file__).parent
+_BUSY = 0.05  # share of the cores that others took
+
+
+@dataclass(frozen=True)
+class Section:
+    """A benchmark of this folder, and which columns of its table are figures."""
+
+    title: str
+    script: str
+    keys: tuple[str, ...]
+    """Columns that name a row."""
+    figures: dict[str, str]
+    """Columns with figures, and their units. Of a unit per second more is better, of all others less."""
+    arguments: tuple[str, ...] = ()
+    quick: tuple[str, ...] = ()
+    """In place of `arguments` for a quick page."""
+    table: str = ""
+    """Name of the CSV file, if it is not that of the script."""
+
+
+SECTIONS = (
+    Section("Memory", "memory", ("what",), {"peak_mib": "MiB"}),
+    Section(
+        "The paper's optimizations",
+        "trajopt_vs_drake",
+        ("problem", "guess", "program"),
+        {"cold_s": "s", "warm_s": "s"},
+        quick=("--quick",),
+    ),
+    Section(
+        "Optima one by one",
+        "optimum_coverage",
+        ("task",),
+        {"seconds_median": "s", "seconds_p95": "s"},
+        ("--draws", "200", "--exhaustive-episodes", "0", "--workers", "1"),
+        ("--draws", "10", "--exhaustive-episodes", "0", "--workers", "1"),
+        "coverage",
+    ),
+    Section(
+        "Optima at once",
+        "batched_optima",
+        ("solver",),
+        {"milliseconds": "ms", "speedup": "1/s, relative"},
+        quick=("--episodes", "512", "--checked", "20"),
+    ),
+    Section(
+        "Intervals",
+        "scaling",
+        ("problem", "intervals"),
+        {"seconds": "s"},
+        quick=("--quick",),
+    ),
+    Section(
+        "NMPC",
+        "mpc_latency",
+        ("task", "mode", "nodes", "horizon", "control_dt"),
+        {"median_ms": "ms", "p99_ms": "ms"},
+        quick=("--quick",),
+    ),
+    Section(
+        "Few environments",
+        "vector_engines",
+        ("envs",),
+        {"sync": "steps/s", "loop": "steps/s", "torch": "steps/s"},
+        quick=("--sizes", "1", "16", "64", "--runs", "1"),
+    ),
+    Section(
+        "Many environments",
+        "throughput",
+        ("what", "env", "batch", "device"),
+        {"steps_per_second": "steps/s", "first_step_seconds": "s"},
+        quick=("--seconds", "0.5", "--batches", "1024", "16384"),
+    ),
+)
+"""What the page holds."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of the page."""
+
+    section: str
+    row: str
+    name: str
+    unit: str
+    value: float
+
+
+def main(
+    out: Path = Path("runs/bench"), sections: tuple[str, ...] = (), quick: bool = False, previous: Path | None = None
+) -> None:
+    """Runs the benchmarks, and writes bench.md, with figures beside it.
+
+    Args:
+        out: folder of the pages, one folder for each commit.
+        sections: names of the scripts to run; default, all.
+        quick: shorter runs, whose figures only show that everything works.
+        previous: page to compare with; default, the newest of another commit.
+    """
+    known = [section.script for section in SECTIONS]
+    if unknown := set(sections) - set(known):
+        raise SystemExit(f"no such section: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    commit = commit_of(Path(__file__))
+    page = out / (commit + ("-quick" if quick else ""))
+    records = []
+    for section in SECTIONS:
+        if not sections or section.script in sections:
+            records.append((section, _measured(section, page / section.script, quick)))
+    before = previous or _newest_other(out, page)
+    print(f"written: {files.write(page / 'bench.md', _markdown(page, records, before))}")
+
+
+def _measured(section: Section, out: Path, quick: bool) -> dict[str, Any]:
+    """Figures and circumstances of a section, from its folder if it has been run."""
+    kept = out / "page.json"
+    if kept.exists():
+        return files.read_json(kept)
+    shutil.rmtree(out, ignore_errors=True)
+    arguments = section.quick if quick else section.arguments
+    print(f"{section.title}: {section.script}.py {' '.join(arguments)}", flush=True)
+    jitter = _jitter()
+    before, start = _processor_seconds(), time.monotonic()
+    run = subprocess.run(
+        [sys.executable, str(_HERE / f"{section.script}.py"), *arguments, "--out", str(out)], check=False
+    )
+    wall, after = time.monotonic() - start, _processor_seconds()
+    figures: list[Figure] = []
+    table = out / f"{section.table or section.script}.csv"
+    if run.returncode == 0:
+        with table.open(newline="") as lines:
+            figures = _figures(section, list(csv.DictReader(lines)))
+    others = max(0.0, (after[0] - before[0]) - (after[1] - before[1])) / (wall * (os.cpu_count() or 1))
+    record = {
+        "figures": [asdict(figure) for figure in figures],
+        "failed": run.returncode != 0,
+        "minutes": wall / 60,
+        "others": others,
+        "jitter": jitter,
+    }
+    if run.returncode == 0:
+        files.write(kept, json.dumps(record, indent=1) + "\n")
+    return record
+
+
+def _figures(section: Section, rows: Sequence[dict[str, str]]) -> list[Figure]:
+    found = []
+    for row in rows:
+        label = ", ".join(_short(row[key]) for key in section.keys)
+        for name, unit in section.figures.items():
+            value = float(row[name] or "nan")
+            if np.isfinite(value):
+                found.append(Figure(section.script, label, name, unit, value))
+    return found
+
+
+def _short(text: str) -> str:
+    """Without the digits of a float that say nothing."""
+    try:
+        return f"{float(text):g}"
+    except ValueError:
+        return text
+
+
+def _processor_seconds() -> tuple[float, float]:
+    """Seconds in which cores worked, for whomever, and those of them for the processes that this one waited for.
+
+    Without /proc there is no first; then both are the same, and nobody seems busy.
+    """
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    own = usage.ru_utime + usage.ru_stime
+    try:
+        user, nice, system, _, _, irq, softirq, steal = map(int, Path("/proc/stat").read_text().split()[1:9])
+    except OSError:
+        return own, own
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK"), own
+
+
+def _jitter() -> float:
+    """By how much the slowest tenth of equal loops exceeds their median, relative: the machine's noise."""
+    times = []
+    for _ in range(50):
+        start = time.perf_counter()
+        sum(i * i for i in range(100_000))
+        times.append(time.perf_counter() - start)
+    return float(np.percentile(times, 90)) / median(times) - 1
+
+
+def _newest_other(out: Path, page: Path) -> Path | None:
+    """The page that was written last, of another commit and of the same length."""
+    quick = page.name.endswith("-quick")
+    others = [p for p in out.glob("*/bench.md") if p.parent != page and p.parent.name.endswith("-quick") == quick]
+    return max(others, key=lambda path: path.stat().st_mtime, default=None)
+
+
+def _markdown(page: Path, records: Sequence[tuple[Section, dict[str, Any]]], before: Path | None) -> str:
+    facts = provenance()
+    lines = ["# Speed of this machine", ""]
+    lines += [f"Commit {page.name}, {facts['machine']}, Python {facts['python']}."]
+    lines += [
+        f"Ratios are to {before.parent.name}; above 1 is better." if before else "There is no page to compare with."
+    ]
+    lines += [
+        "*Noise* is how much longer the slowest tenth of equal short loops took than their median, before a benchmark began. "
+        f"*Others* is the share of the cores that other processes took meanwhile; above {_BUSY:.0%} a section is busy.",
+    ]
+    for section, record in records:
+        busy = " (busy machine)" if record["others"] > _BUSY else ""
+        lines += ["", f"## {section.title}{busy}", ""]
+        lines += [
+            f"`benchmarks/{section.script}.py`, {record['minutes']:.1f} min, noise {record['jitter']:.0%}, "
+            f"others {record['others']:.0%}."
+        ]
+        if record["failed"]:
+            lines += ["", "It failed; see what it printed."]
+            continue
+        old = _values(before, section) if before else {}
+        names = list(section.figures)
+        lines += ["", f"| {', '.join(section.keys)} | {' | '.join(f'{n} | ratio' for n in names)} |"]
+        lines += ["|" + "---|" * (1 + 2 * len(names))]
+        new = {(figure["row"], figure["name"]): figure["value"] for figure in record["figures"]}
+        for row in dict.fromkeys(figure["row"] for figure in record["figures"]):
+            cells = []
+            for name, unit in section.figures.items():
+                value, earlier = new.get((row, name)), old.get((row, name))
+                cells += ["–" if value is None else f"{_rounded(value)} {unit}", _ratio(value, earlier, unit)]
+            lines += [f"| {row} | {' | '.join(cells)} |"]
+        picture = f"{section.script}/{section.script}.png"
+        if (page / picture).exists():
+            lines += ["", f"![{section.title}]({picture})"]
+    return "\n".join(lines) + "\n"
+
+
+def _values(page: Path, section: Section) -> dict[tuple[str, str], float]:
+    """The figures of a section of another page, by row and name; none if it was not run."""
+    kept = page.parent / section.script / "page.json"
+    if not kept.exists():
+        return {}
+    return {(figure["row"], figure["name"]): figure["value"] for figure in files.read_json(kept)["figures"]}
+
+
+def _rounded(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _ratio(value: float | None, earlier: float | None, unit: str) -> str:
+    if not value or not earlier:
+        return "–"
+    return f"{value / earlier if '/s' in unit else earlier / value:.2f}"
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
