@@ -125,13 +125,15 @@ TUNED: dict[str, DaggerConfig] = {
         gathering_iterations=70,
         evaluations=10,
         episodes_per_iteration=8,
-        rollouts_per_plan=0,
+        rollouts_per_plan=1,
+        max_rollout_seconds=6.0,
         tracked_rollouts_per_plan=8,
         start_noise=1.0,
         tube_samples=3,
         label_seconds=6.0,
         gradient_steps=400,
-        backoff=Backoff(goal=0.5, force=0.02, grip=EXECUTED.grip),
+        symmetry="frame",
+        backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip),
     ),
     "orbit": DaggerConfig(
         total_iterations=80,
@@ -143,7 +145,8 @@ TUNED: dict[str, DaggerConfig] = {
         label_seconds=6.0,
         gradient_steps=400,
         hidden=(256, 256),
-        backoff=Backoff(force=0.1, grip=EXECUTED.grip),  # plans at the force limit leave no force for corrections
+        symmetry="frame",
+        backoff=Backoff(force=0.06, grip=EXECUTED.grip),  # plans at the force limit leave no force for corrections
     ),
     "weave": DaggerConfig(
         episodes_per_iteration=5,
