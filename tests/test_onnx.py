@@ -15,7 +15,7 @@ from ballbot_train.policy import SHIPPED, PolicyController, PolicyNetwork, Polic
 
 onnxruntime = pytest.importorskip("onnxruntime")
 
-CLOSE = 1e-6  # float32 sums of up to 256 terms in another order differ by 5e-7 at most, measured
+CLOSE = 5e-6  # of actions in [−1, 1], in float32: where a policy turns into a frame and back, rounding grows
 SHIPPED_NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
 
 
