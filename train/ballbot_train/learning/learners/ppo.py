@@ -21,6 +21,7 @@ from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, value_of_living
+from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
 from ballbot_train.policy import PolicyNetwork, PolicySpec
@@ -68,7 +69,15 @@ class PpoConfig(ModelFreeConfig):
 
 
 TUNED: dict[str, PpoConfig] = {
-    "stabilize": PpoConfig(symmetry="odd"),
+    "stabilize": PpoConfig(
+        symmetry="odd",
+        rl_iterations=560,
+        num_envs=256,
+        num_steps=64,
+        batch_size=1024,
+        gamma=0.998,
+        curriculum=Curriculum(short_episodes=0.5),
+    ),
     "orbit": PpoConfig(symmetry="frame"),
     "weave": PpoConfig(symmetry="mirrors", episode_seconds=8.0),
     "turn": PpoConfig(episode_seconds=8.0),
