@@ -2,7 +2,7 @@
 
 Each figure stands beside its ratio to that of the last page of another commit. A benchmark during which other processes took
 more than 5 % of the cores is marked as busy. What is done is not done again for the same commit, so an interrupted page
-goes on where it was.
+goes on where it was; with changes that are not committed everything is measured anew.
 """
 
 import csv
@@ -27,6 +27,7 @@ from ballbot_train.provenance import commit_of, provenance
 
 _HERE = Path(__file__).parent
 _BUSY = 0.05  # share of the cores that others took
+_MORE_IS_BETTER = {"steps/s", "times"}  # of other units, less is
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Section:
     keys: tuple[str, ...]
     """Columns that name a row."""
     figures: dict[str, str]
-    """Columns with figures, and their units. Of a unit per second more is better, of all others less."""
+    """Columns with figures, and their units."""
     arguments: tuple[str, ...] = ()
     quick: tuple[str, ...] = ()
     """In place of `arguments` for a quick page."""
@@ -68,7 +69,7 @@ SECTIONS = (
         "Optima at once",
         "batched_optima",
         ("solver",),
-        {"milliseconds": "ms", "speedup": "1/s, relative"},
+        {"milliseconds": "ms", "speedup": "times"},
         quick=("--episodes", "512", "--checked", "20"),
     ),
     Section(
@@ -130,18 +131,19 @@ def main(
         raise SystemExit(f"no such section: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     commit = commit_of(Path(__file__))
     page = out / (commit + ("-quick" if quick else ""))
+    again = commit == "none" or commit.endswith("-dirty")  # then the folder's name does not say what was measured
     records = []
     for section in SECTIONS:
         if not sections or section.script in sections:
-            records.append((section, _measured(section, page / section.script, quick)))
+            records.append((section, _measured(section, page / section.script, quick, again)))
     before = previous or _newest_other(out, page)
     print(f"written: {files.write(page / 'bench.md', _markdown(page, records, before))}")
 
 
-def _measured(section: Section, out: Path, quick: bool) -> dict[str, Any]:
-    """Figures and circumstances of a section, from its folder if it has been run."""
+def _measured(section: Section, out: Path, quick: bool, again: bool) -> dict[str, Any]:
+    """Figures and circumstances of a section, from its folder if it has been run and must not be again."""
     kept = out / "page.json"
-    if kept.exists():
+    if kept.exists() and not again:
         return files.read_json(kept)
     shutil.rmtree(out, ignore_errors=True)
     arguments = section.quick if quick else section.arguments
@@ -273,7 +275,7 @@ def _rounded(value: float) -> str:
 def _ratio(value: float | None, earlier: float | None, unit: str) -> str:
     if not value or not earlier:
         return "–"
-    return f"{value / earlier if '/s' in unit else earlier / value:.2f}"
+    return f"{value / earlier if unit in _MORE_IS_BETTER else earlier / value:.2f}"
 
 
 if __name__ == "__main__":

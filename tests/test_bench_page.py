@@ -72,6 +72,12 @@ def test_what_is_measured_is_not_measured_again_for_the_same_commit(page, monkey
     assert Path("ran").read_text() == "x"
 
 
+@pytest.mark.parametrize("commit", ["none", "aaaa-dirty"])
+def test_what_no_commit_names_is_measured_again(page, monkeypatch, commit):
+    written(page, monkeypatch, commit, 1)
+    assert "| walk, 0.5 | 1 s |" in written(page, monkeypatch, commit, 2)
+
+
 def test_a_benchmark_that_fails_is_named_and_runs_again_the_next_time(page, monkeypatch):
     monkeypatch.setenv("FAIL", "1")
     assert "It failed; see what it printed." in written(page, monkeypatch, "aaaa", 1)
@@ -89,7 +95,7 @@ def test_a_section_is_marked_where_others_took_much_of_the_cores(page, monkeypat
     monkeypatch.setenv("FAST", "1")
     monkeypatch.setattr(page.subprocess, "run", _written_at_once)
     (section,) = page.SECTIONS
-    record = page._measured(section, Path("bench/aaaa/fake"), quick=False)
+    record = page._measured(section, Path("bench/aaaa/fake"), quick=False, again=False)
     monkeypatch.undo()
     assert record["others"] == pytest.approx(others)
     text = page._markdown(Path("bench/aaaa"), [(section, record)], None)

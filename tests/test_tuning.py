@@ -29,7 +29,8 @@ def test_the_tuned_settings_lie_in_the_space_that_is_searched(learner, task):
 def test_a_training_has_the_env_steps_that_are_asked_for():
     search = Search("ppo", "stabilize", (0,), 500_000, 4)
     settings = settings_of(search, {"num_steps": 64})
-    assert settings.rl_iterations * settings.num_envs * 64 == pytest.approx(500_000, rel=0.01)
+    iteration = settings.num_envs * 64
+    assert settings.rl_iterations * iteration == pytest.approx(500_000, abs=iteration / 2)
     assert settings.evaluations == 4
 
 

@@ -88,8 +88,8 @@ class PolicyNetwork(torch.nn.Module):
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             features, back = self._frame.features(tuple(observation.tolist()))
-            forwards, sideways = self._sum(torch.tensor(features)).tolist()
-            return torch.tensor(back((forwards, sideways)))
+            forwards, sideways = self._sum(torch.tensor(features, dtype=observation.dtype)).tolist()
+            return torch.tensor(back((forwards, sideways)), dtype=observation.dtype)
         if self._frame is not None:
             features, back = self._frame.features(observation.unbind(-1))
             action = self._sum(torch.stack(features, -1))
