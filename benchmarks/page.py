@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -104,17 +104,6 @@ SECTIONS = (
 """What the page holds."""
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One figure of the page."""
-
-    section: str
-    row: str
-    name: str
-    unit: str
-    value: float
-
-
 def main(
     out: Path = Path("runs/bench"), sections: tuple[str, ...] = (), quick: bool = False, previous: Path | None = None
 ) -> None:
@@ -154,14 +143,14 @@ def _measured(section: Section, out: Path, quick: bool, again: bool) -> dict[str
         [sys.executable, str(_HERE / f"{section.script}.py"), *arguments, "--out", str(out)], check=False
     )
     wall, after = time.monotonic() - start, _processor_seconds()
-    figures: list[Figure] = []
+    figures: dict[str, dict[str, float]] = {}
     table = out / f"{section.table or section.script}.csv"
     if run.returncode == 0:
         with table.open(newline="") as lines:
             figures = _figures(section, list(csv.DictReader(lines)))
     others = max(0.0, (after[0] - before[0]) - (after[1] - before[1])) / (wall * (os.cpu_count() or 1))
     record = {
-        "figures": [asdict(figure) for figure in figures],
+        "figures": figures,
         "failed": run.returncode != 0,
         "minutes": wall / 60,
         "others": others,
@@ -172,15 +161,14 @@ def _measured(section: Section, out: Path, quick: bool, again: bool) -> dict[str
     return record
 
 
-def _figures(section: Section, rows: Sequence[dict[str, str]]) -> list[Figure]:
-    found = []
-    for row in rows:
-        label = ", ".join(_short(row[key]) for key in section.keys)
-        for name, unit in section.figures.items():
-            value = float(row[name] or "nan")
-            if np.isfinite(value):
-                found.append(Figure(section.script, label, name, unit, value))
-    return found
+def _figures(section: Section, rows: Sequence[dict[str, str]]) -> dict[str, dict[str, float]]:
+    """Figures by row and column; those that a row has not are left out."""
+    return {
+        ", ".join(_short(row[key]) for key in section.keys): {
+            name: float(row[name]) for name in section.figures if np.isfinite(float(row[name] or "nan"))
+        }
+        for row in rows
+    }
 
 
 def _short(text: str) -> str:
@@ -243,29 +231,21 @@ def _markdown(page: Path, records: Sequence[tuple[Section, dict[str, Any]]], bef
         if record["failed"]:
             lines += ["", "It failed; see what it printed."]
             continue
-        old = _values(before, section) if before else {}
+        kept = before.parent / section.script / "page.json" if before else None
+        old = files.read_json(kept)["figures"] if kept is not None and kept.exists() else {}
         names = list(section.figures)
         lines += ["", f"| {', '.join(section.keys)} | {' | '.join(f'{n} | ratio' for n in names)} |"]
         lines += ["|" + "---|" * (1 + 2 * len(names))]
-        new = {(figure["row"], figure["name"]): figure["value"] for figure in record["figures"]}
-        for row in dict.fromkeys(figure["row"] for figure in record["figures"]):
+        for row, figures in record["figures"].items():
             cells = []
             for name, unit in section.figures.items():
-                value, earlier = new.get((row, name)), old.get((row, name))
+                value, earlier = figures.get(name), old.get(row, {}).get(name)
                 cells += ["–" if value is None else f"{_rounded(value)} {unit}", _ratio(value, earlier, unit)]
             lines += [f"| {row} | {' | '.join(cells)} |"]
         picture = f"{section.script}/{section.script}.png"
         if (page / picture).exists():
             lines += ["", f"![{section.title}]({picture})"]
     return "\n".join(lines) + "\n"
-
-
-def _values(page: Path, section: Section) -> dict[tuple[str, str], float]:
-    """The figures of a section of another page, by row and name; none if it was not run."""
-    kept = page.parent / section.script / "page.json"
-    if not kept.exists():
-        return {}
-    return {(figure["row"], figure["name"]): figure["value"] for figure in files.read_json(kept)["figures"]}
 
 
 def _rounded(value: float) -> str:
