@@ -14,6 +14,7 @@ from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, value_of_living
 from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
+from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
 from ballbot_train.learning.learners.model_free import ScopedRng, TrainingEnv
 from ballbot_train.policy import load_network, save_policy
@@ -234,6 +235,46 @@ def test_the_actor_of_ppo_has_the_symmetry_of_its_task(task, symmetry):
 def test_ppo_refuses_a_symmetry_that_the_task_has_not():
     with pytest.raises(ValueError, match="BallbotTurn-v0 has no mirror images"):
         LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], symmetry="mirrors"), 0, None)
+
+
+@pytest.mark.parametrize("task", ["turn", "orbit", "weave"])
+def test_sac_sees_and_acts_in_the_frame_of_its_task(task):
+    settings = replace(TINY["sac"], symmetry=LEARNERS["sac"].settings(task).symmetry)
+    learner = LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None)
+    run(learner)
+    assert learner.network.spec.frame == make_task(task).frame
+    batch = learner._env.batch
+    seen = learner._env._seen(batch.observe(batch.state).numpy())
+    action, _ = learner._model.predict(seen, deterministic=True)
+    learner._env.step_async(action)
+    with torch.no_grad():
+        expected = learner.network(batch.observe(batch.state))
+    np.testing.assert_allclose(learner._env.venv._actions, expected, atol=1e-6)  # float32
+
+
+def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
+    task = make_task("orbit")
+    frame = FRAMES[task.frame]
+    observations = np.array([task.observe(*task.sample(rng, default_params())) for _ in range(20)], np.float32)
+    actions = rng.uniform(-1, 1, (2, 20, 2)).astype(np.float32)
+    flags, rewards = np.zeros(20, bool), np.zeros(20, np.float32)
+    framed = demos_in_frame(Demos(observations, actions[0], rewards, observations, flags, flags, actions[1]), frame)
+    assert framed.observations.shape == framed.next_observations.shape == (20, frame.size)
+    for given, turned in zip(actions, (framed.actions, framed.executed), strict=True):
+        for observation, action, there in zip(observations, given, turned, strict=True):
+            _, back = frame.features(tuple(observation))
+            np.testing.assert_allclose(np.tanh(back(tuple(np.arctanh(there)))), action, atol=2e-4)
+
+
+def test_sac_in_a_frame_goes_on_from_a_state_as_if_never_stopped():
+    def learner():
+        settings = replace(TINY["sac"], symmetry="frame")
+        return LEARNERS["sac"].make(make_task("orbit"), default_params(), settings, 0, None)
+
+    whole, begun = run(learner()), run(learner(), 1)
+    resumed = learner()
+    resumed.load_state_dict(through_a_file(begun.state_dict()))
+    assert torch.equal(parameters(run(resumed)), parameters(whole))
 
 
 def test_training_envs_never_end_together():

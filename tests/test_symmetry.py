@@ -115,7 +115,9 @@ def test_the_slalom_frame_forgets_obstacles_that_are_passed(params, rng):
             for each in (obstacles, shown)
         )
         np.testing.assert_array_equal(features, expected)
-        assert features[9] >= 0  # the next one is on the left
+        _, y, radius = shown[0]  # the next one, or the last; it is to the left of the goal's line
+        nearer_way = np.sign(y) * (y - np.sign(y) * (radius + 0.1) - state[1]) / 5
+        np.testing.assert_allclose(features[9], nearer_way if len(ahead) else 0.0, atol=1e-12)
 
 
 def test_the_gate_frame_shows_on_which_side_of_the_switch_between_two_ways_the_speed_is(params):

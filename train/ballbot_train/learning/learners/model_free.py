@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
+import gymnasium
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -15,10 +16,12 @@ from torch import nn
 from ballbot_gym.batch import BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
 from ballbot_train.learning.demonstrations import Demos
+from ballbot_train.learning.frames import axes_of, features_of, turned
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
@@ -72,7 +75,15 @@ class ModelFree(ABC):
     A resumed run does exactly what it would have done; only the success rate of the last hundred episodes starts anew.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, config: ModelFreeConfig, demos: Demos | None):
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        config: ModelFreeConfig,
+        demos: Demos | None,
+        frame: Frame | None = None,
+    ):
+        """Args: frame: in which the envs show observations and take actions; demos must be of it already."""
         self.iteration, self._settings, self._task, self._demos = 0, config, task, demos
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
@@ -89,6 +100,7 @@ class ModelFree(ABC):
             config.reward_scale,
             config.curriculum,
             config.gamma,
+            frame,
         )
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
@@ -199,6 +211,7 @@ class TrainingEnv(VecEnvWrapper):
         reward_scale: float,
         curriculum: Curriculum = Curriculum(),
         gamma: float = 1.0,
+        frame: Frame | None = None,
     ):
         """Makes the envs.
 
@@ -210,6 +223,7 @@ class TrainingEnv(VecEnvWrapper):
             reward_scale: factor of every reward.
             curriculum: what is easier at first.
             gamma: the learner's discount factor, for the curriculum's shaping.
+            frame: in which observations are shown and actions taken; default, the task's own.
 
         Raises:
             ValueError: the task has not what the curriculum asks for.
@@ -219,7 +233,9 @@ class TrainingEnv(VecEnvWrapper):
         self.batch = CurriculumBatch(shorter, num_envs, params, curriculum, gamma, full=task)
         self._vector.batch = self.batch
         self._scale = np.float32(reward_scale)
-        super().__init__(BallbotVecEnv(self._vector))
+        self._frame, self._axes = frame, np.zeros(0)
+        seen = None if frame is None else gymnasium.spaces.Box(-np.inf, np.inf, (frame.size,), np.float32)
+        super().__init__(BallbotVecEnv(self._vector), seen)
 
     def reset(self) -> np.ndarray:
         """Starts an episode in every env, with step counts that differ so that the episodes never end together."""
@@ -227,11 +243,19 @@ class TrainingEnv(VecEnvWrapper):
         assert batch.state is not None
         steps = torch.arange(self.num_envs) * self._vector.task.steps // self.num_envs
         batch.state = batch.state._replace(steps=steps)
-        return observation
+        return self._seen(observation)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        if self._frame is not None:
+            actions = turned(self._axes, actions)
+        self.venv.step_async(actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observation, reward, done, infos = self.venv.step_wait()
-        return cast(np.ndarray, observation), self._scale * reward, done, infos
+        if self._frame is not None:
+            for i in np.flatnonzero(done).tolist():
+                infos[i]["terminal_observation"] = features_of(self._frame, infos[i]["terminal_observation"])
+        return self._seen(cast(np.ndarray, observation)), self._scale * reward, done, infos
 
     def state_dict(self) -> dict[str, Any]:
         """State of every env: tensors and plain values."""
@@ -242,6 +266,14 @@ class TrainingEnv(VecEnvWrapper):
         """Goes back to a state."""
         self.batch.state = BatchState(**state["batch"])
         self.batch.load_curriculum_state(state["curriculum"])
+        self._seen(self.batch.observe(self.batch.state).numpy())
+
+    def _seen(self, observation: np.ndarray) -> np.ndarray:
+        """What the learner sees of observations (num_envs, no); notes where the frame's axes are."""
+        if self._frame is None:
+            return observation
+        self._axes = axes_of(self._frame, observation)
+        return features_of(self._frame, observation)
 
 
 class Imitation:

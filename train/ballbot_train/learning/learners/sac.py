@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import gymnasium
 import numpy as np
@@ -23,9 +23,12 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, value_of_living
 from ballbot_train.learning.demonstrations import Demos, load_demos
+from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
 from ballbot_train.policy import PolicyNetwork
 
@@ -44,6 +47,8 @@ class SacConfig(ModelFreeConfig):
     imitation_weight: float = 300.0
     gradient_steps: int = 4
     """Gradient steps after each control step of all envs."""
+    symmetry: Literal["none", "frame"] = "none"
+    """Whether actor and critics see the task's frame, and act in it."""
     num_critics: int = 2
     """Critics, whose smallest value counts."""
     learning_rate: float = 5e-4
@@ -64,7 +69,11 @@ class SacConfig(ModelFreeConfig):
     """In place of `std` if there are demonstrations."""
 
 
-TUNED: dict[str, SacConfig] = {"turn": SacConfig(episode_seconds=8.0), "weave": SacConfig(episode_seconds=8.0)}
+TUNED: dict[str, SacConfig] = {
+    "orbit": SacConfig(symmetry="frame"),
+    "turn": SacConfig(episode_seconds=8.0, symmetry="frame"),
+    "weave": SacConfig(episode_seconds=8.0, symmetry="frame"),
+}
 """Settings by name of task; every other task takes the defaults."""
 
 
@@ -154,8 +163,16 @@ class Sac(ModelFree):
     """The learner; see `training.Learner`."""
 
     def __init__(self, task: Task, params: BallbotParams, config: SacConfig, seed: int = 0, demos: Demos | None = None):
-        """Args: demos: demonstrations to learn from as well, or None."""
-        super().__init__(task, params, config, demos)
+        """Takes demonstrations to learn from as well, or None.
+
+        Raises:
+            ValueError: the task has no frame, and the settings ask for it.
+        """
+        self._spec = spec_for(task, config.symmetry, config.hidden)
+        frame = None if self._spec.frame is None else FRAMES[self._spec.frame]
+        if demos is not None and frame is not None:
+            demos = demos_in_frame(demos, frame)
+        super().__init__(task, params, config, demos, frame)
         self.config = config
         rate = config.learning_rate
         value = value_of_living(task, config.reward_scale, config.gamma)
@@ -196,7 +213,7 @@ class Sac(ModelFree):
 
     @property
     def network(self) -> PolicyNetwork:
-        return as_policy(self._actor.children(), self._task, activation="silu", squash="tanh")
+        return as_policy(self._actor.children(), self._task, activation="silu", squash="tanh", frame=self._spec.frame)
 
     def state_dict(self) -> dict[str, Any]:
         own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}

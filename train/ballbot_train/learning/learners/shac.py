@@ -23,6 +23,7 @@ from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import FRAMES, Frame
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, spec_for
 from ballbot_train.learning.fitting import start_as_lqr
@@ -117,12 +118,16 @@ class _Record(NamedTuple):
 
 
 class Critic(torch.nn.Module):
-    """Expected cost from observations (B, no), (B,); on a task that ends at rest a multiple of LQR's cost."""
+    """Expected cost from observations (B, no), (B,); on a task that ends at rest a multiple of LQR's cost.
 
-    def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...]):
+    Where the policy sees the task's frame, the critic does too.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...], frame: Frame | None = None):
         super().__init__()
+        self._frame = frame
         layers: list[torch.nn.Module] = []
-        size = len(task.observation_scale)
+        size = len(task.observation_scale) if frame is None else frame.size
         for width in hidden:
             layers += [torch.nn.Linear(size, width), torch.nn.Tanh()]
             size = width
@@ -139,7 +144,11 @@ class Critic(torch.nn.Module):
         if self.p is not None:
             error = observation[..., :8]
             scale = ((error @ self.p) * error).sum(-1) + 1e-3
-        return torch.nn.functional.softplus(self.mlp(observation)[..., 0] + _SOFTPLUS_ONE) * scale
+        seen = observation
+        if self._frame is not None:
+            features, _ = self._frame.features(observation.unbind(-1))
+            seen = torch.stack(features, -1)
+        return torch.nn.functional.softplus(self.mlp(seen)[..., 0] + _SOFTPLUS_ONE) * scale
 
 
 class Shac:
@@ -153,8 +162,9 @@ class Shac:
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
         self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
         start_as_lqr(self._network, task, params)
-        self.critic = Critic(task, params, config.hidden)
-        self.target = Critic(task, params, config.hidden)
+        frame = FRAMES[task.frame] if config.symmetry == "frame" and task.frame else None
+        self.critic = Critic(task, params, config.hidden, frame)
+        self.target = Critic(task, params, config.hidden, frame)
         self.target.load_state_dict(self.critic.state_dict())
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), config.learning_rate, betas=(0.7, 0.95))
