@@ -52,6 +52,19 @@ def test_the_optimal_choice_is_predicted_among_the_best(slaloms, params):
     assert np.median(excess) < 0.1
 
 
+def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
+    task, known = Weave(), certified.load("weave")
+    doubt = []
+    for i in range(12):
+        x0, c = known.states[i], known.constants[i]
+        free = find_optimum(task, params, x0, task.without_obstacles(c), guesses=1)
+        assert free.cost < known.costs[i]
+        found = sides.predict(task, params, x0, c, free.trajectory.x[:, :2], task.passed_obstacles(c))
+        optimal = (found.sides == sides_passed(known.trajectories[i].x[:, :2], c)).all(1)
+        doubt.append((found.costs[optimal][0] - found.costs.min()) / known.costs[i])
+    assert max(doubt) < 0.005
+
+
 @pytest.mark.slow
 def test_likely_choices_hold_the_best_of_all_choices(params):
     task = Weave()

@@ -179,6 +179,10 @@ class Task(ABC):
         """
         return None
 
+    def without_obstacles(self, c: np.ndarray) -> np.ndarray:
+        """(nc,) constants of the same episode with those obstacles out of its way."""
+        return c
+
     @abstractmethod
     def observe(self, x: Vector, c: Vector) -> Vector:
         """Observation (..., no), each quantity divided by its `observation_scale`; no running statistics."""

@@ -198,6 +198,11 @@ class Weave(Task):
         _, obstacles = split_constants(c)
         return obstacles + [0.0, 0.0, self.ball_radius]
 
+    def without_obstacles(self, c: np.ndarray) -> np.ndarray:
+        far = c.copy()
+        far[3::3] = c[1] + 4 * self.arena_radius
+        return far
+
     def side_path(self, x: np.ndarray, goal: np.ndarray, obstacles: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
         """From rest to rest, passing obstacle i on the left where sides[i] = 1, on the right where it is −1."""
         clearance = obstacles[:, 2] + self.ball_radius + 0.1

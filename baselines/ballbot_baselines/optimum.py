@@ -24,6 +24,7 @@ from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver, spent
 from ballbot_gym import dynamics
 from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.paths import cubic, then_stay
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -42,7 +43,9 @@ _NEAR_BARRIER = 1e-3  # near a solution of nearly the same problem: about half t
 _COARSE = 2  # control steps per interval when several guesses are compared
 _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
-_SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
+_SIDE_DOUBT = 0.005  # relative: choices of sides that are predicted to cost more than the best by more are not solved
+_GRID_DOUBT = 0.002  # relative: how differently the coarse grid may order choices of sides; 0.0007 was measured
+_STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
 _Start = tuple[int, np.ndarray, np.ndarray]  # index of a path, states (n+1, 8) and actions (n, 2) to start from
@@ -138,7 +141,7 @@ def find_optimum(
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     own_paths = paths is None
     paths = task.guess_paths(x0, c, params) if paths is None else paths
-    likely = own_paths and 1 < guesses < len(paths) and task.steps % _COARSE == 0
+    likely = own_paths and 1 < guesses < ALL_GUESSES and task.steps % _COARSE == 0
     obstacles = task.passed_obstacles(c) if likely else None
     paths = paths if obstacles is not None else paths[: guesses if own_paths else None]
     started, before = time.perf_counter(), (spent.solving, spent.setup)
@@ -428,47 +431,45 @@ def _solve_likely_sides(
 ) -> list[tuple[int, OcpSolution]]:
     """As `_solve_fixed_time`, but of all choices of sides only those are solved that are predicted to be the best, or nearly.
 
-    Every solution predicts all other choices. The search ends when no choice is left that is predicted to contend.
+    The motion without obstacles comes first: it takes few iterations, and it predicts what every choice costs, and how the
+    robot then moves. Each search starts from that predicted motion, and from the choice's guessed path if that fails.
     """
-    solver, quick = (
-        _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, iterations)
-        for iterations in (_MOST_ITERATIONS, _QUICK_ITERATIONS)
+    far, near = (
+        _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, _QUICK_ITERATIONS, barrier)
+        for barrier in (_BARRIER, _NEAR_BARRIER)
     )
-    starts = _starts(task, params, x0, paths)
-    chosen = [_side_choice(path, obstacles) for path in paths]
-    solved: dict[int, OcpSolution] = {}
-    unsolved = list(range(len(paths)))
-    predicted = np.zeros(len(paths))
-    along, predicted_y = np.zeros(0), np.zeros((0, 0))
-    while unsolved and len(solved) < most:
-        likeliest = min(unsolved, key=lambda i: predicted[i])
-        found = [s for s in solved.values() if is_feasible(s)]
-        best = min(found, key=lambda s: s.cost, default=None)
-        if best is not None and predicted[likeliest] > best.cost * (1 + _SIDE_DOUBT):
+
+    def solved_from(path: np.ndarray, c: np.ndarray, solver: OcpSolver) -> OcpSolution:
+        x, u = guess.along_path(params, path, task.control_dt, start=x0)
+        return _solve_with(solver, params, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
+
+    free = solved_from(_straight(task, params, x0, c), task.without_obstacles(c), near)
+    if not is_feasible(free):
+        return _solve_fixed_time(task, params, x0, c, backoff, paths[:most])
+    along = guess.resampled(free.states[:, :2], task.steps)
+    prediction = sides.predict(task, params, x0, c, along, obstacles)
+    rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
+    row_of = [rows[_side_choice(path, obstacles)] for path in paths]
+    predicted = free.cost + prediction.costs[row_of]
+    solved: list[tuple[int, OcpSolution]] = []
+    for i in np.argsort(predicted, kind="stable")[:most].tolist():
+        if solved and predicted[i] > predicted[solved[0][0]] * (1 + _SIDE_DOUBT):
             break
-        unsolved.remove(likeliest)
-        solution = solved.get(likeliest)
-        if solution is None:
-            _, x, a = starts[likeliest]
-            first = solver if best is None else quick
-            solution = _solve_with(first, params, x[::_COARSE], a[::_COARSE], c, backoff)
-        if best is not None and not is_feasible(solution):  # the path from rest to rest is far from this choice's
-            path = np.column_stack([along, predicted_y[likeliest]])
-            x, u = guess.along_path(params, path, task.control_dt, start=x0)
-            solution = _solve_with(quick, params, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
-        if best is None and is_feasible(solution):
-            unsolved += solved  # those that failed before there was a prediction, whose path is another start
-        solved[likeliest] = solution
-        if is_feasible(solution) and (best is None or solution.cost < best.cost):
-            path = guess.resampled(solution.states[:, :2], task.steps)
-            prediction = sides.predict(task, params, x0, c, path, obstacles)
-            rows = {tuple(side): k for k, side in enumerate(prediction.sides.tolist())}
-            order = [rows[side] for side in chosen]
-            here = prediction.costs[rows[sides.passed(path, obstacles)]]
-            predicted = solution.cost + prediction.costs[order] - here
-            along, predicted_y = path[:, 0], prediction.y[order]
-    fine = _refined(task, [(i, s) for i, s in solved.items() if is_feasible(s)])
-    return _solve_all(task, params, c, backoff, fine, starts[:most])
+        motion = np.column_stack([along[:, 0], prediction.y[row_of[i]]])
+        for start, solver in ((motion, near), (motion, far), (paths[i], far)):
+            solution = solved_from(start, c, solver)
+            if is_feasible(solution):
+                solved.append((i, solution))
+                break
+    fine = _refined(task, solved, _GRID_DOUBT)
+    return _solve_all(task, params, c, backoff, fine, fine or _starts(task, params, x0, paths[:most]))
+
+
+def _straight(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(steps+1, 2) m, from the position and velocity of x0 to rest where the task's reference ends."""
+    goal = task.reference(x0, c, params).x[-1, :2]
+    steps = min(task.steps, round(_STRAIGHT_SECONDS / task.control_dt))
+    return then_stay(cubic(x0[:2], x0[4:6], goal, np.zeros(2), steps, task.control_dt), task.steps)
 
 
 def _side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
@@ -496,20 +497,20 @@ def _contenders(
     return _refined(task, solved)
 
 
-def _refined(task: Task, solved: list[tuple[int, OcpSolution]]) -> list[_Start]:
-    """Starts at the coarse solutions within `_BASIN_DOUBT` of the best."""
+def _refined(task: Task, solved: list[tuple[int, OcpSolution]], doubt: float = _BASIN_DOUBT) -> list[_Start]:
+    """Starts at the coarse solutions within a relative `doubt` of the best."""
     fine = []
-    for index, solution in _distinct(solved):
+    for index, solution in _distinct(solved, doubt):
         x = guess.resampled(solution.states, task.steps)
         fine.append((index, x, np.repeat(solution.inputs, _COARSE, axis=0)))
     return fine
 
 
-def _distinct(solved: list[tuple[int, OcpSolution]]) -> list[tuple[int, OcpSolution]]:
-    """The feasible solutions within `_BASIN_DOUBT` of the best, sorted by cost, without repetitions."""
+def _distinct(solved: list[tuple[int, OcpSolution]], doubt: float = _BASIN_DOUBT) -> list[tuple[int, OcpSolution]]:
+    """The feasible solutions within a relative `doubt` of the best, sorted by cost, without repetitions."""
     kept: list[tuple[int, OcpSolution]] = []
     for index, solution in sorted(solved, key=lambda pair: pair[1].cost):
-        contends = not kept or solution.cost < kept[0][1].cost * (1 + _BASIN_DOUBT)
+        contends = not kept or solution.cost < kept[0][1].cost * (1 + doubt)
         if contends and not any(math.isclose(solution.cost, k.cost, rel_tol=1e-5) for _, k in kept):
             kept.append((index, solution))
     return kept

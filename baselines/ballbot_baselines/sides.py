@@ -1,16 +1,17 @@
 """What every choice of sides in a slalom will cost, predicted without solving it.
 
 Across the way, the robot is nearly linear and moves nearly on its own: the sides hardly change how it moves along the way. So
-the times at which it passes the obstacles are taken from one solution, and the rest is a small quadratic program: the linear
-motion across the way of least cost that clears every obstacle on its side at that time.
+the times at which it passes the obstacles are taken from one solution, such as that of the slalom without its obstacles. The
+rest is a small quadratic program: the linear motion across the way of least cost that clears every obstacle on its side at
+that time.
 
 Without obstacles the optimal force is LQR's, u = −K y. Forces v added to it cost Σ s·v², with s = R + BᵀPB, and move the
 position by the impulse response g of the closed loop. So the cheapest way to move by d at the times t costs dᵀ k(t, t)⁻¹ d,
 with the kernel k(t, t') = Σ_r g(t − r) g(t' − r) / s. The program over d is solved for all choices at once, active set by
 active set.
 
-The prediction is no bound. Measured on 8 slaloms: where it says that a choice costs Δ more than the best, it costs between
-0.2 and 1.05 Δ more, and the best choice is predicted at most 0.6 above the least.
+The prediction is no bound. Measured on 290 drawn slaloms, all of whose choices were solved: from the motion without
+obstacles, the best choice is predicted first in 97.6 % of them, and else within 0.5 % of the first.
 """
 
 import itertools
