@@ -163,12 +163,25 @@ def test_tracked_rollouts_are_labelled_by_feedback_about_the_plan_and_only_near_
     over[-1] = True
     monkeypatch.setattr(learner, "_roll", lambda x, c, steps: (met, over, np.zeros(2, bool)))
     gains = dagger.tube_gains(task, params, plan, c)
-    learner._track([(plan, c)], [gains], rng)
+    learner._track([(plan, c, Backoff())], [gains], rng)
     samples = learner._samples
     assert len(samples) == len(plan.trajectory.u)  # none of the rollout that is 100 m/s off
     expected = plan.trajectory.u / params.force_limit
     expected[2] -= gains[2] @ off / params.force_limit
     np.testing.assert_allclose(samples.actions.numpy(), np.clip(expected, -1, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(("speed", "whole"), [(2.0, True), (4.3, False)])
+def test_a_backoff_with_a_price_is_kept_as_far_as_it_is_worth_it(speed, whole):
+    task, params, backoff, c = make_task("turn"), default_params(), Backoff(goal=0.25, force=0.02), np.array([speed])
+    x = np.array(task.draw_state((), tuple(c), params))
+    config = replace(TINY_DAGGER, backoff=backoff, backoff_price=0.04, max_guesses=5)
+    found, kept = dagger.Dagger(task, params, config)._plan(x, c)
+    best, dear = (find_optimum(task, params, x, c, reserve).cost for reserve in (Backoff(), backoff))
+    assert (kept == backoff) == whole == (dear <= 1.04 * best)
+    assert found.cost == pytest.approx(find_optimum(task, params, x, c, kept).cost)
+    assert best < found.cost <= 1.04 * best
+    assert whole or found.cost > 1.02 * best  # no less than need be
 
 
 def test_thousands_of_optima_at_once_give_the_labels_that_optima_one_by_one_give():

@@ -459,3 +459,9 @@ def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(p
     with pytest.raises(PlanError):
         find_optimum(Stabilize(), params, x0, [], reserve)
     assert plan_to_track(Stabilize(), params, x0, [], reserve).is_optimal
+
+
+def test_a_share_of_a_backoff_is_no_less_than_the_default():
+    half, none = Backoff(margin=0.04, goal=0.2).times(0.5), Backoff(margin=0.04, goal=0.2, force=0.0).times(0.0)
+    assert half == Backoff(margin=0.02, goal=0.1)
+    assert none == Backoff(force=0.0)

@@ -12,7 +12,7 @@ optimum if one of the guesses leads there.
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -110,6 +110,11 @@ class Backoff:
             if not 0 <= value < below:
                 raise ValueError(f"Backoff: {name} must be at least 0 and below {below:g}, not {value}")
 
+    def times(self, share: float) -> "Backoff":
+        """A share of it; fields that are more than the defaults stay so."""
+        least = asdict(Backoff())
+        return Backoff(**{name: min(value, max(share * value, least[name])) for name, value in asdict(self).items()})
+
 
 def find_optimum(
     task: Task,
@@ -188,15 +193,8 @@ def plan_to_track(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarr
     Raises:
         PlanError: no try came to a feasible episode.
     """
-    least = Backoff()
-    tries = [
-        replace(
-            backoff,
-            force=min(backoff.force, max(share * backoff.force, least.force)),
-            grip=min(backoff.grip, max(share * backoff.grip, least.grip)) if params.grips else backoff.grip,
-        )
-        for share in _RESERVES
-    ]
+    parts = [backoff.times(share) for share in _RESERVES]
+    tries = [replace(backoff, force=part.force, grip=part.grip if params.grips else backoff.grip) for part in parts]
     *more, last = dict.fromkeys(tries)
     for reserve in more:
         try:

@@ -17,11 +17,12 @@ the beginnings of episodes, half from states that the learner reaches from there
 states around them are labelled too.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,7 +48,16 @@ _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3])  # standard devia
 _ACTIVE = 0.05  # a goal function this close to the greatest one still limits the optimum
 _SMALL = 0.3  # of the force limit
 _DEAR_AMONG = 16  # episodes that are drawn for each of the dearest
+_BISECTIONS = 6  # of the share of a back-off that has a price
 _MIN_STEPS = 2  # plans with fewer remaining control steps are not used as a guess
+
+
+class _Plan(NamedTuple):
+    """An episode: its optimum, its constants (nc,), and what the optimum keeps from its limits."""
+
+    optimum: Optimum
+    c: np.ndarray
+    backoff: Backoff
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,9 @@ class DaggerConfig:
     """Length of an optimum's part that becomes samples, s; after it the robot rests."""
     backoff: Backoff = Backoff(grip=EXECUTED.grip)
     """What optima keep from their limits, so that the learner's errors do not violate them."""
+    backoff_price: float = 0.0
+    """Greatest share by which the back-off may make an episode dearer than its optimum. Where it would be more, a smaller
+    part of the back-off is kept. 0: all of it is kept, at any price."""
     gradient_steps: int = 150
     """Gradient steps per iteration."""
     batch_size: int = 1024
@@ -213,15 +226,16 @@ class Dagger:
         if self.config.batch_episodes:
             return self._gather_batch(rng)
         plans = self._planned(rng)
-        gains = [tube_gains(self._task, self._params, plan, c) for plan, c in plans]
-        for (plan, c), k in zip(plans, gains, strict=True):
+        gains = [tube_gains(self._task, self._params, plan, c) for plan, c, _ in plans]
+        for (plan, c, _), k in zip(plans, gains, strict=True):
             self._samples.add(self._labelled(plan, k, c, plan.cost, rng))
         if self.config.tracked_rollouts_per_plan and plans:
             self._track(plans, gains, rng)
         starts = [episode for episode in plans for _ in range(self.config.rollouts_per_plan)]
         labelled = 0
-        for (plan, c), (x, elapsed) in zip(starts, self._explore(starts, rng) if starts else (), strict=True):
-            found = self._optimum(x, c, plan.trajectory.x[elapsed:, :2])
+        explored = self._explore(starts, rng) if starts else ()
+        for (plan, c, backoff), (x, elapsed) in zip(starts, explored, strict=True):
+            found = self._optimum(x, c, backoff, plan.trajectory.x[elapsed:, :2])
             if found is not None:
                 labelled += 1
                 k = tube_gains(self._task, self._params, found, c)
@@ -290,8 +304,8 @@ class Dagger:
         small = np.abs(change).max(-1) < _SMALL * self._params.force_limit
         return (x + off)[small], (u + change)[small], np.nonzero(small)[1]
 
-    def _planned(self, rng: np.random.Generator) -> list[tuple[Optimum, np.ndarray]]:
-        """Draws episodes, up to half of them ones that the learner fails; returns their optima and constants (nc,)."""
+    def _planned(self, rng: np.random.Generator) -> list[_Plan]:
+        """Draws episodes, up to half of them ones that the learner fails, and plans them."""
         config = self.config
         drawn = [
             self._task.sample(rng, self._params)
@@ -307,26 +321,49 @@ class Dagger:
         for x, c in drawn:
             if len(plans) < config.episodes_per_iteration:
                 with suppress(PlanError):
-                    found = find_optimum(self._task, self._params, x, c, config.backoff, config.max_guesses)
-                    plans += [(found, c)] if found.is_optimal else []
+                    found, backoff = self._plan(x, c)
+                    plans += [_Plan(found, c, backoff)] if found.is_optimal else []
         return plans
+
+    def _plan(self, x: np.ndarray, c: np.ndarray) -> tuple[Optimum, Backoff]:
+        """The optimum of an episode from state x (8,), and the part of the back-off that it keeps.
+
+        Raises:
+            PlanError: there is none.
+        """
+        config = self.config
+        find = functools.partial(find_optimum, self._task, self._params, x, c, guesses=config.max_guesses)
+        if not config.backoff_price:
+            return find(config.backoff), config.backoff
+        most = (1 + config.backoff_price) * find().cost
+        low, high = 0.0, 2.0  # shares of the back-off; the first to be tried is all of it
+        for _ in range(_BISECTIONS):
+            share = (low + high) / 2
+            affordable = False
+            with suppress(PlanError):
+                affordable = find(config.backoff.times(share)).cost <= most
+            low, high = (share, high) if affordable else (low, share)
+            if low == 1.0:
+                break
+        backoff = config.backoff.times(low)
+        return find(backoff), backoff
 
     def _track(
         self,
-        plans: Sequence[tuple[Optimum, np.ndarray]],
+        plans: Sequence[_Plan],
         gains: Sequence[np.ndarray],
         rng: np.random.Generator,
     ) -> None:
         """Rolls the learner out along plans; TVLQR at the nearest point of the plan labels each state."""
         config = self.config
         tracked = [episode for episode in plans for _ in range(config.tracked_rollouts_per_plan)]
-        x = np.array([plan.trajectory.x[0] for plan, _ in tracked])
+        x = np.array([plan.trajectory.x[0] for plan, *_ in tracked])
         x += config.start_noise * _SPREAD * rng.standard_normal(x.shape)
         steps = min(
-            max(len(plan.trajectory.u) for plan, _ in plans), round(config.label_seconds / self._task.control_dt)
+            max(len(plan.trajectory.u) for plan, *_ in plans), round(config.label_seconds / self._task.control_dt)
         )
-        history, over, _ = self._roll(x, np.array([c for _, c in tracked]), steps)
-        for i, (plan, c) in enumerate(tracked):
+        history, over, _ = self._roll(x, np.array([c for _, c, _ in tracked]), steps)
+        for i, (plan, c, _) in enumerate(tracked):
             met = history[:, i][~over[:, i]]
             distance, nearest = map(np.asarray, KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD))
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
@@ -334,21 +371,19 @@ class Dagger:
             forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", k[nearest], off)
             self._samples.add(self._samples_of(met, forces, np.broadcast_to(c, (len(met), len(c))), plan.cost))
 
-    def _optimum(self, x: np.ndarray, c: np.ndarray, path: np.ndarray) -> Optimum | None:
+    def _optimum(self, x: np.ndarray, c: np.ndarray, backoff: Backoff, path: np.ndarray) -> Optimum | None:
         """The optimum from state x (8,), or None; guessed from a ground path (n, 2), or by the task if that is too short."""
         task = self._task
         paths = None
         if len(path) > _MIN_STEPS:
             paths = [path if task.first_exit else then_stay(path, task.steps)]
         try:
-            found = find_optimum(task, self._params, x, c, self.config.backoff, self.config.max_guesses, paths)
+            found = find_optimum(task, self._params, x, c, backoff, self.config.max_guesses, paths)
         except PlanError:
             return None
         return found if found.is_optimal else None
 
-    def _explore(
-        self, plans: Sequence[tuple[Optimum, np.ndarray]], rng: np.random.Generator
-    ) -> list[tuple[np.ndarray, int]]:
+    def _explore(self, plans: Sequence[_Plan], rng: np.random.Generator) -> list[tuple[np.ndarray, int]]:
         """Rolls the learner out once from each plan.
 
         Returns:
@@ -359,14 +394,15 @@ class Dagger:
         longest = max(1, round(self._share * config.max_rollout_seconds / dt))
         on_plan = rng.random(len(plans)) < config.beta * (1 - 0.8 * self._share)
         starts = [
-            int(rng.integers(len(plan.trajectory.u))) if on else 0 for (plan, _), on in zip(plans, on_plan, strict=True)
+            int(rng.integers(len(plan.trajectory.u))) if on else 0
+            for (plan, *_), on in zip(plans, on_plan, strict=True)
         ]
         steps = rng.integers(1, longest + 1, len(plans))
-        x = np.array([plan.trajectory.x[start] for (plan, _), start in zip(plans, starts, strict=True)])
+        x = np.array([plan.trajectory.x[start] for (plan, *_), start in zip(plans, starts, strict=True)])
         x += config.start_noise * _SPREAD * rng.standard_normal(x.shape)
-        history, over, _ = self._roll(x, np.array([c for _, c in plans]), longest)
+        history, over, _ = self._roll(x, np.array([c for _, c, _ in plans]), longest)
         reached = []
-        for i, (plan, _) in enumerate(plans):
+        for i, (plan, *_) in enumerate(plans):
             # the states before a failure teach most, so any of them may be chosen
             lasted = int(np.argmax(over[:, i])) if over[-1, i] else longest + 1
             k = int(steps[i]) if steps[i] < lasted else int(rng.integers(lasted))
