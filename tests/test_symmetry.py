@@ -157,6 +157,17 @@ def test_policies_that_are_fitted_or_follow_gradients_have_the_symmetry_that_is_
         assert network.spec.squash == "tanh"
 
 
+def test_where_the_policy_sees_the_frame_the_critic_of_shac_does_too(params, rng):
+    task = TASKS["weave"]()
+    critic = Shac(task, params, ShacConfig(num_envs=2, hidden=(8,), symmetry="frame", compile=False)).critic
+    torch.nn.init.normal_(critic.mlp[-1].weight)  # it starts at zero
+    seen = torch.tensor(np.array([task.observe(*task.sample(rng, params)) for _ in range(20)]), dtype=torch.float32)
+    signs = torch.tensor(task.observation_signs(task.mirrors[0]))
+    value, image = critic(seen), critic(signs * seen)
+    torch.testing.assert_close(image, value)
+    assert value.std() > 0
+
+
 @pytest.mark.parametrize("fields", [{"mirrors": True}, {"frame": "radial"}])
 def test_a_policy_file_keeps_frame_and_mirror_images(fields, tmp_path, rng):
     task = TASKS["orbit"]()
