@@ -62,7 +62,7 @@ def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
         found = sides.predict(task, params, x0, c, free.trajectory.x[:, :2], task.passed_obstacles(c))
         optimal = (found.sides == sides_passed(known.trajectories[i].x[:, :2], c)).all(1)
         doubt.append((found.costs[optimal][0] - found.costs.min()) / known.costs[i])
-    assert max(doubt) < 0.005
+    assert max(doubt) < 0.01
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ position by the impulse response g of the closed loop. So the cheapest way to mo
 with the kernel k(t, t') = Σ_r g(t − r) g(t' − r) / s. The program over d is solved for all choices at once, active set by
 active set.
 
-The prediction is no bound. Measured on 290 drawn slaloms, all of whose choices were solved: from the motion without
-obstacles, the best choice is predicted first in 97.6 % of them, and else within 0.5 % of the first.
+The prediction is no bound. Measured on 350 drawn slaloms, all of whose choices were solved: from the motion without
+obstacles, the best choice, or one that costs at most 0.1 % more, is predicted within 0.7 % of the first.
 """
 
 import itertools

@@ -162,10 +162,19 @@ TUNED: dict[str, DaggerConfig] = {
         backoff=Backoff(force=0.06, grip=EXECUTED.grip),  # plans at the force limit leave no force for corrections
     ),
     "weave": DaggerConfig(
-        episodes_per_iteration=5,
+        total_iterations=180,
+        gathering_iterations=140,
+        evaluations=9,
+        episodes_per_iteration=6,
         max_guesses=3,
+        tracked_rollouts_per_plan=4,
+        max_rollout_seconds=3.0,
+        tube_samples=2,
         label_seconds=5.0,
-        backoff=Backoff(margin=0.05, force=0.02, grip=EXECUTED.grip),
+        gradient_steps=300,
+        hidden=(256, 256),
+        symmetry="frame",
+        backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip),
     ),
 }
 """Settings by name of task; every other task takes the defaults."""

@@ -93,10 +93,10 @@ TUNED: dict[str, ShacConfig] = {
     "turn": ShacConfig(exit_softness=0.3),
     "orbit": ShacConfig(gamma=0.998),
     "weave": ShacConfig(
-        total_iterations=10_000,
-        evaluations=25,
+        evaluations=20,
         reset_fraction=0.25,
         hidden=(256, 256),
+        symmetry="frame",
         margin_clearance=0.1,
         margin_penalty=3000.0,
     ),
