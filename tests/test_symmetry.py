@@ -109,16 +109,14 @@ def test_the_slalom_frame_forgets_obstacles_that_are_passed(params, rng):
     for x0 in np.linspace(0, 9, 50):
         state = np.array([x0, rng.uniform(-1, 1), *rng.normal(scale=0.2, size=6)])
         ahead = obstacles[obstacles[:, 0] + obstacles[:, 2] + 0.1 >= x0]
-        passed = obstacles[: 5 - len(ahead)][-1:]  # one of those, so that the next is not the first
-        shown = np.concatenate([passed, ahead, np.repeat(obstacles[-1:], 5 - len(passed) - len(ahead), axis=0)])
+        shown = np.concatenate([ahead, np.repeat(obstacles[-1:], 5 - len(ahead), axis=0)])
         features, expected = (
             FRAMES[task.frame].features(tuple(task.observe(state, np.concatenate([c[:2], each.ravel()]))))[0]
             for each in (obstacles, shown)
         )
         np.testing.assert_array_equal(features, expected)
-        _, y, radius = ahead[0] if len(ahead) else obstacles[-1]
-        side = np.sign(y - (state[1] if len(ahead) == 5 else 0.0))  # of the ball at first, then of the goal's line
-        nearer_way = side * (y - side * (radius + 0.1) - state[1]) / 5
+        _, y, radius = shown[0]  # the next one, or the last; it is to the left of the goal's line
+        nearer_way = np.sign(y) * (y - np.sign(y) * (radius + 0.1) - state[1]) / 5
         np.testing.assert_allclose(features[9], nearer_way if len(ahead) else 0.0, atol=1e-12)
 
 

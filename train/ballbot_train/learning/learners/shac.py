@@ -93,7 +93,8 @@ TUNED: dict[str, ShacConfig] = {
     "turn": ShacConfig(exit_softness=0.3),
     "orbit": ShacConfig(gamma=0.998),
     "weave": ShacConfig(
-        evaluations=20,
+        total_iterations=6000,
+        evaluations=30,
         reset_fraction=0.25,
         hidden=(256, 256),
         symmetry="frame",
