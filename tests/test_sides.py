@@ -65,6 +65,15 @@ def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
     assert max(doubt) < 0.01
 
 
+def test_the_search_from_every_choice_finds_what_the_likely_ones_lead_to(params):
+    """From rest to rest the solver comes to a worse optimum on the best sides of this certified episode."""
+    task, known = Weave(), certified.load("weave")
+    x0, c = known.states[12], known.constants[12]
+    likely, all_choices = (find_optimum(task, params, x0, c, guesses=guesses) for guesses in (5, ALL_GUESSES))
+    assert likely.cost == pytest.approx(105.2216, abs=1e-3)
+    assert all_choices.cost <= likely.cost * (1 + 1e-9)
+
+
 @pytest.mark.slow
 def test_likely_choices_hold_the_best_of_all_choices(params):
     task = Weave()

@@ -146,7 +146,7 @@ def find_optimum(
     x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     own_paths = paths is None
     paths = task.guess_paths(x0, c, params) if paths is None else paths
-    likely = own_paths and 1 < guesses < ALL_GUESSES and task.steps % _COARSE == 0
+    likely = own_paths and guesses > 1 and task.steps % _COARSE == 0
     obstacles = task.passed_obstacles(c) if likely else None
     paths = paths if obstacles is not None else paths[: guesses if own_paths else None]
     started, before = time.perf_counter(), (spent.solving, spent.setup)
@@ -154,6 +154,8 @@ def find_optimum(
     alone = own_paths and len(paths) == 1 and not task.first_exit
     if obstacles is not None:
         tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses, obstacles)
+        if guesses >= ALL_GUESSES:
+            tried += solve(task, params, x0, c, backoff, paths)
     elif alone:
         tried = _solve_quickly(task, params, x0, c, backoff, paths)
     else:
