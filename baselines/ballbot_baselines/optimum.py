@@ -154,8 +154,8 @@ def find_optimum(
     alone = own_paths and len(paths) == 1 and not task.first_exit
     if obstacles is not None:
         tried = _solve_likely_sides(task, params, x0, c, backoff, paths, guesses, obstacles)
-        if guesses >= ALL_GUESSES:
-            tried += solve(task, params, x0, c, backoff, paths)
+        if guesses >= ALL_GUESSES or not tried:
+            tried += solve(task, params, x0, c, backoff, paths[:guesses])
     elif alone:
         tried = _solve_quickly(task, params, x0, c, backoff, paths)
     else:
@@ -347,14 +347,14 @@ def _solve_fixed_time(
     starts, fine = _starts(task, params, x0, paths), []
     if len(paths) > 1 and task.steps % _COARSE == 0:
         fine = _contenders(task, params, x0, c, backoff, starts)
-    return _solve_all(task, params, c, backoff, fine, starts)
+    return _solve_all(task, params, c, backoff, fine or starts, near=bool(fine))
 
 
 def _solve_all(
-    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, fine: list[_Start], starts: list[_Start]
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, starts: list[_Start], near: bool
 ) -> list[tuple[int, OcpSolution]]:
-    """From `fine`, which are near solutions, or where there is none from `starts`."""
-    return [(i, s) for i, x, a in fine or starts for s in _solve_from(task, params, x, a, c, backoff, bool(fine))]
+    """From every start; `near` as of `_solve_from`."""
+    return [(i, s) for i, x, a in starts for s in _solve_from(task, params, x, a, c, backoff, near)]
 
 
 def _solve_quickly(
@@ -432,7 +432,8 @@ def _solve_likely_sides(
     """As `_solve_fixed_time`, but of all choices of sides only those are solved that are predicted to be the best, or nearly.
 
     The motion without obstacles comes first: it takes few iterations, and it predicts what every choice costs, and how the
-    robot then moves. Each search starts from that predicted motion, and from the choice's guessed path if that fails.
+    robot then moves. Each search starts from that predicted motion, and from the choice's guessed path if that fails. Where
+    there is no motion without obstacles, nothing is solved.
     """
     far, near = (
         _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, _QUICK_ITERATIONS, barrier)
@@ -445,7 +446,7 @@ def _solve_likely_sides(
 
     free = solved_from(_straight(task, params, x0, c), task.without_obstacles(c), near)
     if not is_feasible(free):
-        return _solve_fixed_time(task, params, x0, c, backoff, paths[:most])
+        return []
     along = guess.resampled(free.states[:, :2], task.steps)
     prediction = sides.predict(task, params, x0, c, along, obstacles)
     rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
@@ -462,7 +463,8 @@ def _solve_likely_sides(
                 solved.append((i, solution))
                 break
     fine = _refined(task, solved, _GRID_DOUBT)
-    return _solve_all(task, params, c, backoff, fine, fine or _starts(task, params, x0, paths[:most]))
+    starts = fine or _starts(task, params, x0, paths[:most])
+    return _solve_all(task, params, c, backoff, starts, near=bool(fine))
 
 
 def _straight(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -71,12 +71,6 @@ def predict(
     return Prediction(sides, costs, free + (sides * prices) @ responses @ model.responses.T)
 
 
-def passed(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
-    """The side of each obstacle on which a path (n, 2) is where it is nearest to it: 1 for greater y, else −1."""
-    nearest = [int(np.argmin(np.hypot(*(path - obstacle[:2]).T))) for obstacle in obstacles]
-    return tuple(1 if path[k, 1] > o[1] else -1 for k, o in zip(nearest, obstacles, strict=True))
-
-
 @dataclass(frozen=True)
 class _Model:
     """Motion across the way: `free` (steps+1, 4) are the positions without obstacles by initial state.
