@@ -344,18 +344,21 @@ class Dagger:
         find = functools.partial(find_optimum, self._task, self._params, x, c, guesses=config.max_guesses)
         if not config.backoff_price:
             return find(config.backoff), config.backoff
-        most = (1 + config.backoff_price) * find().cost
+        found, kept = find(), Backoff()
+        most = (1 + config.backoff_price) * found.cost
         low, high = 0.0, 2.0  # shares of the back-off; the first to be tried is all of it
         for _ in range(_BISECTIONS):
             share = (low + high) / 2
-            affordable = False
+            backoff, tried = config.backoff.times(share), None
             with suppress(PlanError):
-                affordable = find(config.backoff.times(share)).cost <= most
-            low, high = (share, high) if affordable else (low, share)
+                tried = find(backoff)
+            if tried is not None and tried.cost <= most:
+                found, kept, low = tried, backoff, share
+            else:
+                high = share
             if low == 1.0:
                 break
-        backoff = config.backoff.times(low)
-        return find(backoff), backoff
+        return found, kept
 
     def _track(
         self,
