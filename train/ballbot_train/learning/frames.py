@@ -15,31 +15,32 @@ _MOST = 1 - 1e-4  # of an action before it is turned: at the limit itself it wou
 
 def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
     """Demonstrations with features in place of observations, and actions as the frame has them."""
-    back = axes_of(frame, demos.observations).transpose(0, 2, 1)
+    observations, axes = seen_in(frame, demos.observations)
+    next_observations, _ = seen_in(frame, demos.next_observations)
+    back = axes.transpose(0, 2, 1)
     return replace(
         demos,
-        observations=features_of(frame, demos.observations),
-        next_observations=features_of(frame, demos.next_observations),
+        observations=observations,
+        next_observations=next_observations,
         actions=turned(back, demos.actions),
         executed=turned(back, demos.executed),
     )
 
 
-def features_of(frame: Frame, observation: np.ndarray) -> np.ndarray:
-    """(..., size) float32 features of observations (..., no)."""
-    features, _ = frame.features(tuple(np.moveaxis(observation, -1, 0)))
-    return np.stack(np.broadcast_arrays(*features), -1).astype(np.float32)
+def seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a frame shows of observations (n, no), and where its axes are.
 
-
-def axes_of(frame: Frame, observation: np.ndarray) -> np.ndarray:
-    """(n, 2, 2) float32 for observations (n, no): the frame's two directions as columns.
-
-    They are orthonormal, so the transpose leads back from the world to the frame.
+    Returns:
+        Features (n, size) float32; and (n, 2, 2) float32, the frame's two directions as columns. They turn actions of the
+        frame into those of the world, and are orthonormal, so their transpose leads back.
     """
-    _, back = frame.features(tuple(observation.T))
-    one, zero = np.ones(len(observation), np.float32), np.zeros(len(observation), np.float32)
-    columns = [np.stack(np.broadcast_arrays(*back(unit)), -1) for unit in ((one, zero), (zero, one))]
-    return np.stack(columns, -1).astype(np.float32)
+    features, back = frame.features(tuple(observations.T))
+    one, zero = np.ones(len(observations), np.float32), np.zeros(len(observations), np.float32)
+    return _columns(features), np.stack([_columns(back(unit)) for unit in ((one, zero), (zero, one))], -1)
+
+
+def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
+    return np.stack(np.broadcast_arrays(*parts), -1).astype(np.float32)
 
 
 def turned(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:

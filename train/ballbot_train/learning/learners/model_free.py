@@ -21,7 +21,7 @@ from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
 from ballbot_train.learning.demonstrations import Demos
-from ballbot_train.learning.frames import axes_of, features_of, turned
+from ballbot_train.learning.frames import seen_in, turned
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
@@ -254,7 +254,8 @@ class TrainingEnv(VecEnvWrapper):
         observation, reward, done, infos = self.venv.step_wait()
         if self._frame is not None:
             for i in np.flatnonzero(done).tolist():
-                infos[i]["terminal_observation"] = features_of(self._frame, infos[i]["terminal_observation"])
+                last, _ = seen_in(self._frame, infos[i]["terminal_observation"][np.newaxis])
+                infos[i]["terminal_observation"] = last[0]
         return self._seen(cast(np.ndarray, observation)), self._scale * reward, done, infos
 
     def state_dict(self) -> dict[str, Any]:
@@ -272,8 +273,8 @@ class TrainingEnv(VecEnvWrapper):
         """What the learner sees of observations (num_envs, no); notes where the frame's axes are."""
         if self._frame is None:
             return observation
-        self._axes = axes_of(self._frame, observation)
-        return features_of(self._frame, observation)
+        features, self._axes = seen_in(self._frame, observation)
+        return features
 
 
 class Imitation:

@@ -23,9 +23,9 @@ from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import FRAMES, Frame
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.policy import PolicyNetwork
 
@@ -124,11 +124,11 @@ class Critic(torch.nn.Module):
     Where the policy sees the task's frame, the critic does too.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...], frame: Frame | None = None):
+    def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...], frame: str | None = None):
         super().__init__()
-        self._frame = frame
+        self._inputs = CriticInputs(len(task.observation_scale), products=False, frame=frame)
         layers: list[torch.nn.Module] = []
-        size = len(task.observation_scale) if frame is None else frame.size
+        size = self._inputs.size
         for width in hidden:
             layers += [torch.nn.Linear(size, width), torch.nn.Tanh()]
             size = width
@@ -145,11 +145,7 @@ class Critic(torch.nn.Module):
         if self.p is not None:
             error = observation[..., :8]
             scale = ((error @ self.p) * error).sum(-1) + 1e-3
-        seen = observation
-        if self._frame is not None:
-            features, _ = self._frame.features(observation.unbind(-1))
-            seen = torch.stack(features, -1)
-        return torch.nn.functional.softplus(self.mlp(seen)[..., 0] + _SOFTPLUS_ONE) * scale
+        return torch.nn.functional.softplus(self.mlp(self._inputs(observation))[..., 0] + _SOFTPLUS_ONE) * scale
 
 
 class Shac:
@@ -163,7 +159,7 @@ class Shac:
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
         self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
         start_as_lqr(self._network, task, params)
-        frame = FRAMES[task.frame] if config.symmetry == "frame" and task.frame else None
+        frame = self._network.spec.frame
         self.critic = Critic(task, params, config.hidden, frame)
         self.target = Critic(task, params, config.hidden, frame)
         self.target.load_state_dict(self.critic.state_dict())
