@@ -25,6 +25,7 @@ TINY = {
         rl_iterations=3,
         num_envs=4,
         num_steps=16,
+        final_gamma=0.999,
         episode_seconds=0.4,
         hidden=(16, 8),
         batch_size=32,
@@ -110,6 +111,35 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
         actions = load_network(tmp_path / "policy", task)(torch.as_tensor(observation))
     expected, _ = learner._model.predict(observation, deterministic=True)
     np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
+
+
+def test_the_policy_of_ppo_is_a_running_average_of_its_actor():
+    learner = make("ppo")
+    seen, last = [], parameters(learner)
+    for _ in range(3):
+        learner.iterate()
+        actor = torch.cat([value.flatten() for value in learner._actor.network.state_dict().values()])
+        seen.append(actor)
+        share = max(0.1, 1 / len(seen))
+        last = last + share * (actor - last)
+        torch.testing.assert_close(parameters(learner), last)
+    assert not torch.equal(last, seen[-1])
+
+
+def test_the_discount_of_ppo_rises_and_takes_all_values_with_it():
+    learner = make("ppo", gamma=0.99, final_gamma=0.999)
+    policy, seen = learner._model.policy, observed(20)
+    with torch.no_grad():
+        before = policy.predict_values(seen)
+        learner._raise_gamma(0.999)
+        after = policy.predict_values(seen)
+    task, scale = make_task("stabilize"), learner.config.reward_scale
+    change = value_of_living(task, scale, 0.999) - value_of_living(task, scale, 0.99)
+    torch.testing.assert_close(after, before + change)
+    learner._raise_gamma(0.99)
+    logged = [learner.iterate()["train/gamma"] for _ in range(3)]
+    assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
+    assert learner._model.rollout_buffer.gamma == learner._env.batch.gamma == learner._model.gamma
 
 
 def test_demonstrations_of_another_task_are_refused(name, demos):

@@ -1,6 +1,9 @@
-"""The shapes of actors that respect the symmetry of their task."""
+"""The shapes of actors that respect the symmetry of their task, and running averages of actors."""
 
 from typing import Any, Literal
+
+import torch
+from torch.optim.swa_utils import AveragedModel
 
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicySpec
@@ -8,6 +11,8 @@ from ballbot_train.policy import PolicySpec
 Symmetry = Literal["none", "odd", "mirrors", "frame"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
 the task's mirror images, or it sees and acts in the task's frame."""
+
+_RETAINED = 0.9  # of an averaged actor at each update
 
 
 def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
@@ -30,3 +35,12 @@ def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bo
             raise ValueError(f'{task.id} has no frame; give "none" or "mirrors" as its symmetry')
         fields["frame"] = task.frame
     return PolicySpec.of(task, **fields)
+
+
+def average_of(actor: torch.nn.Module) -> AveragedModel:
+    """A running average of an actor over its last ten or so updates, in `module`; the first updates start it."""
+    return AveragedModel(actor, avg_fn=_towards)
+
+
+def _towards(kept: torch.Tensor, new: torch.Tensor, updates: torch.Tensor | int) -> torch.Tensor:
+    return kept.lerp(new, max(1 - _RETAINED, 1 / (1 + int(updates))))

@@ -4,6 +4,7 @@
 complex dexterous manipulation with deep reinforcement learning and demonstrations", 2018.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +20,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.learning.actors import Symmetry, average_of, spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, value_of_living
 from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
@@ -40,6 +41,8 @@ class PpoConfig(ModelFreeConfig):
     symmetry: Symmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
     over the task's mirror images, or it sees and acts in the task's frame."""
+    final_gamma: float | None = None
+    """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
     gae_lambda: float = 0.95
     """λ of generalized advantage estimation."""
     relative_advantage_floor: float = 0.0
@@ -199,18 +202,48 @@ class Ppo(ModelFree):
             actor = policy.branches.actor
         else:
             actor = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
+        self._model: PPO
         self._set_model(model, actor, (policy.optimizer,))
+        self._average = average_of(actor)
 
     @property
     def network(self) -> PolicyNetwork:
-        if isinstance(self._actor, MeanAction):
-            return self._actor.network
-        return as_policy(self._actor.children(), self._task, activation="tanh", squash="clip")
+        """A running average of the actor over its last ten or so iterations; while it is cloned, the actor."""
+        actor = self._actor if self.iteration <= self._clone_iterations else self._average.module
+        if isinstance(actor, MeanAction):
+            return actor.network
+        return as_policy(actor.children(), self._task, activation="tanh", squash="clip")
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"average": self._average.state_dict(), "gamma": self._model.gamma}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        super().load_state_dict(state)
+        self._average.load_state_dict(state["average"])
+        self._take_gamma(state["gamma"])
 
     def _improve(self) -> dict[str, float]:
-        std = schedules.geometric(self._std, self.config.final_std, self._progress)
+        config, progress = self.config, self._progress
+        std = schedules.geometric(self._std, config.final_std, progress)
         self._log_std.data.fill_(np.log(std))
-        return super()._improve()
+        if config.final_gamma is not None:
+            self._raise_gamma(1 - schedules.geometric(1 - config.gamma, 1 - config.final_gamma, progress))
+        figures = super()._improve()
+        self._average.update_parameters(self._actor)
+        return {**figures, "train/gamma": self._model.gamma}
+
+    def _raise_gamma(self, gamma: float) -> None:
+        """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
+        policy, scale = cast(ActorCriticPolicy, self._model.policy), self.config.reward_scale
+        old = value_of_living(self._task, scale, self._model.gamma)
+        critic = policy.branches.critic.linear if isinstance(policy, BranchedPolicy) else policy.value_net
+        with torch.no_grad():
+            cast(torch.nn.Linear, critic).bias.add_(value_of_living(self._task, scale, gamma) - old)
+        self._take_gamma(gamma)
+
+    def _take_gamma(self, gamma: float) -> None:
+        """Gives the discount factor to all that have a copy of it."""
+        self._model.gamma = self._model.rollout_buffer.gamma = self._env.batch.gamma = gamma
 
     def _imitation_scale(self) -> float:
         return float(self._log_std.detach().exp()[0]) ** -2

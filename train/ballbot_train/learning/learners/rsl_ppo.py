@@ -25,7 +25,7 @@ from ballbot_gym.batch import BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.learning.actors import Symmetry, average_of, spec_for
 from ballbot_train.learning.critics import CriticInputs, start_at, value_of_living
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch, without_arena
 from ballbot_train.learning.learners.model_free import ScopedRng
@@ -34,7 +34,6 @@ from ballbot_train.policy import PolicyNetwork
 
 _GROUPS = {"actor": ["policy"], "critic": ["critic"]}
 _LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
-_RETAINED = 0.9  # of the averaged actor per iteration
 
 
 @dataclass(frozen=True)
@@ -283,8 +282,7 @@ class RslPpo:
         """Makes actor, critic and algorithm around a policy network."""
         config, seen = self.config, self._seen
         self._actor = Actor(seen, network, self._std)
-        self._average = PolicyNetwork(network.spec)
-        self._average.load_state_dict(network.state_dict())
+        self._average = average_of(network)
         self._critic = Critic(seen, config.critic_hidden, self._value_of_living(config.gamma))
         self._ppo = PPO(
             self._actor,
@@ -304,7 +302,7 @@ class RslPpo:
     @property
     def network(self) -> PolicyNetwork:
         """A running average of the actor over its last ten or so iterations."""
-        return self._average
+        return cast(PolicyNetwork, self._average.module)
 
     @property
     def difficulty(self) -> dict[str, float]:
@@ -341,10 +339,7 @@ class RslPpo:
                 )
         self._actor.requires_grad_(self.iteration >= self._warmup_iterations)
         losses = self._ppo.update()
-        with torch.no_grad():
-            share = max(1 - _RETAINED, 1 / (1 + self.iteration))  # the first iterations start the average
-            for kept, new in zip(self._average.parameters(), self._actor.network.parameters(), strict=True):
-                kept.lerp_(new, share)
+        self._average.update_parameters(self._actor.network)
         self.iteration += 1
         return {
             **{f"loss/{name}": float(value) for name, value in losses.items()},
