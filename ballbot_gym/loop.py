@@ -6,7 +6,7 @@ because the loop always computes in float64, and `dtype` is only that of what it
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -107,8 +107,15 @@ class BallbotLoop:
         self.state = state
         return np.array([single.seen() for single in self._singles], np.float32)
 
+    def tilt(self, state: BatchState) -> np.ndarray:
+        """(B,) rad, of a state."""
+        return dynamics.tilt(tuple(cast(np.ndarray, state.x)))
+
     def step(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> BatchStep:
-        """Holds forces for one control step; see `vector._advance`."""
+        """Holds forces for one control step; see `vector._advance`.
+
+        `final_observation` has the rows of ended episodes alone.
+        """
         if not self._started:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         outcomes: list[Outcome] = []
@@ -147,7 +154,7 @@ class BallbotLoop:
             "cost": np.array(cost),
             "terminated": np.array(terminated),
             "truncated": np.array(truncated),
-            "final_observation": final_observation,
+            "final_observation": final_observation[np.logical_or(terminated, truncated)],
             "final_x": final_states,
             "success": np.array(success),
             "failure": index >= 0,

@@ -1,10 +1,11 @@
-"""BallbotVectorEnv: Gymnasium's vector interface to a `BallbotBatch`, or to a `BallbotLoop` where envs are few."""
+"""BallbotVectorEnv: Gymnasium's vector interface to machine code, to a `BallbotBatch` in torch, or to a `BallbotLoop`."""
 
 import dataclasses
+import logging
 import math
 import reprlib
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -13,7 +14,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ballbot_gym import dynamics
 from ballbot_gym.env import (
     LARGEST,
     REWARD_PARTS,
@@ -41,8 +41,12 @@ except ImportError as error:
 from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, tilt_of
 from ballbot_gym.loop import BallbotLoop
 
+if TYPE_CHECKING:
+    from ballbot_gym.native import BallbotNative
+
 LOOP_BELOW = 64
-"""Batch size below which engine="auto" loops over the envs on a CPU. From there on a batch in torch is as fast or faster.
+"""Batch size below which engine="auto" loops over the envs on a CPU where there is no machine code. From there on a batch in
+torch is as fast or faster.
 
 Measured by `benchmarks/vector_engines.py` on one core.
 """
@@ -67,7 +71,9 @@ _INFO_KEYS = tuple(
 )
 """Keys of an info, each with that of its mask."""
 
-_ENGINES = ("auto", "torch", "loop")
+_ENGINES = ("auto", "native", "torch", "loop")
+
+_log = logging.getLogger(__name__)
 
 
 class VectorState(NamedTuple):
@@ -93,8 +99,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
 
     The episodes are the same in all three. The entries of `final_info` are valid only for the envs that the
     masks `_…` mark. Returned arrays never change later; `state` and `constants` in `infos` may share the batch's memory and
-    are read-only. From `LOOP_BELOW` envs on, observations and states are in Fortran order, component by component, like
-    those of Gymnasium's own batched CartPole, and actions in that order are not copied.
+    are read-only. Observations and states are in Fortran order, component by component, like those of Gymnasium's own
+    batched CartPole, and actions in that order are not copied. engine="loop" has C order.
 
     `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
     """
@@ -125,9 +131,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             autoreset_mode: an `AutoresetMode`, or its value or name; default, SAME_STEP.
             physics: "rk4". Gymnasium's own vector envs run "bullet".
             max_episode_steps: control steps; the same as the task's `duration` of so many.
-            engine: "torch" computes all envs at once; "loop" one after the other in float64, whatever dtype is returned;
-                "auto" loops over fewer than `LOOP_BELOW` envs on a CPU, unless compile is True. Both run the same
-                episodes, to rounding. `batch` is a `BallbotBatch` or a `BallbotLoop`.
+            engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
+                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization`. "torch" computes
+                them in torch, and `compile` says whether that is compiled. "loop" computes one after the other in float64,
+                whatever dtype is returned. "auto" takes "native" where it can on a CPU, unless compile is True or
+                False; else "loop" for fewer than `LOOP_BELOW` envs on a CPU, unless compile is True; else "torch". All run
+                the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotLoop`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -143,16 +152,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         task = _task(task, params, max_episode_steps, task_fields)
         _check_physics(physics, task, num_envs)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        small = isinstance(num_envs, int) and num_envs < LOOP_BELOW
-        automatic = small and torch.device(device).type == "cpu" and compile is not True
-        if engine == "loop" and torch.device(device).type != "cpu":
-            raise ValueError(f'engine="loop" runs on the CPU, not on {device}')
-        self.batch: BallbotBatch | BallbotLoop
-        # Made in any case, because it checks the arguments; it allocates nothing.
-        self.batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization)
+        if engine in ("native", "loop") and torch.device(device).type != "cpu":
+            raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         self._dtype = np.float32 if dtype == torch.float32 else np.float64
-        if engine == "loop" or (engine == "auto" and automatic):
-            self.batch = BallbotLoop(task, num_envs, self._dtype, self.batch.params, self.batch.randomization)
+        self.batch = _batch(task, num_envs, device, dtype, compile, params, randomization, engine)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
         fps = round(1 / self.task.control_dt)
@@ -162,7 +165,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space = observation_space(self.task, self.params)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._limit_names = np.array(("", *limit_names(self.task, self.params)), dtype=object)
+        self._limit_names = np.array(limit_names(self.task, self.params), dtype=object)
+        self._no_names = np.full(self.num_envs, "", dtype=object)
         self._survive = self.task.survival_reward * self.task.control_dt
         self._scene: Scene | None = None
 
@@ -209,9 +213,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 state = self._with_x(state, x, mask)
             self.batch.state = state
             observation = self.batch.observe(state)
-            tilt: Any = (
-                dynamics.tilt(tuple(state.x)) if isinstance(self.batch, BallbotLoop) else tilt_of(state.x.unbind(0))
-            )
+            tilt: Any = tilt_of(state.x.unbind(0)) if isinstance(self.batch, BallbotBatch) else self.batch.tilt(state)
         self._ended = self._ended & ~mask
         size = self.num_envs
         infos = self._info(
@@ -275,7 +277,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         elif ended.size:
             end = (cost, parts, result.final_tilt, force, success, violated, clipped)
             infos["final_info"] = self._info(result.final_x, constants, *end, done, grip)
-            infos["final_obs"] = _some_rows(result.final_observation, ended)
+            infos["final_obs"] = _some_rows(result.final_observation, ended, self.num_envs)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
             cost, parts, force, clipped = cost.copy(), parts.copy(), force.copy(), clipped.copy()
@@ -374,22 +376,24 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
 
     def _to_batch(self, array: np.ndarray) -> Any:
         """The array as the batch takes it."""
-        return array if isinstance(self.batch, BallbotLoop) else torch.from_numpy(array).to(self.batch.device)
+        return torch.from_numpy(array).to(self.batch.device) if isinstance(self.batch, BallbotBatch) else array
 
     def _advance(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> Any:
-        """`_advance` of the batch, with NumPy arrays in and out."""
-        if isinstance(self.batch, BallbotLoop):
+        """`_advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone."""
+        if not isinstance(self.batch, BallbotBatch):
             return self.batch.step(actions, waiting, restart)
         with torch.no_grad():
             result = _advance(self.batch, self._to_batch(actions), waiting, restart)
-        arrays = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
-        return result._replace(**arrays)
+        arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
+        result = result._replace(**arrays)
+        ended: Any = result.terminated | result.truncated
+        return result._replace(final_observation=result.final_observation[ended])
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
         """(8, B) states and (nc, B) constants."""
         if isinstance(self.batch, BallbotLoop):
             return self.batch.x_and_c()
-        state = self.batch.state
+        state: Any = self.batch.state
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         return self._array(state.x), self._array(state.c)
@@ -419,7 +423,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """
         x, c = x.T, c.T
         x.flags.writeable = c.flags.writeable = False
-        failure, names = violated >= 0, self._limit_names[violated + 1]
+        failure, names = violated >= 0, self._no_names.copy()
+        names[failure] = self._limit_names[violated[failure]]
         survive, running, goal = reward_parts
         values = (x, cost, survive, running, goal, tilt, success, failure, names, force, clipped, c)
         infos = {}
@@ -452,6 +457,46 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             bad = np.flatnonzero(mask & ~safe)
             raise ValueError(f"start states of envs {bad[:8].tolist()} violate a limit of {self.task.id}")
         return state._replace(x=self._to_batch(x))
+
+
+def _batch(
+    task: Task,
+    num_envs: int,
+    device: str | torch.device,
+    dtype: torch.dtype,
+    compile: bool | str,
+    params: BallbotParams,
+    randomization: Randomization | None,
+    engine: str,
+) -> "BallbotBatch | BallbotLoop | BallbotNative":
+    """The envs of an engine; see `BallbotVectorEnv`."""
+    numbers = np.float32 if dtype == torch.float32 else np.float64
+    on_cpu = torch.device(device).type == "cpu"
+    if engine == "native" or (engine == "auto" and on_cpu and compile == "auto"):
+        # made in any case, because it checks the arguments; it allocates nothing
+        checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization)
+        if checked.randomization == Randomization():
+            try:
+                from ballbot_gym.native import BallbotNative, NativeUnavailableError
+            except ImportError:
+                if engine == "native":
+                    raise
+            else:
+                try:
+                    return BallbotNative(
+                        checked.task, checked.num_envs, numbers, checked.params, torch.get_num_threads()
+                    )
+                except NativeUnavailableError as error:
+                    if engine == "native":
+                        raise
+                    _log.warning("no machine code, so the envs are slower: %s", error)
+        elif engine == "native":
+            raise ValueError('engine="native" knows no Randomization; take engine="torch" or "loop"')
+    batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization)
+    small = engine == "auto" and on_cpu and batch.num_envs < LOOP_BELOW and compile is not True
+    if engine == "loop" or small:
+        return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization)
+    return batch
 
 
 def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None, restart: bool) -> BatchStep:
@@ -561,8 +606,8 @@ def _finite(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     return array
 
 
-def _some_rows(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Gymnasium's layout of `final_obs`: (B,) objects, a row of the array where an index is given, else None."""
-    objects = np.empty(len(array), dtype=object)  # full of None
-    objects[rows] = np.fromiter(array[rows], dtype=object, count=len(rows))
+def _some_rows(rows: np.ndarray, indices: np.ndarray, size: int) -> np.ndarray:
+    """Gymnasium's layout of `final_obs`: (size,) objects, rows where an index is given, else None."""
+    objects = np.empty(size, dtype=object)  # full of None
+    objects[indices] = np.fromiter(rows, dtype=object, count=len(rows))
     return objects

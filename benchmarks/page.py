@@ -87,11 +87,11 @@ SECTIONS = (
         quick=("--quick",),
     ),
     Section(
-        "Few environments",
+        "Environments by number",
         "vector_engines",
         ("envs",),
-        {"sync": "steps/s", "loop": "steps/s", "torch": "steps/s"},
-        quick=("--sizes", "1", "16", "64", "--runs", "1"),
+        dict.fromkeys(("native", "torch", "sync", "loop"), "steps/s"),
+        quick=("--sizes", "1", "64", "1024", "--runs", "1"),
     ),
     Section(
         "Many environments",

@@ -1,12 +1,15 @@
-"""Control steps per second of vector environments by batch size: Gymnasium's sync, the loop and torch.
+"""Control steps per second of vector environments by batch size: Gymnasium's sync, machine code, the loop and torch.
 
-`ballbot_gym.vector.LOOP_BELOW` follows from this table. Every figure is the median of several runs, whose order alternates.
-Time is that of the processor, so that a busy machine does not spoil it; run it with OMP_NUM_THREADS=1.
+`ballbot_gym.vector.LOOP_BELOW` follows from this table. Sync and loop are left out from 1024 envs on, which take them
+seconds. Every figure is the median of several runs, whose order alternates. Time is that of the processor, so that a busy
+machine does not spoil it; run it with OMP_NUM_THREADS=1.
 """
 
+import math
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -18,7 +21,7 @@ from ballbot_gym.tasks import TASKS
 
 def main(
     task: str = "stabilize",
-    sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64, 128, 256, 1024),
+    sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 33, 64, 128, 256, 1024, 4096, 16384, 65536),
     runs: int = 5,
     seconds: float = 0.5,
     out: Path = Path("runs/vector_engines"),
@@ -33,10 +36,14 @@ def main(
         out: folder of the result.
     """
     rows = []
-    print(f"{'envs':>5} {'sync':>12} {'loop':>12} {'torch':>12}   steps/s, median of {runs} runs")
+    print(f"{'envs':>5} {'native':>12} {'torch':>12} {'sync':>12} {'loop':>12}   steps/s, median of {runs} runs")
     for size in sizes:
-        sync = {"vectorization_mode": "sync", "physics": "rk4"}
-        kinds = {"sync": sync, "loop": {"engine": "loop"}, "torch": {"engine": "torch", "compile": False}}
+        kinds: dict[str, dict[str, Any]] = {
+            "native": {"engine": "native"},
+            "torch": {"engine": "torch", "compile": False},
+        }
+        if size < 1024:
+            kinds |= {"sync": {"vectorization_mode": "sync", "physics": "rk4"}, "loop": {"engine": "loop"}}
         envs = {name: gymnasium.make_vec(TASKS[task].id, num_envs=size, **kind) for name, kind in kinds.items()}
         speeds: dict[str, list[float]] = {name: [] for name in envs}
         for _ in range(runs):
@@ -44,7 +51,9 @@ def main(
                 speeds[name].append(speed(env, seconds))
         medians = {name: statistics.median(values) for name, values in speeds.items()}
         print(f"{size:5}", *(f"{value:12,.0f}" for value in medians.values()), flush=True)
-        rows.append({"envs": size, **medians})
+        rows.append(
+            {"envs": size, **{name: medians.get(name, math.nan) for name in ("native", "torch", "sync", "loop")}}
+        )
         for env in envs.values():
             env.close()
     files.write_csv(out / "vector_engines.csv", rows)

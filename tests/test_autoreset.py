@@ -1,4 +1,4 @@
-"""Vector environments restart episodes as Gymnasium's own do, in each of its three modes and with both engines."""
+"""Vector environments restart episodes as Gymnasium's own do, in each of its three modes and with every engine."""
 
 import gymnasium
 import numpy as np
@@ -8,12 +8,12 @@ from gymnasium.vector import AutoresetMode
 torch = pytest.importorskip("torch")
 
 from ballbot_gym import Randomization, counter_rng  # noqa: E402
-from ballbot_gym.vector import LOOP_BELOW, BallbotLoop, BallbotVectorEnv  # noqa: E402
+from ballbot_gym.vector import LOOP_BELOW, BallbotBatch, BallbotLoop, BallbotVectorEnv  # noqa: E402
 
 ROBOTS = Randomization(body_mass=(0.8, 1.2), actuator_delay=(0.0, 0.06), position_noise=0.01, push_impulse=(0.0, 3.0))
 
 
-@pytest.mark.parametrize("engine", ["loop", "torch"])
+@pytest.mark.parametrize("engine", ["native", "loop", "torch"])
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine):
     """The sync envs draw other episodes, so that both are started alike at each restart of ours."""
@@ -84,7 +84,7 @@ def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine)
     assert ends > 80
 
 
-@pytest.mark.parametrize("engine", ["loop", "torch"])
+@pytest.mark.parametrize("engine", ["native", "loop", "torch"])
 def test_disabled_wants_a_reset_of_what_has_ended(engine):
     envs = BallbotVectorEnv(2, duration=0.04, engine=engine, compile=False, autoreset_mode="Disabled")
     envs.reset(seed=0, options={"state": np.zeros(8)})
@@ -96,7 +96,7 @@ def test_disabled_wants_a_reset_of_what_has_ended(engine):
 
 
 @pytest.mark.parametrize("randomization", [None, ROBOTS], ids=["nominal", "randomized"])
-def test_both_engines_and_all_modes_run_the_same_episodes(task, randomization):
+def test_all_engines_and_all_modes_run_the_same_episodes(task, randomization):
     def starts(engine, mode):
         envs = BallbotVectorEnv(
             3,
@@ -121,7 +121,7 @@ def test_both_engines_and_all_modes_run_the_same_episodes(task, randomization):
         return np.array(found)
 
     expected = starts("torch", "SameStep")
-    for engine in ("torch", "loop"):
+    for engine in ("torch", "loop") if randomization else ("native", "torch", "loop"):
         for mode in ("SameStep", "NextStep", "Disabled"):
             np.testing.assert_allclose(starts(engine, mode), expected, rtol=1e-12, atol=1e-12)
 
@@ -137,11 +137,12 @@ def test_numbers_of_one_env_are_those_of_the_batch():
             assert counter_rng.floats(single, 9) == tuple(rows[i].tolist())
 
 
-def test_small_batches_loop_and_large_ones_do_not():
-    assert isinstance(BallbotVectorEnv(1).batch, BallbotLoop)
-    assert isinstance(BallbotVectorEnv(LOOP_BELOW - 1).batch, BallbotLoop)
-    assert not isinstance(BallbotVectorEnv(LOOP_BELOW, compile=False).batch, BallbotLoop)
-    assert not isinstance(BallbotVectorEnv(2, compile=True).batch, BallbotLoop)
+def test_where_there_is_no_machine_code_small_batches_loop_and_large_ones_do_not():
+    assert isinstance(BallbotVectorEnv(1, compile=False).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(1, randomization=ROBOTS).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(LOOP_BELOW - 1, compile=False).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(LOOP_BELOW, compile=False).batch, BallbotBatch)
+    assert isinstance(BallbotVectorEnv(2, compile=True).batch, BallbotBatch)
 
 
 def test_gymnasiums_normalizing_wrappers_take_next_step_and_disabled():

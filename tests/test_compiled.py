@@ -10,8 +10,9 @@ pytest.importorskip("casadi")
 import casadi
 
 from ballbot_baselines import compiled
+from ballbot_gym import machine_code
 
-needs_compiler = pytest.mark.skipif(compiled._compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
 posix = pytest.mark.skipif(os.name != "posix", reason="programs and permissions of POSIX")
 
 
@@ -54,7 +55,7 @@ def test_nothing_but_the_library_is_left_in_the_cache(folder):
 def test_library_depends_on_processor_and_content(folder, monkeypatch):
     compiled.compiled("powers", powers())
     compiled.compiled("powers", powers(2.0))
-    monkeypatch.setattr(compiled, "_machine", lambda compiler: "another processor")
+    monkeypatch.setattr(machine_code, "_machine", lambda compiler: "another processor")
     compiled.compiled("powers", powers())
     assert len(list(folder.iterdir())) == 3
 
@@ -71,7 +72,7 @@ def test_damaged_library_is_built_anew(folder, damage):
     library.write_bytes(broken)
     assert in_another_process() == [9.0, 27.0]
     assert library.read_bytes() != broken
-    assert compiled._is_whole(library)
+    assert machine_code._is_whole(library)
 
 
 @needs_compiler
@@ -101,8 +102,8 @@ def test_compiler_that_fails_leaves_functions_interpreted_and_the_cache_empty(fo
             return subprocess.CompletedProcess(command, 0, "", "")
         raise subprocess.CalledProcessError(1, command, stderr="no such instruction")
 
-    monkeypatch.setattr(compiled, "_compiler", lambda: "broken-cc")
-    monkeypatch.setattr(compiled, "_machine", lambda compiler: "any")
+    monkeypatch.setattr(machine_code, "_compiler", lambda: "broken-cc")
+    monkeypatch.setattr(machine_code, "_machine", lambda compiler: "any")
     monkeypatch.setattr(subprocess, "run", fail)
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
@@ -139,14 +140,14 @@ def fake_compiler(folder, tmp_path, monkeypatch):
         program.write_bytes(content)
         program.chmod(0o755)
         monkeypatch.setenv("CC", str(program))
-        compiled._compiler.cache_clear()
+        machine_code._compiler.cache_clear()
         return str(program)
 
     yield make
     monkeypatch.undo()
-    compiled._compiler.cache_clear()
-    compiled._machine.cache_clear()
-    compiled._hanging.clear()
+    machine_code._compiler.cache_clear()
+    machine_code._machine.cache_clear()
+    machine_code._hanging.clear()
 
 
 @posix
@@ -170,14 +171,14 @@ def test_compiler_that_is_none_leaves_functions_interpreted(fake_compiler, caplo
 @posix
 @pytest.mark.parametrize("hangs", ["at --version", "when it compiles"])
 def test_compiler_that_hangs_is_given_up_and_not_asked_again(fake_compiler, monkeypatch, caplog, hangs):
-    monkeypatch.setattr(compiled, "_VERSION_SECONDS", 0.2 if hangs == "at --version" else 10.0)
-    monkeypatch.setattr(compiled, "_COMPILE_SECONDS", 0.2)
+    monkeypatch.setattr(machine_code, "_VERSION_SECONDS", 0.2 if hangs == "at --version" else 10.0)
+    monkeypatch.setattr(machine_code, "_COMPILE_SECONDS", 0.2)
     answer = b"" if hangs == "at --version" else b'[ "$1" = --version ] && exit 0\n'
     program = fake_compiler(b"#!/bin/sh\n" + answer + b"exec sleep 30\n")
     functions = powers()
     assert compiled.compiled("powers", functions) is functions
     assert f"{program} did not answer within 0.2 s" in caplog.text
-    monkeypatch.setattr(compiled, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
+    monkeypatch.setattr(machine_code, "_run", lambda *args, **kwargs: pytest.fail("asked again"))
     assert compiled.compiled("others", functions) is functions
     assert len(caplog.records) == 1
 
@@ -244,4 +245,4 @@ def test_relative_xdg_cache_home_is_ignored(monkeypatch, tmp_path):
     monkeypatch.delenv("BALLBOT_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    assert compiled.cache_folder() == tmp_path / ".cache" / "ballbot-gym"
+    assert machine_code.cache_folder() == tmp_path / ".cache" / "ballbot-gym"

@@ -13,7 +13,7 @@ from ballbot_baselines import compiled
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
 from ballbot_baselines.optimum import FEASIBLE, Backoff, find_optimum, is_feasible, plan_to_track
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, machine_code
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
@@ -369,7 +369,7 @@ def test_step_toward_consistency_brings_a_rough_guess_nearer_and_respects_bounds
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_compiled_and_interpreted_functions_lead_to_the_same_solution(monkeypatch, solver):
     fast = solve_toy(solver)
-    monkeypatch.setattr(compiled, "_compiler", lambda: None)
+    monkeypatch.setattr(machine_code, "_compiler", lambda: None)
     slow = solve_toy(solver)
     assert slow.cost == pytest.approx(fast.cost, rel=1e-12)
     np.testing.assert_allclose(slow.states, fast.states, atol=1e-9)
@@ -380,7 +380,7 @@ def square():
     return (casadi.Function("square", [x], [x * x]), casadi.Function("cube", [x], [x**3]))
 
 
-needs_compiler = pytest.mark.skipif(compiled._compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
 
 
 @needs_compiler
@@ -421,7 +421,7 @@ def test_other_functions_get_another_library(monkeypatch, tmp_path):
 
 
 def test_without_a_compiler_functions_stay_as_they_are(monkeypatch):
-    monkeypatch.setattr(compiled, "_compiler", lambda: None)
+    monkeypatch.setattr(machine_code, "_compiler", lambda: None)
     functions = square()
     assert compiled.compiled("powers", functions) is functions
 
@@ -429,7 +429,7 @@ def test_without_a_compiler_functions_stay_as_they_are(monkeypatch):
 @pytest.mark.skipif(shutil.which("false") is None, reason="a program that fails")
 def test_compiler_that_fails_is_logged_and_functions_stay_as_they_are(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
-    monkeypatch.setattr(compiled, "_compiler", lambda: "false")
+    monkeypatch.setattr(machine_code, "_compiler", lambda: "false")
     functions = square()
     assert compiled.compiled("powers", functions) is functions
     assert "stay interpreted" in caplog.text
@@ -439,9 +439,9 @@ def test_compiler_that_fails_is_logged_and_functions_stay_as_they_are(monkeypatc
 def test_cache_lies_in_the_users_cache_folder_unless_told_otherwise(monkeypatch, tmp_path):
     monkeypatch.delenv("BALLBOT_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert compiled.cache_folder() == tmp_path / "ballbot-gym"
+    assert machine_code.cache_folder() == tmp_path / "ballbot-gym"
     monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "other"))
-    assert compiled.cache_folder() == tmp_path / "other"
+    assert machine_code.cache_folder() == tmp_path / "other"
 
 
 def test_other_robot_has_another_optimum(params):

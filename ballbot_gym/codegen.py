@@ -1,0 +1,212 @@
+"""C code of what a task and a robot compute, for many robots at once.
+
+`ops` lets tasks and robots compute with CasADi's symbols. So a step is traced once, and written out as C functions that the
+rest of the code, native.c, calls. They compute blocks of `LANES` robots, a number that compilers know, and make SIMD
+instructions of. So every robot is computed by the same instructions, wherever it stands in a batch of whatever
+size.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import casadi
+
+from ballbot_gym import dynamics, ops
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+LANES = 16
+"""Robots per block: as many float32 as an AVX-512 register holds."""
+
+FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
+"""The flags of a step, in the order in which the C code writes them."""
+
+_Part = tuple[str, Sequence[Any]]
+"""A pointer's name in C, and the symbols that are read from its rows, or the expressions that are written to them."""
+
+_C = {
+    casadi.OP_ASSIGN: "{0}",
+    casadi.OP_ADD: "{0} + {1}",
+    casadi.OP_SUB: "{0} - {1}",
+    casadi.OP_MUL: "{0} * {1}",
+    casadi.OP_DIV: "{0} / {1}",
+    casadi.OP_NEG: "-{0}",
+    casadi.OP_INV: "1 / {0}",
+    casadi.OP_SQ: "{0} * {0}",
+    casadi.OP_TWICE: "2 * {0}",
+    casadi.OP_SQRT: "real_sqrt({0})",
+    casadi.OP_SIN: "real_sin({0})",
+    casadi.OP_COS: "real_cos({0})",
+    casadi.OP_TAN: "real_tan({0})",
+    casadi.OP_ATAN: "real_atan({0})",
+    casadi.OP_ACOS: "real_acos({0})",
+    casadi.OP_EXP: "real_exp({0})",
+    casadi.OP_LOG: "real_log({0})",
+    casadi.OP_FABS: "real_fabs({0})",
+    casadi.OP_FMIN: "{0} < {1} ? {0} : {1}",
+    casadi.OP_FMAX: "{0} > {1} ? {0} : {1}",
+    casadi.OP_LT: "{0} < {1} ? (real)1 : (real)0",
+    casadi.OP_LE: "{0} <= {1} ? (real)1 : (real)0",
+    casadi.OP_EQ: "{0} == {1} ? (real)1 : (real)0",
+    casadi.OP_NE: "{0} != {1} ? (real)1 : (real)0",
+}
+"""Operations of CasADi as C."""
+
+_LOGIC = {
+    casadi.OP_NOT: "1 - {0}",
+    casadi.OP_AND: "{0} * {1}",
+    casadi.OP_OR: "{0} + {1} - {0} * {1}",
+}
+"""Operations on truth values, which are the numbers 0 and 1. Compilers make branches of others, and no SIMD."""
+
+_TRUTH = {casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, *_LOGIC}
+
+
+def source(task: Task, params: BallbotParams, double: bool) -> str:
+    """The C code of a task and a robot, with the functions `step`, `start` and `observe`; see `native` for what they do.
+
+    Args:
+        task: the task.
+        params: the robot.
+        double: whether numbers are float64, else float32.
+
+    Raises:
+        NotImplementedError: the task has an operation that is not known here.
+        Exception: whatever a task raises that cannot compute with CasADi's symbols.
+    """
+    x, c = _symbols("x", 8), _symbols("c", len(task.constant_names))
+    z = _symbols("z", task.constant_draws), _symbols("y", task.state_draws)
+    action, taken = _symbols("a", 2), _symbols("t", 1)
+    blocks = [
+        _block(
+            "advance", (("x", x), ("c", c), ("a", action), ("t", taken)), _advance(task, params, x, c, action, taken[0])
+        ),
+        _block("look", (("x", x), ("c", c)), (("seen", task.observe(x, c)), ("tilt", (_tilt(x),)))),
+        _block("draw_constants", (("z", z[0]),), (("c", task.draw_constants(z[0], params)),)),
+        _block("draw_state", (("z", z[1]), ("c", c)), (("x", task.draw_state(z[1], c, params)),)),
+    ]
+    sizes = {
+        "DOUBLE": int(double),
+        "LANES": LANES,
+        "CONSTANTS": len(c),
+        "SEEN": len(task.observation_scale),
+        "GRIP": 4 if params.grips else 0,
+        "FLAGS": len(FLAGS),
+        "CONSTANT_DRAWS": task.constant_draws,
+        "DRAWS": task.constant_draws + task.state_draws,
+    }
+    defined = [f"#define {name} {value}" for name, value in sizes.items()]
+    return "\n".join([*defined, Path(__file__).with_name("native.c").read_text(encoding="utf-8"), *blocks])
+
+
+def _advance(
+    task: Task, params: BallbotParams, x: tuple, c: tuple, action: tuple, taken: Any
+) -> tuple[tuple[str, Sequence[Any]], ...]:
+    """One control step, as `BallbotBatch.transition` computes it, up to the start of the next episode."""
+    u = tuple([casadi.fmax(casadi.fmin(part, 1.0), -1.0) * params.force_limit for part in action])
+    rate = task.cost(x, u, c)
+    end = dynamics.step(params, x, u, task.control_dt, dynamics.substeps_for(task.control_dt))
+    limits, grip = task.limits(end, c), ()
+    if params.grips:
+        floor = dynamics.held_contact(params, x, u, task.control_dt)
+        held = [casadi.fmin(*dynamics.grip_limits(params, force)) for force in floor]
+        limits = (*limits, casadi.fmin(*held))
+        grip = (*floor[0], casadi.fmax(*(dynamics.needed_friction(force) for force in floor)))
+    violated: Any = -1.0
+    for i in reversed(range(len(limits))):
+        violated = ops.where(casadi.SX(limits[i] >= 0), violated, float(i))  # not ≥ 0 where it is not a number
+    failure = violated >= 0
+    reached: Any = casadi.SX(1)
+    for g in task.goal(end, c):
+        reached = casadi.logic_and(reached, g <= 0)
+    steps = taken + 1
+    last = steps >= task.steps
+    success = casadi.logic_and(casadi.logic_not(failure), reached)
+    if not task.first_exit:
+        success = casadi.logic_and(success, last)
+    terminated = casadi.logic_or(failure, success) if task.first_exit else failure
+    truncated = casadi.logic_and(last, casadi.logic_not(terminated))
+    survive, running = task.survival_reward * task.control_dt, rate * task.control_dt
+    ahead = survive * (task.steps - steps)  # for the time that remains
+    reward = survive - running + ops.where(casadi.logic_and(success, int(task.first_exit)), ahead, 0.0)
+    cost = running + ops.where(failure, ahead, 0.0)
+    clipped = casadi.logic_or(casadi.fabs(action[0]) > 1, casadi.fabs(action[1]) > 1)
+    return (
+        ("end", end),
+        ("force", u),
+        ("grip", grip),
+        ("pay", (reward, cost)),
+        ("flags", (terminated, truncated, success, failure, clipped)),
+        ("violated", (violated,)),
+    )
+
+
+def _tilt(x: tuple) -> Any:
+    """As `dynamics.tilt`."""
+    return casadi.acos(ops.clip(dynamics.cos_tilt(x), -1.0, 1.0))
+
+
+def _symbols(name: str, count: int) -> tuple[Any, ...]:
+    return tuple(casadi.SX.sym(f"{name}{i}") for i in range(count))
+
+
+def _block(name: str, inputs: Sequence[_Part], outputs: Sequence[_Part]) -> str:
+    """A C function that computes expressions for `LANES` robots.
+
+    Row i of every pointer p is at p + i * sp, so that rows may be those of a whole batch or of a block alone.
+    """
+    read = [(f"{pointer}[{i} * s{pointer} + k]", symbol) for pointer, part in inputs for i, symbol in enumerate(part)]
+    write = [(f"{pointer}[{i} * s{pointer} + k]", value) for pointer, part in outputs for i, value in enumerate(part)]
+    function = casadi.Function(name, [symbol for _, symbol in read], [casadi.SX(v) for _, v in write], {"cse": True})
+    lines, registers = [], set()
+    truths, infinite = set(), set()  # registers that hold a truth value, and infinity
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        given, made = function.instruction_input(k), function.instruction_output(k)
+        if operation == casadi.OP_OUTPUT:
+            lines.append(f"{write[made[0]][0]} = w{given[0]};")
+            continue
+        if operation == casadi.OP_INPUT:
+            value = read[given[0]][0]
+        elif operation == casadi.OP_CONST:
+            value = _literal(function.instruction_constant(k))
+        elif operation in _C:
+            value = _C[operation].format(*(f"w{i}" for i in given))
+        elif operation in _LOGIC:
+            value = _LOGIC[operation].format(*(_truth(i, truths) for i in given))
+        elif operation == casadi.OP_IF_ELSE_ZERO:
+            condition, number = given
+            form = "{0} != 0 ? w{1} : (real)0" if number in infinite else "{0} * w{1}"  # 0 times infinity is no number
+            value = form.format(_truth(condition, truths), number)
+        else:
+            raise NotImplementedError(f"{name} has CasADi's operation {operation}, which is not known as C")
+        lines.append(f"w{made[0]} = {value};")
+        registers.add(made[0])
+        constant = function.instruction_constant(k) if operation == casadi.OP_CONST else None
+        _note(truths, made[0], operation in _TRUTH or constant in (0.0, 1.0))
+        _note(infinite, made[0], constant is not None and math.isinf(constant))
+    variables = ", ".join(f"w{i}" for i in sorted(registers))
+    arguments = [f"const real *restrict {pointer}, int64_t s{pointer}" for pointer, _ in inputs]
+    arguments += [f"real *restrict {pointer}, int64_t s{pointer}" for pointer, _ in outputs]
+    body = "\n        ".join([f"real {variables};" if registers else "", *lines])
+    return (
+        f"static void {name}({', '.join(arguments)}) {{\n"
+        f"    #pragma omp simd\n    for (int k = 0; k < LANES; ++k) {{\n        {body}\n    }}\n}}\n"
+    )
+
+
+def _truth(register: int, truths: set[int]) -> str:
+    """A register as a truth value."""
+    return f"w{register}" if register in truths else f"(w{register} != 0 ? (real)1 : (real)0)"
+
+
+def _note(those: set[int], register: int, holds: bool) -> None:
+    (those.add if holds else those.discard)(register)
+
+
+def _literal(value: float) -> str:
+    """A number as C."""
+    text = {"inf": "INFINITY", "-inf": "-INFINITY", "nan": "NAN"}.get(repr(float(value)), repr(float(value)))
+    return f"(real){text}"

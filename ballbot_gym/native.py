@@ -1,0 +1,295 @@
+"""BallbotNative: what `BallbotBatch` does without gradients, in machine code that is compiled once per task and robot.
+
+`codegen` writes the C code, `machine_code` compiles it within a second or two, and it serves batches of all sizes. Episodes
+are those of `BallbotBatch`: the same `counter_rng` numbers for the same seeds. Motions agree to rounding, and are
+bit-identical wherever an env stands in whatever batch.
+"""
+
+import ctypes
+import itertools
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from ballbot_gym import machine_code
+from ballbot_gym.batch import BatchState, BatchStep, check_num_envs, seeds_of
+from ballbot_gym.loop import BallbotLoop
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.tasks import Task
+
+try:
+    from ballbot_gym import codegen
+except ImportError as error:
+    raise ImportError(
+        'environments in machine code need CasADi: pip install "ballbot-gym[baselines]", or give engine="torch"'
+    ) from error
+
+_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
+_PARALLEL_FROM = 4096
+"""Number of envs from which threads share the work. Waking them takes as long as a thousand steps."""
+
+
+class NativeUnavailableError(RuntimeError):
+    """There is no machine code for a task; the message says why."""
+
+
+State = Any
+"""A `BatchState` whose fields are NumPy arrays."""
+
+
+class _Code(NamedTuple):
+    """The functions of a library; `codegen` has them."""
+
+    step: Callable[..., None]
+    start: Callable[..., None]
+    observe: Callable[..., None]
+
+
+class BallbotNative:
+    """B ballbots that do one task, with `state`, `initial_state`, `step` and `robot` as of `BallbotBatch`.
+
+    The fields of `BatchState` and `BatchStep` are NumPy arrays. Arrays of a state are never written into.
+    """
+
+    compiled = True
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        dtype: type[np.floating],
+        params: BallbotParams,
+        threads: int = 1,
+        code: _Code | None = None,
+    ):
+        """Makes the envs.
+
+        Args:
+            task, num_envs, params: as of `BallbotBatch`.
+            dtype: np.float32 or np.float64.
+            threads: among which large batches are divided.
+            code: its functions; default, those of the task and the robot, once they were checked.
+
+        Raises:
+            NativeUnavailableError: CasADi or a C compiler is missing, or the task cannot be traced.
+            ValueError: num_envs out of range.
+        """
+        self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
+        self.randomization, self.threads = Randomization(), threads
+        self.state: State = None
+        self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
+        self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
+        self._all = np.arange(self.num_envs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_code": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._code = _checked_code(self.task, self.params, self.dtype is np.float64)
+
+    def initial_state(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        mask: np.ndarray | None = None,
+        c: np.ndarray | None = None,
+    ) -> State:
+        """As `BallbotBatch.initial_state`, with NumPy arrays."""
+        old = self.state
+        state = self._unstarted() if old is None else old._make(part.copy() for part in old)
+        which = self._all if old is None or mask is None else np.flatnonzero(mask)
+        state.episode[which] += old is not None
+        if seed is not None:
+            given = np.array([-1 if number is None else number for number in seeds_of(seed, self.num_envs)])
+            seeded = which[given[which] >= 0]
+            state.seed[seeded], state.episode[seeded] = given[seeded], 0
+        if c is not None:
+            state.c[:, which] = c[:, which]
+        self._start(which, state, given=c is not None)
+        return state
+
+    def observe(self, state: State) -> np.ndarray:
+        """(B, no) observations of a state."""
+        return self._seen(state)[0].astype(np.float32, copy=False).T
+
+    def tilt(self, state: State) -> np.ndarray:
+        """(B,) rad, of a state."""
+        return self._seen(state)[1]
+
+    def step(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> BatchStep:
+        """Holds forces for one control step; see `vector._advance`.
+
+        `final_observation` has the rows of ended episodes alone.
+        """
+        old = self.state
+        if old is None:
+            raise gymnasium.error.ResetNeeded("step() before reset()")
+        x, seen, tilt, force, grip, pay, flags, violated = self._advance(old, actions)
+        new = old._replace(x=x, steps=old.steps + 1)
+        terminated, truncated, success, failure, clipped = flags
+        reward, cost = pay
+        final_x, final_tilt = x, tilt
+        idle = None if waiting is None else np.flatnonzero(waiting)
+        if idle is not None:
+            pay[:, idle] = 0.0
+            flags[:, idle] = False
+            violated[idle], force[:, idle], grip[:, idle] = -1, 0.0, 0.0
+        ended = np.flatnonzero(terminated | truncated)
+        final_seen = seen.T[ended].astype(np.float32, copy=False)
+        begin = ended if restart else idle
+        if begin is not None and begin.size:
+            if restart:
+                new, tilt = new._replace(x=x.copy()), tilt.copy()
+            new = new._replace(c=new.c.copy(), episode=new.episode.copy())
+            new.episode[begin] += 1
+            self._start(begin, new)
+            self._look(begin, new, seen, tilt)
+        self.state = new
+        fields: Any = {
+            "observation": seen.astype(np.float32, copy=False).T,
+            "reward": reward,
+            "cost": cost,
+            "terminated": terminated,
+            "truncated": truncated,
+            "final_observation": final_seen,
+            "final_x": final_x,
+            "success": success,
+            "failure": failure,
+            "violated": violated,
+            "force": force,
+            "clipped": clipped,
+            "final_tilt": final_tilt,
+            "tilt": tilt,
+            "grip": grip,
+        }
+        return BatchStep(**fields)
+
+    def robot(self, i: int) -> BallbotParams:
+        """The robot of env i in its running episode."""
+        if self.state is None:
+            raise gymnasium.error.ResetNeeded("no episode before reset()")
+        return self.params
+
+    def _unstarted(self) -> State:
+        """A state before the first episodes, with random seeds."""
+        size = self.num_envs
+        x, c, none = (np.zeros((rows, size), self.dtype) for rows in (8, len(self.task.constant_names), 0))
+        seeds = np.array(seeds_of(self._entropy, size))
+        fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none)
+        return BatchState(*fields)
+
+    def _start(self, which: np.ndarray, state: State, given: bool = False) -> None:
+        """Starts the episodes of some envs, in arrays that nobody else has; their constants are drawn unless given."""
+        arrays = (which, state.seed, state.episode)
+        self._code.start(self.num_envs, len(which), *_pointers(*arrays), given, *_pointers(state.x, state.c))
+        state.steps[which] = 0
+
+    def _look(self, which: np.ndarray, state: State, seen: np.ndarray, tilt: np.ndarray) -> None:
+        """Writes what some envs see, and their tilts."""
+        self._code.observe(self.num_envs, len(which), *_pointers(which, state.x, state.c, seen, tilt))
+
+    def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """(no, B) what all envs see, and (B,) their tilts."""
+        seen = np.empty((len(self.task.observation_scale), self.num_envs), self.dtype)
+        tilt = np.empty(self.num_envs, self.dtype)
+        self._look(self._all, state, seen, tilt)
+        return seen, tilt
+
+    def _advance(self, state: State, actions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """One control step of every env, with nothing started anew.
+
+        Returns:
+            States (8, B), observations (no, B), tilts (B,), forces (2, B), grip (4 or 0, B); rewards and costs (2, B) in
+            float64, `codegen.FLAGS` (5, B), and violated (B,) as of `BatchStep`.
+        """
+        size, dtype = self.num_envs, self.dtype
+        rows = (8, len(self.task.observation_scale), 1, 2, 4 if self.params.grips else 0)
+        made = [np.empty((count, size), dtype) for count in rows]
+        made += [np.empty((2, size)), np.empty((len(codegen.FLAGS), size), np.bool_), np.empty(size, np.int64)]
+        pointers = _pointers(state.x, state.c, actions.T, state.steps, *made)
+        made[2] = made[2][0]
+        if size < _PARALLEL_FROM or self.threads == 1:
+            self._code.step(size, 0, size, *pointers)
+        else:
+            blocks = math.ceil(size / codegen.LANES)
+            bounds = [min(size, blocks * i // self.threads * codegen.LANES) for i in range(self.threads + 1)]
+            others = [
+                _pool().submit(self._code.step, size, first, last, *pointers)
+                for first, last in itertools.pairwise(bounds[1:])
+            ]
+            self._code.step(size, 0, bounds[1], *pointers)
+            for other in others:
+                other.result()
+        return tuple(made)
+
+
+def _pointers(*arrays: np.ndarray) -> list[int]:
+    return [array.ctypes.data for array in arrays]
+
+
+@cache
+def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
+    """The functions of a task and a robot, if these compute the same with CasADi's symbols as with numbers.
+
+    A symbol that is made a float, for one, becomes NaN without a word.
+
+    Raises:
+        NativeUnavailableError: see `BallbotNative`.
+    """
+    code, dtype = _code(task, params, double), np.float64 if double else np.float32
+    actions = np.asfortranarray([[0.1, -0.2], [-0.3, 0.4], [1.2, 0.5], [-0.6, -1.2]], dtype)
+    found = []
+    for envs in (
+        BallbotNative(task, len(actions), dtype, params, code=code),
+        BallbotLoop(task, len(actions), dtype, params),
+    ):
+        envs.state = envs.initial_state(seed=0)
+        start = {"first observation": envs.observe(envs.state), "start": envs.state.x, "constants": envs.state.c}
+        found.append(start | envs.step(actions, None, False)._asdict())
+    for name, expected in found[1].items():
+        if not np.allclose(found[0][name], expected, rtol=1e-3, atol=1e-3, equal_nan=True):
+            raise NativeUnavailableError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
+    return code
+
+
+@cache
+def _code(task: Task, params: BallbotParams, double: bool) -> _Code:
+    """The functions of a task and a robot.
+
+    Raises:
+        NativeUnavailableError: see `BallbotNative`.
+    """
+    try:
+        source = codegen.source(task, params, double)
+    except Exception as error:  # whatever code of users raises that meets CasADi's symbols
+        raise NativeUnavailableError(f"{task.id} cannot be traced: {type(error).__name__}: {error}") from error
+    try:
+        library = ctypes.CDLL(str(machine_code.library(type(task).__name__.lower(), source, _FLAGS)))
+    except (OSError, machine_code.NoMachineCodeError) as error:
+        raise NativeUnavailableError(str(error) or "there is no C compiler that works") from error
+    count, pointer = ctypes.c_int64, ctypes.c_void_p
+    signatures = {
+        "step": [count] * 3 + [pointer] * 12,
+        "start": [count] * 2 + [pointer] * 3 + [ctypes.c_int] + [pointer] * 2,
+        "observe": [count] * 2 + [pointer] * 5,
+    }
+    for name, signature in signatures.items():
+        function = getattr(library, name)
+        function.argtypes, function.restype = signature, None
+    return _Code(*(getattr(library, name) for name in _Code._fields))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="ballbot")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child does not have the threads

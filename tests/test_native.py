@@ -1,0 +1,245 @@
+"""Envs in machine code: the same episodes as in torch, wherever an env stands, and a word where there is no machine code."""
+
+import copy
+import logging
+import multiprocessing
+import pickle
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+pytest.importorskip("casadi")
+torch = pytest.importorskip("torch")
+
+import casadi  # noqa: E402
+
+from ballbot_gym import Randomization, codegen, machine_code, native  # noqa: E402
+from ballbot_gym.batch import BallbotBatch  # noqa: E402
+from ballbot_gym.env import make_task  # noqa: E402
+from ballbot_gym.loop import BallbotLoop  # noqa: E402
+from ballbot_gym.robots import named_robot  # noqa: E402
+from ballbot_gym.tasks.stabilize import Stabilize  # noqa: E402
+from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
+
+needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
+
+
+def actions_of(count, steps=40, scale=1.2):
+    return np.random.default_rng(0).uniform(-scale, scale, (steps, count, 2)).astype(np.float32)
+
+
+def play(env, actions, seed):
+    """What every step returns, stacked: observations, rewards, states, tilts, constants."""
+    env.reset(seed=seed)
+    results = []
+    for action in actions:
+        observation, reward, *_, infos = env.step(action)
+        results.append((observation, reward[:, None], infos["state"], infos["tilt"][:, None], infos["constants"]))
+    return [np.stack(parts) for parts in zip(*results, strict=True)]
+
+
+@needs_compiler
+@pytest.mark.parametrize("robot", ["paper", "rolling", "kugle"])
+def test_a_step_is_that_of_the_batch_in_torch(task, robot):
+    """From the same states, in float64; some envs end in each step, and begin anew."""
+    params = named_robot(robot)
+    task = type(task)(duration=0.4)
+    envs = native.BallbotNative(make_task(task, params), 21, np.float64, params)
+    batch = BallbotBatch(task, 21, dtype=torch.float64, compile=False, params=params)
+    batch.reset(seed=3)
+    envs.state = envs.initial_state(seed=3)
+    for name, part in batch.state._asdict().items():
+        np.testing.assert_allclose(getattr(envs.state, name), part.numpy(), rtol=1e-14, atol=1e-14, err_msg=name)
+    ended = 0
+    for action in actions_of(21, 50).astype(np.float64):
+        envs.state = type(batch.state)(*(part.numpy().copy() for part in batch.state))
+        got, expected = envs.step(np.asfortranarray(action), None, True), batch.step(torch.from_numpy(action))
+        done = expected.terminated | expected.truncated
+        expected = expected._replace(final_observation=expected.final_observation[done])
+        ended += int(done.sum())
+        for of, to in ((got, expected), (envs.state, batch.state)):
+            for name, part in to._asdict().items():
+                tolerance = 1e-6 if "observation" in name else 1e-10
+                np.testing.assert_allclose(
+                    getattr(of, name), part.numpy(), rtol=tolerance, atol=tolerance, equal_nan=True, err_msg=name
+                )
+    assert ended > 40
+
+
+@needs_compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_env_is_the_same_bit_for_bit_wherever_it_stands(task, dtype):
+    """In blocks that are full and in the remainder, alone, and where threads share the work."""
+    actions = actions_of(37)
+    make = {"task": task, "engine": "native", "dtype": dtype, "max_episode_steps": 25}
+    whole = play(BallbotVectorEnv(37, **make), actions, list(range(37)))
+    for first, count in ((0, 1), (3, 16), (19, 18), (36, 1)):
+        part = play(
+            BallbotVectorEnv(count, **make), actions[:, first : first + count], list(range(first, first + count))
+        )
+        for a, b in zip(part, whole, strict=True):
+            np.testing.assert_array_equal(a, b[:, first : first + count])
+
+
+@needs_compiler
+def test_threads_change_nothing(monkeypatch):
+    monkeypatch.setattr(native, "_PARALLEL_FROM", 64)
+    actions, results = actions_of(150), []
+    for threads in (1, 3):
+        env = BallbotVectorEnv(150, "weave", engine="native", max_episode_steps=20)
+        env.batch.threads = threads
+        results.append(play(env, actions, 0))
+    for a, b in zip(*results, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@needs_compiler
+def test_copies_and_pickles_go_on_alike_and_apart():
+    env, actions = BallbotVectorEnv(5, "weave", engine="native", max_episode_steps=8), actions_of(5)
+    play(env, actions[:10], 0)
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    expected = [env.step(action)[0] for action in actions]
+    for other in copies:
+        for action, observation in zip(actions, expected, strict=True):
+            np.testing.assert_array_equal(other.step(action)[0], observation)
+
+
+@needs_compiler
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
+def test_a_forked_process_has_threads_of_its_own():
+    """In a process of its own, because this one may have threads that hold locks."""
+    code = """
+import numpy as np, os
+from ballbot_gym import native
+from ballbot_gym.vector import BallbotVectorEnv
+native._PARALLEL_FROM = 64
+env = BallbotVectorEnv(100, engine="native")
+env.batch.threads = 2
+env.reset(seed=0)
+env.step(np.zeros((100, 2)))
+child = os.fork()
+if not child:
+    env.step(np.zeros((100, 2)))
+    os._exit(7)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@needs_compiler
+def test_a_state_that_is_not_finite_fails_and_its_neighbours_go_on():
+    env = BallbotVectorEnv(3, engine="native", autoreset_mode="NextStep")
+    env.reset(seed=0)
+    for bad in (np.nan, np.inf):
+        x = env.batch.state.x.copy()
+        x[2, 1] = bad
+        env.batch.state = env.batch.state._replace(x=x)
+        *_, terminated, _, infos = env.step(np.zeros((3, 2)))
+        assert terminated.tolist() == [False, True, False]
+        assert infos["failure"].tolist() == [False, True, False]
+        assert infos["violated"][1]
+        env.step(np.zeros((3, 2)))
+
+
+@needs_compiler
+def test_auto_takes_machine_code_unless_something_speaks_against_it():
+    assert isinstance(BallbotVectorEnv(1).batch, native.BallbotNative)
+    assert isinstance(BallbotVectorEnv(2000).batch, native.BallbotNative)
+    assert isinstance(BallbotVectorEnv(2000, compile=False).batch, BallbotBatch)
+    assert isinstance(BallbotVectorEnv(2, randomization=Randomization(body_mass=(0.9, 1.1))).batch, BallbotLoop)
+    with pytest.raises(ValueError, match='engine="native" knows no Randomization; take engine="torch" or "loop"'):
+        BallbotVectorEnv(2, engine="native", randomization=Randomization(body_mass=(0.9, 1.1)))
+    with pytest.raises(ValueError, match="engine='native' runs on the CPU, not on cuda"):
+        BallbotVectorEnv(2, engine="native", device="cuda")
+
+
+@dataclass(frozen=True)
+class Branching(Stabilize):
+    """A task whose cost CasADi refuses."""
+
+    def cost(self, x, u, c):
+        px, *_ = x
+        return px if px > 0 else -px
+
+
+@dataclass(frozen=True)
+class Converting(Stabilize):
+    """A task whose cost CasADi takes for something else."""
+
+    def cost(self, x, u, c):
+        px, *_ = x
+        return float(px) if not isinstance(px, torch.Tensor) else px
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("task", "reason"),
+    [
+        (Branching(), "BallbotStabilize-v0 cannot be traced: RuntimeError"),
+        (Converting(), "BallbotStabilize-v0 has another reward with CasADi's symbols than with numbers"),
+    ],
+    ids=["refused", "taken for something else"],
+)
+def test_a_task_that_cannot_be_traced_runs_in_torch_with_a_word_in_the_log(caplog, task, reason):
+    with caplog.at_level(logging.WARNING):
+        assert isinstance(BallbotVectorEnv(100, task).batch, BallbotBatch)
+    assert len(caplog.records) == 1
+    assert f"no machine code, so the envs are slower: {reason}" in caplog.text
+    with pytest.raises(native.NativeUnavailableError, match=reason):
+        BallbotVectorEnv(100, task, engine="native")
+
+
+def test_without_a_compiler_envs_run_in_python_or_torch(monkeypatch, caplog):
+    def refuse(*args):
+        raise machine_code.NoMachineCodeError("cc failed: no such instruction")
+
+    monkeypatch.setattr(machine_code, "library", refuse)
+    native._code.cache_clear(), native._checked_code.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        assert isinstance(BallbotVectorEnv(2).batch, BallbotLoop)
+    assert "no such instruction" in caplog.text
+    with pytest.raises(native.NativeUnavailableError, match="no such instruction"):
+        BallbotVectorEnv(2, engine="native")
+    native._code.cache_clear(), native._checked_code.cache_clear()
+
+
+def test_an_operation_that_is_not_known_as_c_is_refused():
+    x = casadi.SX.sym("x")
+    with pytest.raises(NotImplementedError, match="not known as C"):
+        codegen._block("odd", [("x", [x])], [("y", [casadi.erf(x)])])
+
+
+@needs_compiler
+def test_every_operation_that_is_known_as_c_does_what_casadis_does(tmp_path, monkeypatch):
+    """Truth values as numbers, comparisons with and without equality, and choices of infinities too."""
+    import ctypes
+
+    a, b = casadi.SX.sym("a"), casadi.SX.sym("b")
+    less, same = a < b, a == b
+    values = [
+        a + b, a - b, a * b, a / b, -a, 1 / a, a * a, 2 * a, casadi.fabs(a), casadi.sqrt(casadi.fabs(a)),
+        casadi.sin(a), casadi.cos(a), casadi.tan(a), casadi.atan(a), casadi.acos(casadi.fmin(casadi.fabs(a), 1)),
+        casadi.exp(a), casadi.log(casadi.fabs(a) + 1), casadi.fmin(a, b), casadi.fmax(a, b),
+        less, a <= b, same, a != b, casadi.logic_not(less), casadi.logic_not(a), casadi.logic_and(less, a > 0),
+        casadi.logic_or(less, same), casadi.logic_and(a, b), casadi.if_else(less, a, b), casadi.if_else(a, b, 3.0),
+        casadi.if_else(less, a, np.inf), casadi.if_else(same, -np.inf, casadi.if_else(less, 1.0, 0.0)),
+    ]  # fmt: skip
+    block = codegen._block("every", [("a", [a]), ("b", [b])], [("y", values)])
+    head = f"#define LANES {codegen.LANES}\n#include <math.h>\n#include <stdint.h>\ntypedef double real;\n"
+    head += "".join(
+        f"#define real_{name} {name}\n" for name in ("sqrt", "fabs", "sin", "cos", "tan", "atan", "acos", "exp", "log")
+    )
+    whole = "void whole(double *a, double *b, double *y) { every(a, LANES, b, LANES, y, LANES); }\n"
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
+    library = ctypes.CDLL(str(machine_code.library("every", head + block + whole, native._FLAGS)))
+    rng = np.random.default_rng(0)
+    given = rng.normal(size=(2, codegen.LANES))
+    given[1, :3], given[0, 3], given[1, 4] = given[0, :3], 0.0, 0.0
+    made = np.zeros((len(values), codegen.LANES))
+    library.whole(*(ctypes.c_void_p(array.ctypes.data) for array in (given[0].copy(), given[1].copy(), made)))
+    function = casadi.Function("every", [a, b], [casadi.vertcat(*values)])
+    expected = np.column_stack([np.array(function(*pair)).ravel() for pair in given.T])
+    np.testing.assert_allclose(made, expected, rtol=1e-12, atol=1e-12)
