@@ -98,8 +98,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     | "Disabled" | `reset(options={"reset_mask": mask})` must come before the next step |
 
     The episodes are the same in all three. The entries of `final_info` are valid only for the envs that the
-    masks `_…` mark. Returned arrays never change later; `state` and `constants` in `infos` may share the batch's memory and
-    are read-only. Observations and states are in Fortran order, component by component, like those of Gymnasium's own
+    masks `_…` mark. Returned arrays never change later; `state`, `constants` and `violated` in `infos` may share memory
+    and are read-only. Observations and states are in Fortran order, component by component, like those of Gymnasium's own
     batched CartPole, and actions in that order are not copied. engine="loop" has C order.
 
     `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
@@ -167,6 +167,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._limit_names = np.array(limit_names(self.task, self.params), dtype=object)
         self._no_names = np.full(self.num_envs, "", dtype=object)
+        self._no_names.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
         self._scene: Scene | None = None
 
@@ -262,8 +263,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         grip = result.grip.T if self.params.grips else None
         done = terminated | truncated
         ended = done.nonzero()[0]
-        parts = np.zeros((3, self.num_envs))
-        parts[0], parts[1] = self._survive, -cost
+        parts = np.empty((3, self.num_envs))
+        parts[0], parts[2] = self._survive, 0.0
+        np.negative(cost, out=parts[1])
         infos: dict[str, Any] = {}
         if waiting is not None:
             parts[:, waiting] = 0.0
@@ -280,7 +282,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             infos["final_obs"] = _some_rows(result.final_observation, ended, self.num_envs)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
-            cost, parts, force, clipped = cost.copy(), parts.copy(), force.copy(), clipped.copy()
+            cost, parts, force, clipped = cost.copy(), parts.copy(), force.copy(order="K"), clipped.copy()
             cost[ended], parts[:, ended], force[ended], clipped[ended] = 0.0, 0.0, 0.0, False
             success, violated = success & ~done, np.where(done, -1, violated)
             if grip is not None:
@@ -423,8 +425,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """
         x, c = x.T, c.T
         x.flags.writeable = c.flags.writeable = False
-        failure, names = violated >= 0, self._no_names.copy()
-        names[failure] = self._limit_names[violated[failure]]
+        failure, names = violated >= 0, self._no_names
+        if failure.any():
+            names = names.copy()
+            names[failure] = self._limit_names[violated[failure]]
         survive, running, goal = reward_parts
         values = (x, cost, survive, running, goal, tilt, success, failure, names, force, clipped, c)
         infos = {}
