@@ -509,3 +509,39 @@ def test_every_field_has_a_docstring():
         for statement, following in zip(body.body, body.body[1:], strict=False):
             if isinstance(statement, ast.AnnAssign):
                 assert isinstance(following, ast.Expr), f"{cls.__name__}.{statement.target.id} has no docstring"
+
+
+# --- one way ---
+
+
+def test_one_way_margins_are_no_wider_than_the_margins(task, rng, params):
+    """And the same where a task leaves one way alone."""
+    for _ in range(20):
+        x, c = task.sample(rng, params)
+        x = x + rng.normal(size=8)
+        margins, one_way = np.array(task.margins(x, c), float), np.array(task.one_way_margins(x, c), float)
+        assert margins.shape == one_way.shape
+        assert (one_way <= margins + 1e-12).all()
+        if not task.id.startswith("BallbotWeave"):
+            np.testing.assert_array_equal(one_way, margins)
+
+
+def test_weaves_one_way_is_past_the_nearer_side_of_every_obstacle(rng, params):
+    torch = pytest.importorskip("torch")
+    task = TASKS["weave"]()
+    for _ in range(10):
+        _, c = task.sample(rng, params)
+        for i in range(5):
+            ox, oy, _ = c[2 + 3 * i : 5 + 3 * i]
+            side = -1.0 if oy > c[1] else 1.0
+            for off in (0.01, 0.3, 1.0, 3.0):  # beside the obstacle, on the farther side and on the nearer one
+                y = torch.tensor(oy - side * off, requires_grad=True)
+                x = (torch.tensor(ox), y, *(torch.zeros(6, dtype=torch.float64)))
+                margin = task.one_way_margins(x, tuple(map(torch.tensor, c)))[1 + i]
+                margin.backward()
+                assert margin < 0
+                assert side * y.grad > 0  # it leads to the nearer side
+                near = np.array([ox, oy + side * off, 0, 0, 0, 0, 0, 0])
+                assert task.one_way_margins(near, c)[1 + i] == task.margins(near, c)[1 + i]
+            far_behind = np.array([ox + 3.0, oy - side * 1.0, 0, 0, 0, 0, 0, 0])
+            assert task.one_way_margins(far_behind, c)[1 + i] > 0

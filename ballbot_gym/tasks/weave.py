@@ -152,14 +152,32 @@ class Weave(Task):
 
     def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         px, py, *_ = ops.components(x)
-        _, _, *obstacles = ops.components(c)
         clearances = []
-        for i in range(MAX_OBSTACLES):
-            ox, oy, radius = obstacles[3 * i : 3 * i + 3]
-            reach = radius + self.ball_radius
+        for ox, oy, reach in self._obstacles(c):
             # about the distance to contact, m, and smooth everywhere
             clearances.append((squared(px - ox, py - oy) - reach * reach) / (2 * reach))
         return (*super().margins(x, c), *clearances)
+
+    def one_way_margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+        """Obstacles whose farther side is closed, by a wedge that opens away from the line through the goal along x.
+
+        The nearer side everywhere is the best choice of four in five drawn slaloms, and costs 0.2 % more on average.
+        """
+        px, py, *_ = ops.components(x)
+        _, y_goal, *_ = ops.components(c)
+        clearances = []
+        for ox, oy, reach in self._obstacles(c):
+            off = ops.where(oy < y_goal, oy - py, py - oy)  # from the obstacle's centre towards its farther side
+            depth = ops.where(off > 0, off, 0.0)
+            length = 2 * ops.sqrt(reach * reach + depth * depth)  # so that it stays about a length deep in the wedge
+            clearances.append((squared(px - ox) - off * abs(off) - reach * reach) / length)
+        return (*super().margins(x, c), *clearances)
+
+    def _obstacles(self, c: Vector) -> list[tuple[Any, Any, Any]]:
+        """Centres x, y of all obstacles, and how near to these the ball's centre may come, m."""
+        _, _, *numbers = ops.components(c)
+        triples = zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True)
+        return [(ox, oy, radius + self.ball_radius) for ox, oy, radius in triples]
 
     def arena(self, c: Vector) -> tuple[Any, Any, Any]:
         x_goal, y_goal, *_ = ops.components(c)

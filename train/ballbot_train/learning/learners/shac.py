@@ -74,7 +74,10 @@ class ShacConfig:
     margin_clearance: float = 0.0
     """Distance from the margins at which the penalty starts, in the margins' units."""
     margin_penalty: float = 0.0
-    """Penalty per second and squared shortfall of the clearance; 0: none."""
+    """Penalty per second and squared shortfall of the clearance; 0: none. It grows linearly from 0.15 on."""
+    one_way: bool = False
+    """Whether the penalty is that of the task's `one_way_margins`: of Weave's, a policy that started on the nearer sides
+    does not leave them. From scratch no way past the first obstacle was found with it."""
     grip_clearance: float = 0.05
     """Reserve of `dynamics.limits` below which its penalty starts; a robot with unlimited friction has none."""
     grip_penalty: float = 3000.0
@@ -86,6 +89,7 @@ class ShacConfig:
 
 
 _SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
+_DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
 _ENDLESS = 10**6  # control steps: longer than any episode in training
 
 TUNED: dict[str, ShacConfig] = {
@@ -274,9 +278,10 @@ class Shac:
         cost = cost + config.failure_penalty * result.failure
         shaped = cost
         if config.margin_penalty:
-            for margin in task.margins(x, c):
+            for margin in task.one_way_margins(x, c) if config.one_way else task.margins(x, c):
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
-                shaped = shaped + config.margin_penalty * task.control_dt * shortfall**2
+                squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
+                shaped = shaped + config.margin_penalty * task.control_dt * squared
         if config.grip_penalty:
             for limit in dynamics.limits(self._batch.params, before, force, hold=task.control_dt):
                 shortfall = (config.grip_clearance - limit).clamp(min=0)
