@@ -175,3 +175,23 @@ def test_missing_set_says_how_to_make_one(task, tmp_path):
 
 def test_all_sets_together_are_under_5_megabytes():
     assert sum(certified.path_of(make_task(task, robot), robot).stat().st_size for robot, task in SHIPPED) < 5e6
+
+
+def test_a_set_is_improved_by_what_is_cheaper_in_another_alone(task, evaluation):
+    costs = evaluation.costs.copy()
+    costs[1] *= 0.99
+    costs[2] *= 1.01
+    costs[3] *= 1 - 1e-12
+    states = evaluation.states.copy()
+    states[4], costs[4] = 0.0, costs[4] + 1
+    statuses = np.array(["again"] * 200)
+    trajectories = tuple(replace(trajectory, t=trajectory.t + 1) for trajectory in evaluation.trajectories)
+    other = replace(evaluation, costs=costs, states=states, statuses=statuses, trajectories=trajectories)
+    merged = evaluation.improved_by(other)
+    taken = np.flatnonzero(merged.statuses == "again")
+    assert taken.tolist() == [1, 4]  # cheaper; and of another start
+    for name in ("states", "constants", "costs", "durations", "violations"):
+        np.testing.assert_array_equal(getattr(merged, name)[taken], getattr(other, name)[taken])
+        kept = np.setdiff1d(np.arange(200), taken)
+        np.testing.assert_array_equal(getattr(merged, name)[kept], getattr(evaluation, name)[kept])
+    assert [trajectory.t[0] for trajectory in merged.trajectories[:6]] == [0, 1, 0, 0, 1, 0]

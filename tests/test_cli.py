@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -313,6 +314,22 @@ def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
     assert not (tmp_path / "package").exists()
     certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
     np.testing.assert_array_equal(certified.load(task).states, full.states[:2])
+
+
+def test_certify_keeps_installed_optima_that_are_cheaper(tmp_path, monkeypatch, capsys):
+    task, path = make_task("turn"), tmp_path / "package" / "set.npz"
+    first = replace(
+        certified.load(task), **{name: getattr(certified.load(task), name)[:2] for name in certified._PER_EPISODE}
+    )
+    first = replace(first, costs=first.costs * [0.9, 1.1], trajectories=first.trajectories[:2])
+    first.save(task, path)
+    monkeypatch.setattr(certified, "EPISODES", 2)
+    monkeypatch.setattr(certified, "path_of", lambda task, robot: path)
+    certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
+    assert "turn: 1 of 2 optima are cheaper than those installed" in capsys.readouterr().out
+    now = certified.load(task).costs / first.costs
+    assert now[0] == 1
+    assert now[1] == pytest.approx(1 / 1.1, rel=1e-6)
 
 
 def test_certify_says_which_episode_has_no_optimum_and_writes_no_set(tmp_path, monkeypatch):

@@ -20,6 +20,8 @@ from ballbot_gym.trajectory import Trajectory
 EPISODES = 200
 TRAJECTORIES = 20
 
+_CHEAPER = 1e-7  # relative: optima that differ by less are the same
+
 
 class CertificateError(ValueError):
     """No evaluation set for this task as it is configured."""
@@ -54,6 +56,17 @@ class EvaluationSet:
     def options(self, i: int) -> dict[str, np.ndarray]:
         """What to give `env.reset(options=...)` to start episode i."""
         return {"state": self.states[i], "constants": self.constants[i]}
+
+    def improved_by(self, other: "EvaluationSet") -> "EvaluationSet":
+        """A set with the cheaper optimum of each episode of two sets; the other's where the episodes differ."""
+        better = other.costs < self.costs * (1 - _CHEAPER)
+        better |= (other.states != self.states).any(1) | (other.constants != self.constants).any(1)
+        chosen = {}
+        for name in _PER_EPISODE:
+            old, new = getattr(self, name), getattr(other, name)
+            chosen[name] = np.where(better[:, None] if old.ndim > 1 else better, new, old)
+        pairs = zip(better.tolist(), self.trajectories, other.trajectories, strict=False)
+        return EvaluationSet(**chosen, trajectories=tuple(new if take else old for take, old, new in pairs))
 
     def save(self, task: Task, path: Path, robot: str = PAPER) -> Path:
         """Writes the set, with what defines its optima, so that it is never read for another problem or robot."""

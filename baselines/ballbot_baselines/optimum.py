@@ -45,6 +45,10 @@ _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordere
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
 _SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
 _GRID_DOUBT = 0.002  # relative: how differently the coarse grid may order choices of sides; 0.0007 was measured
+_GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip: 130 to 270 are common
+_GRIPPING_DOUBT = (
+    0.02  # in place of both doubts: friction is left out of the prediction, and coarse grids are rough about it
+)
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
@@ -435,8 +439,11 @@ def _solve_likely_sides(
     robot then moves. Each search starts from that predicted motion, and from the choice's guessed path if that fails. Where
     there is no motion without obstacles, nothing is solved.
     """
+    grips = params.grips
+    iterations = _GRIPPING_ITERATIONS if grips else _QUICK_ITERATIONS
+    side_doubt, grid_doubt = (_GRIPPING_DOUBT, _GRIPPING_DOUBT) if grips else (_SIDE_DOUBT, _GRID_DOUBT)
     far, near = (
-        _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, _QUICK_ITERATIONS, barrier)
+        _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, iterations, barrier)
         for barrier in (_BARRIER, _NEAR_BARRIER)
     )
 
@@ -454,7 +461,7 @@ def _solve_likely_sides(
     predicted = free.cost + prediction.costs[row_of]
     solved: list[tuple[int, OcpSolution]] = []
     for i in np.argsort(predicted, kind="stable")[:most].tolist():
-        if solved and predicted[i] > predicted[solved[0][0]] * (1 + _SIDE_DOUBT):
+        if solved and predicted[i] > predicted[solved[0][0]] * (1 + side_doubt):
             break
         motion = np.column_stack([along[:, 0], prediction.y[row_of[i]]])
         for start, solver in ((motion, near), (motion, far), (paths[i], far)):
@@ -462,7 +469,7 @@ def _solve_likely_sides(
             if is_feasible(solution):
                 solved.append((i, solution))
                 break
-    fine = _refined(task, solved, _GRID_DOUBT)
+    fine = _refined(task, solved, grid_doubt)
     starts = fine or _starts(task, params, x0, paths[:most])
     return _solve_all(task, params, c, backoff, starts, near=bool(fine))
 

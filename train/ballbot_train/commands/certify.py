@@ -36,7 +36,8 @@ def certify(
     Args:
         tasks: names of tasks.
         episodes: how many, from the first.
-        install: puts the finished sets into the package too, in place of those that all evaluation reads.
+        install: puts the finished sets into the package too, which all evaluation reads. Where an episode's optimum there is
+            cheaper, it stays.
         shards: URL or folder for a set of shards, SHARDS/TASK, in place of the .npz files; for more episodes than fit into
             memory. See `ballbot_train.shards`.
         out: folder of the .npz files; an interrupted run continues here.
@@ -87,7 +88,16 @@ def certify(
     if install:
         for name, evaluation_set in sets.items():
             task = make_task(name, robot)
-            console.print(f"installed: {evaluation_set.save(task, certified.path_of(task, robot), robot)}")
+            path = certified.path_of(task, robot)
+            try:
+                old = certified.load(task, robot=robot)
+            except certified.CertificateError:  # none, or of another problem
+                kept = evaluation_set
+            else:
+                kept = old.improved_by(evaluation_set)
+                same = int((kept.costs == old.costs).sum())
+                console.print(f"{name}: {len(kept) - same} of {len(kept)} optima are cheaper than those installed")
+            console.print(f"installed: {kept.save(task, path, robot)}")
 
 
 def _certify_shards(
