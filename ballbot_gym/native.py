@@ -83,10 +83,35 @@ class BallbotNative:
         """
         self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
         self.randomization, self.threads = Randomization(), threads
-        self.state: State = None
+        self._state: State = None
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
+
+    @property
+    def state(self) -> State:
+        """Everything that the environments remember; None before the first reset."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        """Takes a state; machine code reads its memory, so every array must be of the right shape.
+
+        Raises:
+            ValueError: it is not.
+        """
+        if state is not None:
+            size = self.num_envs
+            arrays = {"x": (8, size), "c": (len(self.task.constant_names), size)}
+            arrays |= dict.fromkeys(("steps", "episode", "seed"), (size,))
+            given = state._asdict()
+            for name, shape in arrays.items():
+                dtype = self.dtype if name in ("x", "c") else np.int64
+                given[name] = np.ascontiguousarray(given[name], dtype)
+                if given[name].shape != shape:
+                    raise ValueError(f"{name} of a state must have shape {shape}, not {given[name].shape}")
+            state = BatchState(**given)
+        self._state = state
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_code": None}
@@ -151,7 +176,7 @@ class BallbotNative:
             new.episode[begin] += 1
             self._start(begin, new)
             self._look(begin, new, seen, tilt)
-        self.state = new
+        self._state = new
         fields: Any = {
             "observation": seen.astype(np.float32, copy=False).T,
             "reward": reward,

@@ -479,28 +479,35 @@ def _batch(
     if engine == "native" or (engine == "auto" and on_cpu and compile == "auto"):
         # made in any case, because it checks the arguments; it allocates nothing
         checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization)
-        if checked.randomization == Randomization():
-            try:
-                from ballbot_gym.native import BallbotNative, NativeUnavailableError
-            except ImportError:
-                if engine == "native":
-                    raise
-            else:
-                try:
-                    return BallbotNative(
-                        checked.task, checked.num_envs, numbers, checked.params, torch.get_num_threads()
-                    )
-                except NativeUnavailableError as error:
-                    if engine == "native":
-                        raise
-                    _log.warning("no machine code, so the envs are slower: %s", error)
-        elif engine == "native":
-            raise ValueError('engine="native" knows no Randomization; take engine="torch" or "loop"')
+        native = _native(checked, numbers, must=engine == "native")
+        if native is not None:
+            return native
     batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization)
     small = engine == "auto" and on_cpu and batch.num_envs < LOOP_BELOW and compile is not True
     if engine == "loop" or small:
         return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization)
     return batch
+
+
+def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
+    """The envs of a batch in machine code. Where that is not possible: None, or an error if it must be."""
+    if batch.randomization != Randomization():
+        if must:
+            raise ValueError('engine="native" knows no Randomization; take engine="torch" or "loop"')
+        return None
+    try:
+        from ballbot_gym.native import BallbotNative, NativeUnavailableError
+    except ImportError:
+        if must:
+            raise
+        return None
+    try:
+        return BallbotNative(batch.task, batch.num_envs, dtype, batch.params, torch.get_num_threads())
+    except NativeUnavailableError as error:
+        if must:
+            raise
+        _log.warning("no machine code, so the envs are slower: %s", error)
+        return None
 
 
 def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None, restart: bool) -> BatchStep:

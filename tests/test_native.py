@@ -145,6 +145,19 @@ def test_a_state_that_is_not_finite_fails_and_its_neighbours_go_on():
 
 
 @needs_compiler
+def test_a_state_of_another_shape_is_refused_before_machine_code_reads_it():
+    envs = BallbotVectorEnv(3, "weave", engine="native").batch
+    state = envs.initial_state(seed=0)
+    for name in ("x", "c", "steps", "episode", "seed"):
+        with pytest.raises(ValueError, match=f"{name} of a state must have shape"):
+            envs.state = state._replace(**{name: getattr(state, name)[..., :2]})
+    envs.state = state._replace(x=np.asfortranarray(state.x, np.float64))  # another order and type are taken
+    first = envs.step(np.zeros((3, 2), np.float32, order="F"), None, True)
+    envs.state = state
+    np.testing.assert_array_equal(envs.step(np.zeros((3, 2), np.float32, order="F"), None, True).final_x, first.final_x)
+
+
+@needs_compiler
 def test_auto_takes_machine_code_unless_something_speaks_against_it():
     assert isinstance(BallbotVectorEnv(1).batch, native.BallbotNative)
     assert isinstance(BallbotVectorEnv(2000).batch, native.BallbotNative)
