@@ -11,7 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import casadi
+try:
+    import casadi
+except ImportError as error:
+    raise ImportError(
+        'environments in machine code need CasADi: pip install "ballbot-gym[baselines]", or give engine="torch"'
+    ) from error
 
 from ballbot_gym import dynamics, ops
 from ballbot_gym.params import BallbotParams

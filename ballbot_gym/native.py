@@ -17,19 +17,12 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from ballbot_gym import machine_code
+from ballbot_gym import codegen, machine_code
 from ballbot_gym.batch import BatchState, BatchStep, check_num_envs, seeds_of
 from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
-
-try:
-    from ballbot_gym import codegen
-except ImportError as error:
-    raise ImportError(
-        'environments in machine code need CasADi: pip install "ballbot-gym[baselines]", or give engine="torch"'
-    ) from error
 
 _FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096

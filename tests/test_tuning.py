@@ -35,11 +35,11 @@ def test_a_training_has_the_env_steps_that_are_asked_for():
 
 
 class Fake:
-    """A learner that gets better with every iteration, the more so the nearer its learning rate is to 1e-3."""
+    """A learner that gets better with every iteration, the more so the nearer its learning rate is to 2e-3."""
 
     def __init__(self, settings, seed):
         self.iteration, self.iterations = 0, settings.rl_iterations
-        self._off = abs(settings.learning_rate - 1e-3) * 1000 + 0.01 * seed
+        self._off = abs(settings.learning_rate - 2e-3) * 1000 + 0.01 * seed
 
     def iterate(self):
         self.iteration += 1
@@ -62,14 +62,14 @@ def fakes(monkeypatch):
     monkeypatch.setattr(type(LEARNERS["ppo"]), "make", make)
     monkeypatch.setattr(tuning.training, "validate", lambda network, task, robot: Validation(network, 1.0, 0, network))
     monkeypatch.setattr(tuning.training, "score", lambda network, task, robot: Score(network, 0.1, 0.1, 1.0, 0))
-    space = {"learning_rate": Range(1e-4, 5e-3), "batch_size": Choice((512, 1024, 2048))}
+    space = {"learning_rate": Range(1e-4, 5e-3), "batch_size": Choice((512, 3072, 2048))}
     space["hidden"] = Choice(((64, 64), (128, 128)))
     monkeypatch.setitem(tuning.SPACES, "ppo", space)
     monkeypatch.setattr(tuning, "_STARTUP_TRIALS", 2)
     return made
 
 
-SEARCH = Search("ppo", "stabilize", (0, 1), 100_000, 3)
+SEARCH = Search("ppo", "stabilize", (0, 1), 600_000, 3)
 
 
 def trials(folder):
