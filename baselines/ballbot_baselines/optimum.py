@@ -46,9 +46,7 @@ _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest fi
 _SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
 _GRID_DOUBT = 0.002  # relative: how differently the coarse grid may order choices of sides; 0.0007 was measured
 _GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip: 130 to 270 are common
-_GRIPPING_DOUBT = (
-    0.02  # in place of both doubts: friction is left out of the prediction, and coarse grids are rough about it
-)
+_GRIPPING_DOUBT = 0.02  # in place of both doubts: predictions leave friction out, coarse grids are rough about it
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
@@ -439,9 +437,9 @@ def _solve_likely_sides(
     robot then moves. Each search starts from that predicted motion, and from the choice's guessed path if that fails. Where
     there is no motion without obstacles, nothing is solved.
     """
-    grips = params.grips
-    iterations = _GRIPPING_ITERATIONS if grips else _QUICK_ITERATIONS
-    side_doubt, grid_doubt = (_GRIPPING_DOUBT, _GRIPPING_DOUBT) if grips else (_SIDE_DOUBT, _GRID_DOUBT)
+    iterations, side_doubt, grid_doubt = _QUICK_ITERATIONS, _SIDE_DOUBT, _GRID_DOUBT
+    if params.grips:
+        iterations, side_doubt, grid_doubt = _GRIPPING_ITERATIONS, _GRIPPING_DOUBT, _GRIPPING_DOUBT
     far, near = (
         _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, iterations, barrier)
         for barrier in (_BARRIER, _NEAR_BARRIER)

@@ -19,3 +19,8 @@ def linear(start: float, final_fraction: float, progress: float) -> float:
 def geometric(start: float, end: float, progress: float) -> float:
     """Goes from `start` to `end`, both positive, by the same factor in every iteration."""
     return start * (end / start) ** progress
+
+
+def discount(start: float, end: float, progress: float) -> float:
+    """A discount factor that goes from `start` to `end`, both below 1: 1 less it goes there geometrically."""
+    return 1 - geometric(1 - start, 1 - end, progress)

@@ -234,7 +234,7 @@ class Ppo(ModelFree):
         std = schedules.geometric(self._std, config.final_std, progress)
         self._log_std.data.fill_(np.log(std))
         if config.final_gamma is not None:
-            self._raise_gamma(1 - schedules.geometric(1 - config.gamma, 1 - config.final_gamma, progress))
+            self._raise_gamma(schedules.discount(config.gamma, config.final_gamma, progress))
         figures = super()._improve()
         self._average.update_parameters(self._actor)
         return {**figures, "train/gamma": self._model.gamma}

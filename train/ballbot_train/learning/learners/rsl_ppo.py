@@ -321,7 +321,7 @@ class RslPpo:
         for group in self._ppo.optimizer.param_groups:
             group["lr"] = rate
         self._actor.set_std(std)
-        self._set_gamma(1 - schedules.geometric(1 - config.gamma, 1 - config.final_gamma, progress))
+        self._set_gamma(schedules.discount(config.gamma, config.final_gamma, progress))
         ended = early = paid = 0.0
         with torch.no_grad():
             for _ in range(config.num_steps):
