@@ -10,9 +10,9 @@ from stable_baselines3 import PPO, SAC
 
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
-from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.learning.critics import CriticInputs, value_of_living
+from ballbot_train.learning.critics import CriticInputs, relative_advantages, value_of_living
 from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
@@ -140,6 +140,16 @@ def test_the_discount_of_ppo_rises_and_takes_all_values_with_it():
     logged = [learner.iterate()["train/gamma"] for _ in range(3)]
     assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
     assert learner._model.rollout_buffer.gamma == learner._env.batch.gamma == learner._model.gamma
+
+
+def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
+    learner = make("ppo", relative_advantages=1.0)
+    learner.iterate()
+    buffer = learner._model.rollout_buffer
+    living = value_of_living(make_task("stabilize"), learner.config.reward_scale, learner._model.gamma)
+    returns, values = torch.as_tensor(buffer.returns), torch.as_tensor(buffer.values)
+    torch.testing.assert_close(torch.as_tensor(buffer.advantages), relative_advantages(returns, values, living))
+    assert buffer.advantages.std() == pytest.approx(1, abs=0.02)
 
 
 def test_demonstrations_of_another_task_are_refused(name, demos):
@@ -293,7 +303,7 @@ def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
     for given, turned in zip(actions, (framed.actions, framed.executed), strict=True):
         for observation, action, there in zip(observations, given, turned, strict=True):
             _, back = frame.features(tuple(observation))
-            np.testing.assert_allclose(np.tanh(back(tuple(np.arctanh(there)))), action, atol=2e-4)
+            np.testing.assert_allclose(REACH * np.array(back(tuple(there))), action, atol=1e-6)
 
 
 def test_sac_in_a_frame_goes_on_from_a_state_as_if_never_stopped():

@@ -58,6 +58,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     [
         ("orbit", {"frame": "radial"}),
         ("weave", {"frame": "slalom"}),
+        ("orbit", {"frame": "radial", "squash": "tanh_in_frame"}),
         ("stabilize", {"odd": True, "linear": False, "squash": "clip"}),
         ("weave", {"mirrors": True, "activation": "silu"}),
     ],

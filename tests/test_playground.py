@@ -121,6 +121,7 @@ def test_every_function_of_every_task_is_what_python_computes(engine, tmp_path, 
         ("stabilize", {"odd": True, "linear": False}),
         ("weave", {"activation": "silu", "mirrors": True}),
         ("weave", {"frame": "slalom"}),
+        ("orbit", {"frame": "radial", "squash": "tanh_in_frame"}),
     ],
 )
 def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(name, fields, tmp_path, rng):

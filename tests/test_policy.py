@@ -34,7 +34,7 @@ def network_of(task, **fields):
 
 
 @pytest.mark.parametrize("name", TASKS)
-@pytest.mark.parametrize("squash", ["tanh", "clip"])
+@pytest.mark.parametrize("squash", ["tanh", "clip", "tanh_in_frame"])
 def test_a_saved_policy_acts_as_before(name, squash, tmp_path):
     task = TASKS[name]()
     network = network_of(task, squash=squash, linear=squash == "tanh", activation="relu")

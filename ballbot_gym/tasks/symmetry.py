@@ -32,6 +32,9 @@ MIRROR_Y = Mirror((1, -1, 1, -1, 1, -1, 1, -1), (1, -1))
 HALF_TURN = Mirror((-1,) * 8, (-1, -1))
 """Both mirrors one after the other: a rotation by 180°."""
 
+REACH = 2**0.5
+"""Actions in a frame, each component within ±REACH, include all actions of the world, however the frame is turned."""
+
 Back = Callable[[tuple[Any, Any]], tuple[Any, Any]]
 """Turns an action in a frame into the action in the world."""
 

@@ -20,7 +20,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.policy_files import (
     OBSERVATION_VERSION,
     SHIPPED,
@@ -101,7 +101,9 @@ class PolicyNetwork(torch.nn.Module):
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
-        return output if self.linear is None else output + self.linear(inputs)
+        if self.linear is not None:
+            output = output + self.linear(inputs)
+        return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
 
 
 class PolicyController(ActionController):

@@ -56,8 +56,8 @@ class PolicySpec:
     """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
     mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = ()
     """Signs of the observation and of the action in each mirror image over which the network's output is averaged."""
-    squash: Literal["tanh", "clip"] = "tanh"
-    """How the sum is brought into [−1, 1]."""
+    squash: Literal["tanh", "clip", "tanh_in_frame"] = "tanh"
+    """How the sum is brought into [−1, 1]. "tanh_in_frame" is that of `sac`: tanh, times `REACH`, in the frame, then clip."""
     observation_version: int = OBSERVATION_VERSION
     robot: str = PAPER
     """Name in `ROBOTS` of the robot it was trained on."""

@@ -13,6 +13,8 @@ import torch
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 
+_LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
+
 
 class CriticInputs:
     """An observation as a critic sees it: in the task's frame if one is named, and with the products of its entries."""
@@ -68,6 +70,20 @@ def value_of_living(task: Task, reward_scale: float, gamma: float) -> float:
     """
     paid = reward_scale * task.survival_reward * task.control_dt
     return paid / (1 - gamma) if gamma < 1 else paid * task.steps
+
+
+def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float, power: float = 1.0) -> torch.Tensor:
+    """Advantages relative to the cost to go, normalized, of returns and values of any one shape.
+
+    Args:
+        returns: estimates of the return.
+        values: what the critic expects.
+        living: value of a state without any cost, so that the cost to go is `living` minus the value.
+        power: of the cost to go by which they are divided.
+    """
+    cost = living - values
+    relative = (returns - values) / torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6)) ** power
+    return (relative - relative.mean()) / (relative.std() + 1e-8)
 
 
 def start_at(value: float, linear: torch.nn.Linear, last: torch.nn.Linear) -> None:

@@ -1,29 +1,27 @@
 """Observations, actions and demonstrations as seen in a task's frame, for learners whose networks know nothing of frames.
 
-Actions are turned before tanh squashes them, as `PolicyNetwork` does, so every action of the frame is one of the world.
+Actions of a frame are within ±1, as those of the world are. Times `REACH` and turned they include all of the world's, and the
+others are clipped, as `PolicyNetwork` does with the squash "tanh_in_frame". So a small error of an action is small in both.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from ballbot_gym.tasks.symmetry import Frame
+from ballbot_gym.tasks.symmetry import REACH, Frame
 from ballbot_train.learning.demonstrations import Demos
-
-_MOST = 1 - 1e-4  # of an action before it is turned: at the limit itself it would be endless
 
 
 def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
     """Demonstrations with features in place of observations, and actions as the frame has them."""
     observations, axes = seen_in(frame, demos.observations)
     next_observations, _ = seen_in(frame, demos.next_observations)
-    back = axes.transpose(0, 2, 1)
     return replace(
         demos,
         observations=observations,
         next_observations=next_observations,
-        actions=turned(back, demos.actions),
-        executed=turned(back, demos.executed),
+        actions=_to_frame(axes, demos.actions),
+        executed=_to_frame(axes, demos.executed),
     )
 
 
@@ -31,8 +29,7 @@ def seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndar
     """What a frame shows of observations (n, no), and where its axes are.
 
     Returns:
-        Features (n, size) float32; and (n, 2, 2) float32, the frame's two directions as columns. They turn actions of the
-        frame into those of the world, and are orthonormal, so their transpose leads back.
+        Features (n, size) float32; and (n, 2, 2) float32, the frame's two directions as columns, which are orthonormal.
     """
     features, back = frame.features(tuple(observations.T))
     one, zero = np.ones(len(observations), np.float32), np.zeros(len(observations), np.float32)
@@ -43,6 +40,11 @@ def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*parts), -1).astype(np.float32)
 
 
-def turned(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Actions (n, 2) in [-1, 1] from a frame to the world, for its axes (n, 2, 2), or back for their transpose."""
-    return np.tanh(np.einsum("nij,nj->ni", axes, np.arctanh(actions.clip(-_MOST, _MOST))))
+def to_world(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Actions (n, 2) in [-1, 1] of the frame whose directions are the columns of axes (n, 2, 2), as actions of the world."""
+    return np.clip(REACH * np.einsum("nij,nj->ni", axes, actions), -1.0, 1.0)
+
+
+def _to_frame(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """The actions of the frame that `to_world` turns into actions (n, 2) of the world."""
+    return np.einsum("nji,nj->ni", axes, actions) / np.float32(REACH)

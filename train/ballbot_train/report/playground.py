@@ -23,7 +23,7 @@ from ballbot_gym import certified, drawing, dynamics, files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy_files import PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
@@ -117,6 +117,7 @@ def engine_script(policies: Sequence[str] = ()) -> str:
     data = {
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
+        "reach": REACH,
         "robot": {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")},
         "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
         "force_scale": drawing.FORCE_SCALE,

@@ -21,7 +21,7 @@ from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
 from ballbot_train.learning.demonstrations import Demos
-from ballbot_train.learning.frames import seen_in, turned
+from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
@@ -247,7 +247,7 @@ class TrainingEnv(VecEnvWrapper):
 
     def step_async(self, actions: np.ndarray) -> None:
         if self._frame is not None:
-            actions = turned(self._axes, actions)
+            actions = to_world(self._axes, actions)
         self.venv.step_async(actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:

@@ -4,7 +4,8 @@
 complex dexterous manipulation with deep reinforcement learning and demonstrations", 2018.
 """
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +22,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, average_of, spec_for
-from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, value_of_living
+from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages, value_of_living
 from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
@@ -45,8 +46,8 @@ class PpoConfig(ModelFreeConfig):
     """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
     gae_lambda: float = 0.95
     """λ of generalized advantage estimation."""
-    relative_advantage_floor: float = 0.0
-    """If > 0, every advantage is divided by |value| + this, in scaled rewards, because regret is relative; 0: off."""
+    relative_advantages: float = 0.0
+    """Power of the cost to go, as the critic expects it, by which an advantage is divided, as in `rsl_ppo`; 0: off."""
     learning_rate: float = 1e-3
     """Learning rate at the start."""
     demo_learning_rate: float = 1e-4
@@ -96,15 +97,17 @@ TUNED: dict[str, PpoConfig] = {
 
 
 class RelativeRollouts(RolloutBuffer):
-    """A rollout buffer whose advantages are divided by the absolute value of their state, plus a floor."""
+    """A rollout buffer of advantages relative to the cost to go."""
 
-    def __init__(self, *args: Any, floor: float, **kwargs: Any):
-        self._floor = floor
+    def __init__(self, *args: Any, living: Callable[[float], float], power: float, **kwargs: Any):
+        """Args: living: from a discount factor to the value of living for ever without cost; power: of the cost to go."""
+        self._living, self._power = living, power
         super().__init__(*args, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
         super().compute_returns_and_advantage(last_values, dones)
-        self.advantages /= np.abs(self.values) + self._floor
+        returns, values = torch.as_tensor(self.returns), torch.as_tensor(self.values)
+        self.advantages = relative_advantages(returns, values, self._living(self.gamma), self._power).numpy()
 
 
 class MeanAction(torch.nn.Module):
@@ -195,9 +198,14 @@ class Ppo(ModelFree):
                 if plain
                 else {"spec": spec, "products": config.products, "value": value}
             ),
-            rollout_buffer_class=RelativeRollouts if config.relative_advantage_floor else None,
+            rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
             rollout_buffer_kwargs=(
-                {"floor": config.relative_advantage_floor} if config.relative_advantage_floor else None
+                {
+                    "living": functools.partial(value_of_living, task, config.reward_scale),
+                    "power": config.relative_advantages,
+                }
+                if config.relative_advantages
+                else None
             ),
             seed=seed,
             device="cpu",

@@ -26,14 +26,13 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, average_of, spec_for
-from ballbot_train.learning.critics import CriticInputs, start_at, value_of_living
+from ballbot_train.learning.critics import CriticInputs, relative_advantages, start_at, value_of_living
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch, without_arena
 from ballbot_train.learning.learners.model_free import ScopedRng
 from ballbot_train.learning.rsl import RslVecEnv
 from ballbot_train.policy import PolicyNetwork
 
 _GROUPS = {"actor": ["policy"], "critic": ["critic"]}
-_LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
 
 
 @dataclass(frozen=True)
@@ -145,20 +144,6 @@ class Actor(MLPModel):
         """Sets the standard deviation of both actions."""
         assert isinstance(self.distribution, GaussianDistribution)
         self.distribution.std_param.data.fill_(std)
-
-
-def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float, power: float = 1.0) -> torch.Tensor:
-    """Advantages relative to the cost to go, normalized: (T, B, 1) of returns and values (T, B, 1).
-
-    Args:
-        returns: estimates of the return.
-        values: what the critic expects.
-        living: value of a state without any cost, so that the cost to go is `living` minus the value.
-        power: of the cost to go by which they are divided.
-    """
-    cost = living - values
-    relative = (returns - values) / torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6)) ** power
-    return (relative - relative.mean()) / (relative.std() + 1e-8)
 
 
 def last_layer(network: torch.nn.Module) -> torch.nn.Linear:

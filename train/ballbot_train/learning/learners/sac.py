@@ -213,7 +213,8 @@ class Sac(ModelFree):
 
     @property
     def network(self) -> PolicyNetwork:
-        return as_policy(self._actor.children(), self._task, activation="silu", squash="tanh", frame=self._spec.frame)
+        squash = "tanh" if self._spec.frame is None else "tanh_in_frame"
+        return as_policy(self._actor.children(), self._task, activation="silu", squash=squash, frame=self._spec.frame)
 
     def state_dict(self) -> dict[str, Any]:
         own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}

@@ -49,8 +49,8 @@ class Policy {
       values = affine(layer, values);
       if (i < this.layers.length - 1) values = values.map(activate);
     });
-    if (this.linear === null) return values;
-    return affine(this.linear, inputs).map((value, i) => value + values[i]);
+    if (this.linear !== null) values = affine(this.linear, inputs).map((value, i) => value + values[i]);
+    return this.data.squash === "tanh_in_frame" ? values.map((value) => DATA.reach * Math.tanh(value)) : values;
   }
 }
 
