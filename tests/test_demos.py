@@ -20,6 +20,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.rollout import PlanError
 from ballbot_train.cli import main
 from ballbot_train.learning.demonstrations import DemoConfig, Expert, command_of, load_demos, record, write_demos
+from ballbot_train.policy import load_policy, shipped_policies
 
 
 def make(out, **changes):
@@ -136,6 +137,15 @@ def test_a_new_controller_can_demonstrate(tmp_path, monkeypatch):
     folder = make(tmp_path / "damped-v0", expert="damper")
     data = minari.MinariDataset(folder / "data")
     assert {m["expert"] for m in data.storage.get_episode_metadata(data.episode_indices)} == {"damper"}
+
+
+def test_a_policy_that_comes_with_the_package_can_demonstrate(tmp_path):
+    task = make_task("orbit")
+    demos = load_demos(make(tmp_path / "orbits-v0", task="orbit", expert="dagger", episodes=1), task)
+    policy = load_policy(shipped_policies(task)["dagger"], task)
+    np.testing.assert_allclose(policy.predict(demos.observations)[0], demos.actions, atol=1e-5)
+    with pytest.raises(ValueError, match="unknown expert ppo; known: lqr, trajopt, nmpc, dagger"):
+        DemoConfig("orbit", "ppo")
 
 
 def test_experts_that_take_a_back_off_get_the_one_of_the_dataset():

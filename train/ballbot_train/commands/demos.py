@@ -33,7 +33,8 @@ def demos(
 
     Args:
         task: name of a task.
-        expert: name of a controller, such as trajopt (a plan, tracked by TVLQR), nmpc or lqr.
+        expert: name of a controller, such as trajopt (a plan, tracked by TVLQR), nmpc or lqr, or of a policy that comes with
+            the package.
         episodes: number of episodes, each with a seed of its own.
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
         noise: each episode draws the standard deviation of its noise from [0, this], in units of the force limit.

@@ -49,6 +49,7 @@ from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs, shards
 from ballbot_train.console import check_names
+from ballbot_train.evaluation import controllers
 from ballbot_train.executors import Workers
 from ballbot_train.policy import OBSERVATION_VERSION
 
@@ -64,7 +65,7 @@ class DemoConfig:
     task: str = "stabilize"
     """Name of a task."""
     expert: str = "trajopt"
-    """Name of a controller in `CONTROLLERS`."""
+    """Name of a controller in `CONTROLLERS`, or of a policy that comes with the package."""
     episodes: int = 200
     """Number of episodes."""
     physics: Literal["bullet", "rk4"] = "bullet"
@@ -81,8 +82,8 @@ class DemoConfig:
     """Name of a robot in `ROBOTS`."""
 
     def __post_init__(self) -> None:
-        make_task(self.task, self.robot)
-        check_names("expert", [self.expert], CONTROLLERS)
+        task = make_task(self.task, self.robot)
+        check_names("expert", [self.expert], controllers.names(task, self.robot))
         if not 1 <= self.episodes <= _SEEDS:
             raise ValueError(f"episodes must be 1 to {_SEEDS}, not {self.episodes}")
         if not 0 <= self.seed < 2**32:
@@ -90,7 +91,7 @@ class DemoConfig:
         for name in ("noise", "pushes"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and at least 0, not {getattr(self, name)}")
-        most = round(1 / make_task(self.task, self.robot).control_dt)
+        most = round(1 / task.control_dt)
         if self.pushes > most:
             raise ValueError(f"pushes must be at most {most} per second, one in every control step, not {self.pushes}")
 
@@ -159,11 +160,10 @@ class Expert:
     """A controller as a teacher: it gives its action in states of an episode that others control, and replans if told to."""
 
     def __init__(self, name: str, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
-        """Args: name: in `CONTROLLERS`; backoff: given to a controller whose constructor takes one."""
-        make = cast(Callable[..., Controller], CONTROLLERS[name])
-        controller = make(task, params)
+        """Args: name: as in `DemoConfig`; backoff: given to a controller whose constructor takes one."""
+        controller = controllers.make_controller(name, task, params)
         if "backoff" in inspect.signature(type(controller)).parameters:
-            controller = make(task, params, backoff=backoff)
+            controller = cast(Callable[..., Controller], CONTROLLERS[name])(task, params, backoff=backoff)
         self._task, self._params, self._controller = task, params, controller
         self.plans = self.plans_failed = 0
 
