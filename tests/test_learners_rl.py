@@ -114,13 +114,13 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
 
 
 def test_the_policy_of_ppo_is_a_running_average_of_its_actor():
-    learner = make("ppo")
+    learner = make("ppo", averaged_iterations=2)
     seen, last = [], parameters(learner)
     for _ in range(3):
         learner.iterate()
         actor = torch.cat([value.flatten() for value in learner._actor.network.state_dict().values()])
         seen.append(actor)
-        share = max(0.1, 1 / len(seen))
+        share = max(1 / 2, 1 / len(seen))
         last = last + share * (actor - last)
         torch.testing.assert_close(parameters(learner), last)
     assert not torch.equal(last, seen[-1])

@@ -12,8 +12,6 @@ Symmetry = Literal["none", "odd", "mirrors", "frame"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
 the task's mirror images, or it sees and acts in the task's frame."""
 
-_RETAINED = 0.9  # of an averaged actor at each update
-
 
 def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
     """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
@@ -37,10 +35,10 @@ def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bo
     return PolicySpec.of(task, **fields)
 
 
-def average_of(actor: torch.nn.Module) -> AveragedModel:
-    """A running average of an actor over its last ten or so updates, in `module`; the first updates start it."""
-    return AveragedModel(actor, avg_fn=_towards)
+def average_of(actor: torch.nn.Module, updates: int) -> AveragedModel:
+    """A running average of an actor over about its last so many updates, in `module`; the first updates start it."""
 
+    def towards(kept: torch.Tensor, new: torch.Tensor, done: torch.Tensor | int) -> torch.Tensor:
+        return kept.lerp(new, max(1 / updates, 1 / (1 + int(done))))
 
-def _towards(kept: torch.Tensor, new: torch.Tensor, updates: torch.Tensor | int) -> torch.Tensor:
-    return kept.lerp(new, max(1 - _RETAINED, 1 / (1 + int(updates))))
+    return AveragedModel(actor, avg_fn=towards)

@@ -44,6 +44,8 @@ class PpoConfig(ModelFreeConfig):
     over the task's mirror images, or it sees and acts in the task's frame."""
     final_gamma: float | None = None
     """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
+    averaged_iterations: int = 10
+    """Iterations over which the policy is a running average of the actor."""
     gae_lambda: float = 0.95
     """λ of generalized advantage estimation."""
     relative_advantages: float = 0.0
@@ -219,11 +221,11 @@ class Ppo(ModelFree):
             actor = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
         self._model: PPO
         self._set_model(model, actor, (policy.optimizer,))
-        self._average = average_of(actor)
+        self._average = average_of(actor, config.averaged_iterations)
 
     @property
     def network(self) -> PolicyNetwork:
-        """A running average of the actor over its last ten or so iterations; while it is cloned, the actor."""
+        """A running average of the actor over its last iterations; while it is cloned, the actor."""
         actor = self._actor if self.iteration <= self._clone_iterations else self._average.module
         if isinstance(actor, MeanAction):
             return actor.network

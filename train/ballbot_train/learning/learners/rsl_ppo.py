@@ -56,6 +56,8 @@ class RslPpoConfig:
     final_gamma: float = 0.99
     """Discount factor at the end; 1 less it goes there geometrically. A low one learns fast, but spares force at the
     start of an episode that costs more later."""
+    averaged_iterations: int = 10
+    """Iterations over which the policy is a running average of the actor."""
     gae_lambda: float = 0.9
     """λ of generalized advantage estimation."""
     relative_advantages: float = 0.0
@@ -267,7 +269,7 @@ class RslPpo:
         """Makes actor, critic and algorithm around a policy network."""
         config, seen = self.config, self._seen
         self._actor = Actor(seen, network, self._std)
-        self._average = average_of(network)
+        self._average = average_of(network, config.averaged_iterations)
         self._critic = Critic(seen, config.critic_hidden, self._value_of_living(config.gamma))
         self._ppo = PPO(
             self._actor,
@@ -286,7 +288,7 @@ class RslPpo:
 
     @property
     def network(self) -> PolicyNetwork:
-        """A running average of the actor over its last ten or so iterations."""
+        """A running average of the actor over its last iterations."""
         return cast(PolicyNetwork, self._average.module)
 
     @property
