@@ -84,7 +84,7 @@ class PolicyNetwork(torch.nn.Module):
         return torch.tanh(raw) if self.spec.squash == "tanh" else raw.clamp(-1.0, 1.0)
 
     def raw(self, observation: torch.Tensor) -> torch.Tensor:
-        """(..., 2) before it is squashed."""
+        """(..., 2) before it is squashed; with "tanh_in_frame" before it is clipped, which alone is left to do then."""
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             features, back = self._frame.features(tuple(observation.tolist()))
