@@ -1,6 +1,7 @@
 """Demonstrations: what a dataset promises, and that a kill neither loses nor doubles an episode."""
 
 import json
+import math
 import random
 import shlex
 import signal
@@ -141,7 +142,12 @@ def test_a_new_controller_can_demonstrate(tmp_path, monkeypatch):
 
 def test_a_policy_that_comes_with_the_package_can_demonstrate(tmp_path):
     task = make_task("orbit")
-    demos = load_demos(make(tmp_path / "orbits-v0", task="orbit", expert="dagger", episodes=1), task)
+    folder = make(tmp_path / "orbits-v0", task="orbit", expert="dagger", episodes=1, optima=False)
+    assert "--no-optima" in shlex.split(command_of(folder))
+    data = minari.MinariDataset(folder / "data")
+    (about,) = data.storage.get_episode_metadata(data.episode_indices)
+    assert math.isnan(about["optimum"])
+    demos = load_demos(folder, task)
     policy = load_policy(shipped_policies(task)["dagger"], task)
     np.testing.assert_allclose(policy.predict(demos.observations)[0], demos.actions, atol=1e-5)
     with pytest.raises(ValueError, match="unknown expert ppo; known: lqr, trajopt, nmpc, dagger"):

@@ -11,8 +11,9 @@ dataset shows recoveries too.
 | infos/state (T+1, 8) | states; order and units in `dynamics.STATE` |
 | an episode's metadata | seed, expert, physics, cost, success, failure and the following |
 
-`optimum` is the cost of the optimal undisturbed episode from the same start, NaN if none was found; `solver_status` and
-`violation` are those of its search. `plans` counts the expert's plans, and `plans_failed` its searches that found none.
+`optimum` is the cost of the optimal undisturbed episode from the same start, NaN if none was found or asked for;
+`solver_status` and `violation` are those of its search. `plans` counts the expert's plans, and `plans_failed` its searches
+that found none.
 
 `load_demos` reads a dataset for learners. Datasets of any size are shards: `write_shards` makes them, and `StreamedDemos`
 reads them one by one.
@@ -56,6 +57,7 @@ from ballbot_train.policy import OBSERVATION_VERSION
 _CHUNK = 5  # episodes of a job
 _ARRAYS = "npz"  # where an entry holds the arrays of its episode
 _SEEDS = 1_000_000  # episode seeds per dataset seed, so that datasets of different seeds share none
+_NOT_SEARCHED = {"optimum": math.nan, "solver_status": "not searched", "violation": math.nan}
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,8 @@ class DemoConfig:
     """Seed of the dataset."""
     robot: str = PAPER
     """Name of a robot in `ROBOTS`."""
+    optima: bool = True
+    """Whether each episode's optimum is searched too. Learners do not need it."""
 
     def __post_init__(self) -> None:
         task = make_task(self.task, self.robot)
@@ -526,9 +530,13 @@ def command_of(path: str | Path) -> str:
         options |= (
             {f"{name}.{part}": each for part, each in value.items()} if isinstance(value, dict) else {name: value}
         )
-    return shlex.join(
-        ["ballbot", "demos", *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
-    )
+    words = ["ballbot", "demos"]
+    for name, value in options.items():
+        if isinstance(value, bool):
+            words.append(f"--{name}" if value else f"--no-{name}")
+        else:
+            words += [f"--{name}", str(value)]
+    return shlex.join(words)
 
 
 def _metadata(path: Path) -> dict[str, Any]:
@@ -557,7 +565,7 @@ def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jo
             "seed": config.episode_seed(i),
             "expert": config.expert,
             "physics": config.physics,
-            **_optimum(env, recording.states[0], info["constants"]),
+            **(_optimum(env, recording.states[0], info["constants"]) if config.optima else _NOT_SEARCHED),
             "cost": env.task.survival_pay - float(recording.rewards.sum()),
             "success": bool(info["success"]),
             "failure": bool(info["failure"]),
