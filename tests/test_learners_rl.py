@@ -8,6 +8,7 @@ import pytest
 import torch
 from stable_baselines3 import PPO, SAC
 
+from ballbot_gym import dynamics
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
@@ -248,7 +249,8 @@ def test_without_products_the_networks_are_those_of_stable_baselines3(name):
         kwargs = {"net_arch": [16, 8], "n_critics": config.num_critics, "activation_fn": torch.nn.SiLU}
         plain = SAC("MlpPolicy", learner._env, buffer_size=100, policy_kwargs=kwargs, seed=0)
     assert type(model.policy) is type(plain.policy)
-    set_by_us = ("log_std", "actor.log_std.weight", "actor.log_std.bias")
+    set_by_us = {"log_std", "actor.log_std.weight", "actor.log_std.bias"}
+    set_by_us |= {f"{kind}.qf{i}.4.bias" for kind in ("critic", "critic_target") for i in range(2)}
     for key, expected in plain.policy.state_dict().items():
         assert key in set_by_us or torch.equal(model.policy.state_dict()[key], expected), key
 
@@ -290,6 +292,46 @@ def test_sac_sees_and_acts_in_the_frame_of_its_task(task):
     with torch.no_grad():
         expected = learner.network(batch.observe(batch.state))
     np.testing.assert_allclose(learner._env.venv._actions, expected, atol=1e-6)  # float32
+
+
+@pytest.mark.parametrize("demonstrated", [False, True])
+def test_sac_with_mirrors_learns_from_mirror_images_and_acts_the_same_in_them(demonstrated, demos):
+    learner = run(make("sac", demos if demonstrated else None, symmetry="mirrors"))
+    spec = spec_for(make_task("stabilize"), "mirrors", (16, 8))
+    assert learner.network.spec.mirrors == spec.mirrors
+    observation = observed(20)
+    with torch.no_grad():
+        for signs, acted in spec.mirrors:
+            given, there = learner.network(observation), learner.network(torch.tensor(signs) * observation)
+            torch.testing.assert_close(there, torch.tensor(acted) * given)
+    drawn = learner._replay.sample(400)
+    steps = learner._replay.observations.reshape(-1, 8)
+    if demonstrated:
+        steps = np.concatenate([steps, load_demos(demos, make_task("stabilize")).observations])
+    images = [np.ones(8), *(np.array(signs) for signs, _ in spec.mirrors)]
+    for sample in drawn.observations.numpy()[:50]:
+        assert any((steps == (signs * sample).astype(np.float32)).all(1).any() for signs in images)
+    assert not all((steps == sample).all(1).any() for sample in drawn.observations.numpy())
+
+
+def test_a_mirrored_sample_is_a_step_of_the_mirrored_robot():
+    learner = run(make("sac", symmetry="mirrors"), 1)
+    task, params = make_task("stabilize"), default_params()
+    scale, substeps = np.array(task.observation_scale), dynamics.substeps_for(task.control_dt)
+    drawn = learner._replay.sample(50)
+    for before, action, after, done in zip(*(part.numpy() for part in drawn[:4]), strict=True):
+        state = dynamics.step(params, tuple(scale * before), tuple(350.0 * action), task.control_dt, substeps)
+        assert done or np.abs(np.array(state) / scale - after).max() < 1e-5
+
+
+@pytest.mark.parametrize("products", [False, True])
+def test_the_critics_of_sac_start_near_the_value_of_living(products):
+    learner = make("sac", products=products)
+    settings = learner.config
+    value = settings.reward_scale * 100 * 0.02 / (1 - settings.gamma)
+    with torch.no_grad():
+        values = torch.cat(learner._model.critic(0.1 * observed(20), torch.zeros(20, 2)))
+    assert (values - value).abs().max() < 0.3 * value
 
 
 def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):

@@ -27,6 +27,10 @@ _MOST_UNITS = 1_000_000  # of a layer
 _DESCRIPTION_LIMIT = 2**24  # bytes
 
 
+Mirrors = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+"""Signs of the observation and of the action in each mirror image."""
+
+
 class PolicyError(ValueError):
     """A policy file that is missing, damaged, or belongs to another task or observation."""
 
@@ -54,8 +58,8 @@ class PolicySpec:
     """Whether opposite observations get opposite actions, exactly: no biases. Needs an odd activation."""
     frame: str | None = None
     """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
-    mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = ()
-    """Signs of the observation and of the action in each mirror image over which the network's output is averaged."""
+    mirrors: Mirrors = ()
+    """Mirror images over which the network's output is averaged."""
     squash: Literal["tanh", "clip", "tanh_in_frame"] = "tanh"
     """How the sum is brought into [−1, 1]. "tanh_in_frame" is that of `sac`: tanh, times `REACH`, in the frame, then clip."""
     observation_version: int = OBSERVATION_VERSION

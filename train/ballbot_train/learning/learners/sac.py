@@ -31,6 +31,7 @@ from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
 from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy_files import Mirrors
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,9 @@ class SacConfig(ModelFreeConfig):
     imitation_weight: float = 300.0
     gradient_steps: int = 4
     """Gradient steps after each control step of all envs."""
-    symmetry: Literal["none", "frame"] = "none"
-    """Whether actor and critics see the task's frame, and act in it."""
+    symmetry: Literal["none", "mirrors", "frame"] = "none"
+    """Whether actor and critics learn from the task's mirror images as well, over which the policy is averaged; or see the
+    task's frame, and act in it."""
     num_critics: int = 2
     """Critics, whose smallest value counts."""
     learning_rate: float = 5e-4
@@ -78,10 +80,12 @@ TUNED: dict[str, SacConfig] = {
 
 
 class SymmetricReplay(ReplayBuffer):
-    """A replay buffer that draws half of its samples from demonstrations, if there are any."""
+    """A replay buffer that draws half of its samples from demonstrations, if there are any, and shows mirror images."""
 
-    def __init__(self, *args: Any, demos: Demos | None, reward_scale: float, **kwargs: Any):
+    def __init__(self, *args: Any, demos: Demos | None, reward_scale: float, mirrors: Mirrors = (), **kwargs: Any):
+        """Args: mirrors: signs of observation and action in each; each sample is as it was, or one of its mirror images."""
         super().__init__(*args, **kwargs)
+        self._mirrors = [(torch.tensor(signs), torch.tensor(acted)) for signs, acted in mirrors]
         self._demos: tuple[torch.Tensor, ...] | None = None
         if demos is not None:
             columns = (
@@ -95,10 +99,22 @@ class SymmetricReplay(ReplayBuffer):
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
         if self._demos is None:
-            return super().sample(batch_size, env)
-        own = super().sample(batch_size // 2, env)
-        chosen = torch.randint(len(self._demos[0]), (batch_size - batch_size // 2,))
-        return ReplayBufferSamples(*(torch.cat([a, b[chosen]]) for a, b in zip(own[:5], self._demos, strict=True)))
+            samples = super().sample(batch_size, env)
+        else:
+            own = super().sample(batch_size // 2, env)
+            chosen = torch.randint(len(self._demos[0]), (batch_size - batch_size // 2,))
+            both = zip(own[:5], self._demos, strict=True)
+            samples = ReplayBufferSamples(*(torch.cat([a, b[chosen]]) for a, b in both))
+        if not self._mirrors:
+            return samples
+        observations, actions, next_observations, dones, rewards, *_ = samples
+        seen = torch.randint(1 + len(self._mirrors), (batch_size, 1))
+        for number, (signs, acted) in enumerate(self._mirrors, 1):
+            here = seen == number
+            observations = torch.where(here, signs * observations, observations)
+            next_observations = torch.where(here, signs * next_observations, next_observations)
+            actions = torch.where(here, acted * actions, actions)
+        return ReplayBufferSamples(observations, actions, next_observations, dones, rewards)
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the buffer, without the demonstrations."""
@@ -187,7 +203,11 @@ class Sac(ModelFree):
             gamma=config.gamma,
             gradient_steps=config.gradient_steps,
             replay_buffer_class=SymmetricReplay,
-            replay_buffer_kwargs={"demos": demos, "reward_scale": config.reward_scale},
+            replay_buffer_kwargs={
+                "demos": demos,
+                "reward_scale": config.reward_scale,
+                "mirrors": self._spec.mirrors,
+            },
             ent_coef=f"auto_{config.ent_coef}",
             target_entropy=config.target_entropy,
             policy_kwargs={
@@ -205,6 +225,10 @@ class Sac(ModelFree):
         actor, log_std = model.actor, cast(torch.nn.Linear, model.actor.log_std)
         torch.nn.init.zeros_(log_std.weight)
         torch.nn.init.constant_(log_std.bias, math.log(config.std if demos is None else config.demo_std))
+        if not config.products:
+            for critic in (*model.critic.q_networks, *model.critic_target.q_networks):
+                last = cast(torch.nn.Linear, cast(torch.nn.Sequential, critic)[-1])
+                torch.nn.init.constant_(last.bias, value)
         self._set_model(
             model,
             torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
@@ -214,7 +238,8 @@ class Sac(ModelFree):
     @property
     def network(self) -> PolicyNetwork:
         squash = "tanh" if self._spec.frame is None else "tanh_in_frame"
-        return as_policy(self._actor.children(), self._task, activation="silu", squash=squash, frame=self._spec.frame)
+        symmetry = {"frame": self._spec.frame, "mirrors": self._spec.mirrors}
+        return as_policy(self._actor.children(), self._task, activation="silu", squash=squash, **symmetry)
 
     def state_dict(self) -> dict[str, Any]:
         own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}
