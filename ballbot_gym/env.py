@@ -15,7 +15,15 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.scene import CAMERA_YAW, Scene, no_display
-from ballbot_gym.simulator import PHYSICS, BulletContactSimulator, State, default_physics, make_simulator
+from ballbot_gym.simulator import (
+    PHYSICS,
+    BulletContactSimulator,
+    Rk4Simulator,
+    State,
+    default_physics,
+    make_simulator,
+)
+from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.viewer import PageScene
 
@@ -55,6 +63,10 @@ class Outcome(NamedTuple):
     clipped: bool
     grip: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     """The floor's force on the ball, N, and the friction that it needs, of robots whose friction is limited."""
+    tilt: float | None = None
+    """rad, if it is known already."""
+    seen: np.ndarray | None = None
+    """(no) float32 observation without noise, if it is known already."""
 
 
 class BallbotEnv(gymnasium.Env):
@@ -141,9 +153,12 @@ class BallbotEnv(gymnasium.Env):
         self._disturbance = (
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )
+        self._noisy = self.randomization.is_noisy
         self.observation_space = observation_space(self.task, self.params)
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
+        self._judge: Judge | None = None  # in machine code
+        self._resets = 0
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
         self._steps_left = 0
@@ -165,6 +180,8 @@ class BallbotEnv(gymnasium.Env):
         self._check_open()
         super().reset(seed=seed)
         x, c = self._draw({} if options is None else options)
+        self._resets += 1
+        self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
         self._set_constants(tuple(c.tolist()))
         self._state = tuple(x.tolist())
         if self._disturbance is not None:
@@ -196,8 +213,11 @@ class BallbotEnv(gymnasium.Env):
         outcome = self._advance(*self._force(action))
         if self.render_mode == "human":
             self.render()
-        reward = sum(outcome.reward)
-        return self._observation(), reward, outcome.terminated, outcome.truncated, self._info(outcome)
+        survive, running, goal = outcome.reward
+        seen = outcome.seen
+        if seen is None or self._noisy:
+            seen = self._observation()
+        return seen, survive + running + goal, outcome.terminated, outcome.truncated, self._info(outcome)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -284,15 +304,17 @@ class BallbotEnv(gymnasium.Env):
 
     def __getstate__(self) -> dict[str, Any]:
         self.np_random  # noqa: B018  an env that was never seeded is seeded here, so that its copy draws the same episodes
-        return {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_scene")}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_scene", "_judge")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._scene = None
+        self._scene = self._judge = None
         self._simulator = make_simulator(self.physics, self.params, self.task.control_dt, self._physics_dt)
         if self._closed:
             self._simulator.close()
         elif self._state:
+            self._use_code(start=False)
+            self._set_constants(self._constants)
             self._restore_simulator()
 
     def close(self) -> None:
@@ -324,8 +346,17 @@ class BallbotEnv(gymnasium.Env):
     def _set_constants(self, c: State) -> None:
         """Makes c the constants of the episode."""
         self._constants, self._constants_array = c, np.array(c, np.float64)
+        if self._judge is not None:
+            self._judge.set_constants(c)
         if self._scene is not None:
             self._scene.set_markers(self.task.markers(self._constants_array))
+
+    def _use_code(self, start: bool) -> None:
+        """Takes machine code if there is some; if start, it is made in the background. `_set_constants` must follow."""
+        if isinstance(self._simulator, Rk4Simulator):
+            self._simulator.use_code(start)
+        if self._judge is None and (code := Judge.made(self.task, start)) is not None:
+            self._judge = Judge(code, self.task)
 
     def _restore_simulator(self) -> None:
         """Puts the simulator into the env's state. Joint positions and velocities are all that Bullet remembers of a step."""
@@ -339,18 +370,22 @@ class BallbotEnv(gymnasium.Env):
         if self._disturbance is not None:
             force = self._disturbance.actuate(force)
             total = self._disturbance.pushed(force, self.np_random)
-        running = task.cost(self._state, force, c) * task.control_dt
         before = self._state
         self._state = x = self._simulator.step(total)
         self._steps_left -= 1
-        violated = task.violated(x, c)
+        judged = None if self._judge is None else self._judge.judge(before, force, x)
+        if judged is None:
+            rate, tilt, violated, reached, seen = task.cost(before, force, c), None, task.violated(x, c), None, None
+        else:
+            rate, tilt, violated, reached, seen = judged
+        running = rate * task.control_dt
         grip = _START.grip
         if self.params.grips:
             grip, lost = self._grip(before, total)
             violated = violated or (GRIP if lost else "")
         failure = violated != ""
         last = self._steps_left == 0
-        success = not failure and (last or task.first_exit) and task.is_goal(x, c)
+        success = not failure and (last or task.first_exit) and (task.is_goal(x, c) if reached is None else reached)
         terminated = failure or (success and task.first_exit)
         survive = task.survival_reward * task.control_dt
         ahead = survive * self._steps_left  # for the time that remains
@@ -358,7 +393,8 @@ class BallbotEnv(gymnasium.Env):
         if terminated:
             self._steps_left = 0
         cost = running + ahead * failure
-        return Outcome(terminated, last and not terminated, reward, cost, force, success, violated, clipped, grip)
+        truncated = last and not terminated
+        return Outcome(terminated, truncated, reward, cost, force, success, violated, clipped, grip, tilt, seen)
 
     def _grip(self, x: State, total: tuple[float, float]) -> tuple[tuple[float, ...], bool]:
         """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
@@ -406,16 +442,17 @@ class BallbotEnv(gymnasium.Env):
         return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
-        if np.shape(action) != (2,):
-            raise ValueError(f"action must have shape (2,), not {np.shape(action)}")
-        ax, ay = float(action[0]), float(action[1])
+        is_array = isinstance(action, np.ndarray)
+        shape = action.shape if is_array else np.shape(action)
+        if shape != (2,):
+            raise ValueError(f"action must have shape (2,), not {shape}")
+        ax, ay = map(float, action.tolist() if is_array else action)
+        limit = self.params.force_limit
+        if -1.0 <= ax <= 1.0 and -1.0 <= ay <= 1.0:
+            return (limit * ax, limit * ay), False
         if not (math.isfinite(ax) and math.isfinite(ay)):
             raise ValueError(f"action must be finite, not {[ax, ay]}")
-        clipped = not (-1.0 <= ax <= 1.0 and -1.0 <= ay <= 1.0)
-        if clipped:
-            ax, ay = min(max(ax, -1.0), 1.0), min(max(ay, -1.0), 1.0)
-        limit = self.params.force_limit
-        return (limit * ax, limit * ay), clipped
+        return (limit * min(max(ax, -1.0), 1.0), limit * min(max(ay, -1.0), 1.0)), True
 
     def _observed(self) -> tuple[float, ...]:
         """(no) observation of the present state, with the sensors' noise."""
@@ -428,11 +465,14 @@ class BallbotEnv(gymnasium.Env):
         return np.array(self._observed(), np.float32)
 
     def _info(self, outcome: Outcome) -> dict[str, Any]:
+        survive, running, goal = outcome.reward
         info = {
             "state": np.array(self._state),
             "cost": outcome.cost,
-            **dict(zip(REWARD_PARTS, outcome.reward, strict=True)),
-            "tilt": dynamics.tilt(self._state),
+            "reward_survive": survive,
+            "reward_cost": running,
+            "reward_goal": goal,
+            "tilt": dynamics.tilt(self._state) if outcome.tilt is None else outcome.tilt,
             "success": outcome.success,
             "failure": outcome.violated != "",
             "violated": outcome.violated,

@@ -146,7 +146,7 @@ class BallbotLoop:
         if restart and begun:
             observation = np.array([single.seen() for single in self._singles], np.float32)
             tilt = np.array([dynamics.tilt(single._state) for single in self._singles], self.dtype)
-        terminated, truncated, reward, cost, force, success, violated, clipped, grip = zip(*outcomes, strict=True)
+        terminated, truncated, reward, cost, force, success, violated, clipped, grip, *_ = zip(*outcomes, strict=True)
         index = np.array([self._index[name] for name in violated])
         fields: Any = {
             "observation": observation,
@@ -214,7 +214,9 @@ class _Single(BallbotEnv):
 
     def remember(self, x: Any, c: Any, taken: int, episode: int, seed: int, drawn: Any, actuator: Any) -> None:
         """Goes on from a `memory`."""
-        self._state, self._constants = tuple(x), tuple(c)
+        self._use_code(start=episode > 0)
+        self._set_constants(tuple(c))
+        self._state = tuple(x)
         self.taken, self.episode, self.seed = taken, episode, seed
         self._steps_left = self.task.steps - taken
         if self._disturbance is not None:

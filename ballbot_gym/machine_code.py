@@ -130,8 +130,15 @@ def _is_whole(path: Path) -> bool:
 
 
 @cache
+def compiler() -> str | None:
+    """The path of a C compiler; None where there is none."""
+    return shutil.which(os.environ.get("CC", "cc")) or shutil.which("gcc") or shutil.which("clang")
+
+
+@cache
 def _compiler() -> str | None:
-    path = shutil.which(os.environ.get("CC", "cc")) or shutil.which("gcc") or shutil.which("clang")
+    """The same, and a word in the log where there is none."""
+    path = compiler()
     if path is None:
         _log.warning("no C compiler found: optimization and many environments at once are several times slower")
     return path

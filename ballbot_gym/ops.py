@@ -1,4 +1,4 @@
-"""Elementary functions for robot and tasks, which then work with floats, NumPy, CasADi and torch alike.
+"""Elementary functions for robot and tasks, which then work with floats, NumPy, CasADi and torch alike, and with `traced`.
 
 A vector is an array whose last axis holds the components (NumPy, torch), a column (CasADi), or a tuple of components.
 A tuple's components may be floats, arrays of one shape, tensors or symbols. This layout is fast both for one robot in pure
@@ -20,7 +20,8 @@ Vector = Any
 
 def _library(a: Any) -> ModuleType:
     """The library of `a`. It is already imported, because `a` exists."""
-    return sys.modules.get(type(a).__module__.partition(".")[0], np)
+    module = type(a).__module__
+    return sys.modules.get(module if module == "ballbot_gym.traced" else module.partition(".")[0], np)
 
 
 def sin(a: Any) -> Any:
@@ -76,7 +77,7 @@ def where(condition: Any, a: Any, b: Any) -> Any:
     if library.__name__ == "torch":
         as_tensor = functools.partial(library.as_tensor, device=condition.device)
         return library.where(condition, as_tensor(a), as_tensor(b))
-    return np.where(condition, a, b)
+    return library.where(condition, a, b)
 
 
 def between(z: Any, low: Any, high: Any) -> Any:
@@ -86,7 +87,10 @@ def between(z: Any, low: Any, high: Any) -> Any:
 
 def squared(*parts: Any) -> Any:
     """Sum of the squares of components."""
-    return sum(part * part for part in parts)
+    total: Any = 0
+    for part in parts:  # sum() rounds floats otherwise from Python 3.12 on
+        total = total + part * part
+    return total
 
 
 def scaled(parts: tuple[Any, ...], scale: tuple[float, ...], like: Vector) -> Vector:

@@ -20,6 +20,7 @@ from typing import Protocol
 from ballbot_gym import dynamics
 from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.step_code import Motion
 
 State = tuple[float, ...]
 """(8,) state as a tuple of floats; order and units in `dynamics.STATE`."""
@@ -62,15 +63,24 @@ class Rk4Simulator:
             dynamics.substeps_for(control_dt) if physics_dt is None else _whole_substeps(control_dt, physics_dt)
         )
         self._x: State = (0.0,) * 8
+        self._motion: Motion | None = None  # in machine code
 
     def reset(self, x: State) -> None:
         self._x = x
 
     def set_params(self, params: BallbotParams) -> None:
         self._params = params
+        if self._motion is not None:
+            self._motion.set_params(params)
+
+    def use_code(self, start: bool) -> None:
+        """Takes machine code if there is some; if start, it is made in the background."""
+        if self._motion is None and (code := Motion.made(self._params.rolls, start)) is not None:
+            self._motion = Motion(code, self._params, self._dt, self._substeps)
 
     def step(self, u: tuple[float, float]) -> State:
-        self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps)
+        x = None if self._motion is None else self._motion.step(self._x, u)
+        self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps) if x is None else x
         return self._x
 
     def floor_force(self) -> None:

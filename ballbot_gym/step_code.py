@@ -1,0 +1,193 @@
+"""What one environment computes in a control step, in machine code: the closed form, and what a task says of the step.
+
+`traced` writes the C code, and `machine_code` compiles it in the background, within a fraction of a second, once per machine
+and content. Until then, and where there is no compiler, Python computes the same: machine code is used only where it gave
+the very bits of Python in a trial, and not for results that are no finite numbers, where Python may raise an error. So
+nobody can tell from the results which of both computed them.
+"""
+
+import contextlib
+import ctypes
+import logging
+import os
+import struct
+import threading
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ballbot_gym import dynamics, machine_code, ops, traced
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+_log = logging.getLogger(__name__)
+
+_ROBOT = ("moving_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "ball_radius")
+"""What the equations of motion take of a robot."""
+
+_TRIALS = 64
+_MOVED = struct.Struct("9d")  # whether all is finite, and a state
+_HELD = struct.Struct("10d")  # a state and a force
+_JUDGED = struct.Struct("5d")  # whether all is finite, cost rate, tilt, violated limit, goal reached
+_STEP = struct.Struct("18d")  # a state, a force and the state after it
+
+State = tuple[float, ...]
+
+
+class Code(NamedTuple):
+    """A function of `traced.function`."""
+
+    call: Callable[[ctypes.c_void_p], None]
+    results: int
+    arguments: int
+
+
+class _Work:
+    """A function's numbers in memory: of one simulator or one env."""
+
+    def __init__(self, code: Code, in_place: bool = False):
+        self.first = 1 if in_place else 1 + code.results  # of the arguments
+        self.bytes = bytearray(8 * (self.first + code.arguments))
+        self.numbers = np.frombuffer(self.bytes)
+        self.at = ctypes.c_void_p(self.numbers.ctypes.data)
+
+
+class Motion:
+    """RK4 steps of the closed form."""
+
+    def __init__(self, code: Code, params: BallbotParams, dt: float, substeps: int):
+        work = _Work(code, in_place=True)
+        self._call, self._bytes, self._at, self._numbers = code.call, work.bytes, work.at, work.numbers
+        self._substeps = range(substeps)
+        self._numbers[11] = dt / substeps
+        self.set_params(params)
+
+    @staticmethod
+    def made(rolls: bool, start: bool) -> Code | None:
+        """The code for robots whose ball rolls, or does not; see `_code`."""
+
+        def compute(x: tuple, u: tuple, dt: tuple, robot: tuple) -> tuple:
+            params: Any = SimpleNamespace(rolls=rolls, **dict(zip(_ROBOT, robot, strict=True)))
+            return dynamics.step(params, x, u, dt[0], 1)
+
+        return _code(("motion", rolls), compute, (8, 2, 1, len(_ROBOT)), True, start)
+
+    def set_params(self, params: BallbotParams) -> None:
+        """Replaces the robot by one whose ball rolls as well, or as little."""
+        self._numbers[12:] = [getattr(params, name) for name in _ROBOT]
+
+    def step(self, x: State, u: tuple[float, float]) -> State | None:
+        """The state after the force u, N, was held; None where Python must compute it."""
+        _HELD.pack_into(self._bytes, 8, *x, *u)
+        for _ in self._substeps:
+            self._call(self._at)
+        check, *end = _MOVED.unpack_from(self._bytes)
+        return tuple(end) if check == 0 else None
+
+
+class Judge:
+    """What a task says of control steps."""
+
+    def __init__(self, code: Code, task: Task):
+        work = _Work(code)
+        self._call, self._bytes, self._at, self._numbers = code.call, work.bytes, work.at, work.numbers
+        self._first = work.first
+        self._seen = self._numbers[5 : 5 + len(task.observation_scale)]
+        self._names = (*task.limit_names, "")  # the last one has index −1
+
+    @staticmethod
+    def made(task: Task, start: bool) -> Code | None:
+        """The code for a task; see `_code`. There is none for a task that has its own idea of failure or success."""
+        kind = type(task)
+        if kind.violated is not Task.violated or kind.is_goal is not Task.is_goal:
+            return None
+
+        def compute(before: tuple, u: tuple, x: tuple, c: tuple) -> tuple:
+            limits, goal = task.limits(x, c), task.goal(x, c)
+            violated, reached = -1.0, 1.0
+            for i in reversed(range(len(limits))):
+                violated = ops.where(limits[i] >= 0, violated, float(i))
+            for excess in goal:
+                reached = ops.where(excess <= 0, reached, 0.0)
+            judged = (task.cost(before, u, c), dynamics.tilt(x), violated, reached)
+            return (*judged, *task.observe(x, c), *limits, *goal)
+
+        return _code(task, compute, (8, 2, 8, len(task.constant_names)), False, start)
+
+    def set_constants(self, c: State) -> None:
+        """Makes c the constants of the episode."""
+        self._numbers[self._first + 18 :] = c
+
+    def judge(self, before: State, force: tuple[float, float], x: State) -> tuple | None:
+        """Cost rate, 1/s, tilt, rad, the violated limit's name or "", whether the goal holds, and what is seen in state x,
+        which a force led to; None where Python must compute it.
+        """
+        _STEP.pack_into(self._bytes, 8 * self._first, *before, *force, *x)
+        self._call(self._at)
+        check, rate, tilt, violated, reached = _JUDGED.unpack_from(self._bytes)
+        if check != 0:
+            return None
+        return rate, tilt, self._names[int(violated)], reached != 0, self._seen.astype(np.float32)
+
+
+_codes: dict[Any, Code | None] = {}
+_begun: set[Any] = set()
+
+
+def _code(
+    key: Any, compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_place: bool, start: bool
+) -> Code | None:
+    """The code of a function; None where there is none, or none yet. If start, it is made in the background."""
+    try:
+        if start and key not in _begun and machine_code.compiler() is not None:
+            _begun.add(key)
+            with contextlib.suppress(RuntimeError):  # there can be no more threads
+                threading.Thread(target=_make, args=(key, compute, counts, in_place), name="ballbot-code").start()
+        return _codes.get(key)
+    except TypeError:  # a task that has no hash
+        return None
+
+
+def _make(key: Any, compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_place: bool) -> None:
+    try:
+        _codes[key] = _checked(compute, counts, in_place)
+    except Exception as error:  # no cache, or whatever code of users raises that meets a traced number
+        _log.info("%s stays in Python: %s: %s", key, type(error).__name__, error)
+        _codes[key] = None
+
+
+def _checked(compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_place: bool) -> Code:
+    """The code of a function, once it has given the bits that Python gives.
+
+    Raises:
+        ArithmeticError: it does not.
+        NoMachineCodeError: see `machine_code.library`.
+        Exception: whatever compute raises that cannot compute with traced numbers.
+    """
+    source = traced.function("compute", compute, counts, in_place)
+    call = ctypes.PyDLL(
+        str(machine_code.library("step", source, traced.FLAGS))
+    ).compute  # it keeps the GIL: it is short
+    call.argtypes, call.restype = (ctypes.c_void_p,), None
+    rng, ends = np.random.default_rng(0), np.cumsum(counts)[:-1]
+    code = Code(call, 0, sum(counts))
+    for _ in range(_TRIALS):
+        given = rng.uniform(-1.5, 1.5, sum(counts))
+        expected = compute(*(tuple(part.tolist()) for part in np.split(given, ends)))
+        code = code._replace(results=len(expected))
+        work = _Work(code, in_place)
+        work.numbers[work.first : work.first + len(given)] = given
+        call(work.at)
+        if (
+            work.numbers[0] == 0
+            and work.numbers[1 : 1 + len(expected)].tobytes() != np.array(expected, float).tobytes()
+        ):
+            raise ArithmeticError("machine code computes other bits than Python")
+    return code
+
+
+if hasattr(os, "register_at_fork"):
+    # a child does not have the threads
+    os.register_at_fork(after_in_child=lambda: _begun.intersection_update(_codes))

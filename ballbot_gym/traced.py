@@ -1,0 +1,167 @@
+"""Numbers that are computed later: what robot and tasks compute with `ops` for floats, written down as C.
+
+The C code does the operations that Python does, in the same order, in float64, and with the same libm. So it computes the
+very bits that Python computes. `codegen` is faster for many robots at once: CasADi simplifies, and compilers may reorder.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+FLAGS = ("-O2", "-ffp-contract=off", "-fno-builtin")
+"""Of compilers, which must neither fuse a product and a sum nor join a sine and a cosine."""
+
+
+class Number:
+    """A float64 that C code will have; a truth value is 1 or 0. Python cannot branch on it."""
+
+    __array_ufunc__ = None  # so that NumPy's floats leave the operators to this class
+
+    def __init__(self, name: str, lines: dict[str, str]):
+        """Args: name: its name in C. lines: what C computes, an expression in each line, with the names of the results."""
+        self.name, self.lines = name, lines
+
+    def made(self, form: str, *others: Any) -> "Number":
+        """The number that an expression gives of this one, {0}, and of others, {1} and so on."""
+        expression = form.format(self.name, *(_name(other) for other in others))
+        return Number(self.lines.setdefault(expression, f"v{len(self.lines)}"), self.lines)
+
+    def __add__(self, other: Any) -> "Number":
+        return self.made("{0} + {1}", other)
+
+    def __radd__(self, other: Any) -> "Number":
+        return self.made("{1} + {0}", other)
+
+    def __sub__(self, other: Any) -> "Number":
+        return self.made("{0} - {1}", other)
+
+    def __rsub__(self, other: Any) -> "Number":
+        return self.made("{1} - {0}", other)
+
+    def __mul__(self, other: Any) -> "Number":
+        return self.made("{0} * {1}", other)
+
+    def __rmul__(self, other: Any) -> "Number":
+        return self.made("{1} * {0}", other)
+
+    def __truediv__(self, other: Any) -> "Number":
+        return self.made("{0} / {1}", other)
+
+    def __rtruediv__(self, other: Any) -> "Number":
+        return self.made("{1} / {0}", other)
+
+    def __pow__(self, other: Any) -> "Number":
+        return self.made("pow({0}, {1})", other)
+
+    def __neg__(self) -> "Number":
+        return self.made("-{0}")
+
+    def __abs__(self) -> "Number":
+        return self.made("fabs({0})")
+
+    def __lt__(self, other: Any) -> "Number":
+        return self.made("{0} < {1}", other)
+
+    def __le__(self, other: Any) -> "Number":
+        return self.made("{0} <= {1}", other)
+
+    def __gt__(self, other: Any) -> "Number":
+        return self.made("{0} > {1}", other)
+
+    def __ge__(self, other: Any) -> "Number":
+        return self.made("{0} >= {1}", other)
+
+    def __eq__(self, other: Any) -> Any:
+        return self.made("{0} == {1}", other)
+
+    def __ne__(self, other: Any) -> Any:
+        return self.made("{0} != {1}", other)
+
+    __hash__: Any = None
+
+    def __bool__(self) -> bool:
+        raise TypeError("a traced number is neither true nor false; take ops.where")
+
+
+def sin(a: Number) -> Number:
+    """Sine."""
+    return a.made("sin({0})")
+
+
+def cos(a: Number) -> Number:
+    """Cosine."""
+    return a.made("cos({0})")
+
+
+def sqrt(a: Number) -> Number:
+    """Square root."""
+    return a.made("sqrt({0})")
+
+
+def exp(a: Number) -> Number:
+    """Exponential."""
+    return a.made("exp({0})")
+
+
+def log(a: Number) -> Number:
+    """Natural logarithm."""
+    return a.made("log({0})")
+
+
+def arccos(a: Number) -> Number:
+    """Arc cosine."""
+    return a.made("acos({0})")
+
+
+def arctan(a: Number) -> Number:
+    """Arc tangent."""
+    return a.made("atan({0})")
+
+
+def where(condition: Number, a: Any, b: Any) -> Number:
+    """a where the condition holds, else b."""
+    return condition.made("{0} != 0 ? {1} : {2}", a, b)
+
+
+def clip(a: Number, low: Any, high: Any) -> Number:
+    """The nearest number in [low, high], as max(min(a, high), low)."""
+    below = a.made("{1} < {0} ? {1} : {0}", high)
+    return below.made("{1} > {0} ? {1} : {0}", low)
+
+
+def function(name: str, compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_place: bool = False) -> str:
+    """C code of a function `void name(double *v)`.
+
+    v[0] becomes 0 if all results are finite, else not a number. The results come next, then the arguments, one after the
+    other.
+
+    Args:
+        name: what it is called.
+        compute: takes tuples of numbers, and gives the results. It uses `ops` for all but arithmetic.
+        counts: how many numbers each of these tuples has.
+        in_place: whether the results replace the first arguments.
+
+    Raises:
+        Exception: whatever compute raises that cannot compute with a `Number`.
+    """
+    lines: dict[str, str] = {}
+    given = [Number(f"a{i}", lines) for i in range(sum(counts))]
+    starts = [sum(counts[:i]) for i in range(len(counts))]
+    results = compute(*(tuple(given[at : at + count]) for at, count in zip(starts, counts, strict=True)))
+    first = 1 if in_place else 1 + len(results)
+    names = [_name(result) for result in results]
+    body = [f"const double a{i} = v[{first + i}];" for i in range(len(given))]
+    body += [f"const double {made} = {expression};" for expression, made in lines.items()]
+    body += [f"v[0] = {' + '.join(f'0 * {n}' for n in names)};"]
+    body += [f"v[{i}] = {n};" for i, n in enumerate(names, start=1)]
+    return f"#include <math.h>\nvoid {name}(double *v) {{\n    " + "\n    ".join(body) + "\n}\n"
+
+
+def _name(value: Any) -> str:
+    """A traced or an ordinary number in C."""
+    if isinstance(value, Number):
+        return value.name
+    number = float(value)
+    if math.isnan(number):
+        return "NAN"
+    return f"({'-' if number < 0 else ''}INFINITY)" if math.isinf(number) else f"({number.hex()})"

@@ -1,0 +1,180 @@
+"""Machine code of single environments: it changes speed, and nothing else."""
+
+import math
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from ballbot_gym import TASKS, BallbotEnv, Randomization, dynamics, machine_code, ops, step_code, traced
+from ballbot_gym.step_code import Judge, Motion
+from ballbot_gym.tasks import Stabilize
+
+needs_compiler = pytest.mark.skipif(machine_code.compiler() is None, reason="no C compiler")
+
+EVERYTHING = Randomization(
+    body_mass=(0.8, 1.2),
+    com_height=(0.9, 1.1),
+    inertia=(0.8, 1.2),
+    actuator_lag=(0.01, 0.03),
+    actuator_delay=(0.0, 0.04),
+    lean_noise=0.01,
+    push_impulse=(0.5, 2.0),
+)
+
+
+@pytest.fixture(autouse=True)
+def nothing_made(monkeypatch):
+    """Forgets all machine code, and what is made in a test afterwards."""
+    monkeypatch.setattr(step_code, "_codes", {})
+    monkeypatch.setattr(step_code, "_begun", set())
+    yield
+    wait()
+
+
+def wait() -> None:
+    """Until all machine code that was asked for is made."""
+    for thread in threading.enumerate():
+        if thread.name == "ballbot-code":
+            thread.join(60)
+
+
+def play(env: BallbotEnv, steps: int = 120) -> list:
+    """What steps with random actions, some of them clipped, give from seed 0 on, with the starts of new episodes."""
+    rng, given = np.random.default_rng(0), [env.reset(seed=0)]
+    for action in rng.uniform(-1.1, 1.1, (steps, 2)).astype(np.float32):
+        given.append(env.step(action))
+        if given[-1][2] or given[-1][3]:
+            given.append(env.reset())
+    return given
+
+
+def bits(given: list) -> list:
+    """The same with the bits of all numbers and the types of everything."""
+
+    def of(part):
+        if isinstance(part, np.ndarray):
+            return part.dtype, part.shape, part.tobytes()
+        if isinstance(part, dict):
+            return [(key, of(value)) for key, value in part.items()]
+        return type(part), part.hex() if isinstance(part, float) else part
+
+    return [[of(part) for part in row] for row in given]
+
+
+@needs_compiler
+@pytest.mark.parametrize("randomization", [None, EVERYTHING], ids=["nominal", "randomized"])
+@pytest.mark.parametrize("robot", ["paper", "rolling"])
+@pytest.mark.parametrize("physics", ["rk4", "bullet"])
+@pytest.mark.parametrize("task", TASKS)
+def test_machine_code_gives_the_bits_of_python(task, physics, robot, randomization, monkeypatch):
+    if physics == "bullet":
+        pytest.importorskip("pybullet")
+    env = BallbotEnv(task, physics, robot=robot, randomization=randomization)
+    with monkeypatch.context() as patch:
+        patch.setattr(machine_code, "compiler", lambda: None)
+        python = bits(play(env))
+        assert env._judge is None
+    env.reset(), wait(), env.reset()
+    assert env._judge is not None
+    assert physics == "bullet" or env._simulator._motion is not None
+    assert bits(play(env)) == python
+
+
+@needs_compiler
+@pytest.mark.parametrize("task", TASKS)
+def test_goals_limits_and_ends_are_those_of_python(task):
+    """Random actions reach no goal, so states are put near it."""
+    env = BallbotEnv(task, "rk4", duration=0.1)
+    env.reset(), env.reset(), wait(), env.reset(seed=0)
+    assert env._judge is not None
+    rng, ends = np.random.default_rng(0), set()
+    for i in range(100):
+        x, c = env.task.sample(rng, env.params)
+        reference = env.task.reference(x, c, env.params).x
+        before, after = (tuple((reference[-1] + rng.normal(0, (0.05, 0.5)[i % 2], 8)).tolist()) for _ in range(2))
+        c, force = tuple(c.tolist()), tuple(rng.uniform(-50, 50, 2).tolist())
+        env._judge.set_constants(c)
+        rate, tilt, violated, reached, seen = env._judge.judge(before, force, after)
+        assert rate == env.task.cost(before, force, c)
+        assert tilt == dynamics.tilt(after)
+        assert violated == env.task.violated(after, c)
+        assert reached == env.task.is_goal(after, c)
+        assert seen.tobytes() == np.array(env.task.observe(after, c), np.float32).tobytes()
+        ends.add(reached)
+    assert ends == {True, False}
+
+
+@needs_compiler
+def test_numbers_that_are_not_finite_are_left_to_python(params):
+    Motion.made(False, start=True), Judge.made(Stabilize(), start=True), wait()
+    motion = Motion(Motion.made(False, start=False), params, 0.02, 2)
+    judge = Judge(Judge.made(Stabilize(), start=False), Stabilize())
+    good, bad = (0.1,) * 8, (0.1,) * 4 + (math.inf,) + (0.1,) * 3
+    assert motion.step(good, (1.0, 2.0)) == dynamics.step(params, good, (1.0, 2.0), 0.02, 2)
+    assert motion.step(bad, (1.0, 2.0)) is None
+    assert judge.judge(good, (1.0, 2.0), bad) is None
+    assert judge.judge(good, (1.0, 2.0), good) is not None
+
+
+@dataclass(frozen=True)
+class Branching(Stabilize):
+    """A task that machine code cannot compute."""
+
+    def cost(self, x, u, c):
+        return 1.0 if x[0] > 0 else 2.0
+
+
+@dataclass(frozen=True)
+class OwnFailure(Stabilize):
+    """A task that decides by itself what a failure is."""
+
+    def violated(self, x, c):
+        return ""
+
+
+@pytest.mark.parametrize("task", [Branching(), OwnFailure()])
+def test_tasks_that_machine_code_does_not_know_stay_in_python(task):
+    env = BallbotEnv(task, "rk4")
+    env.reset(), env.reset(), wait(), env.reset()
+    assert env._judge is None
+    assert env.step([0.1, 0.1])[-1]["cost"] >= 0
+
+
+@needs_compiler
+def test_other_bits_than_pythons_are_refused(monkeypatch):
+    written = traced.function
+    monkeypatch.setattr(traced, "function", lambda *args: written(*args).replace(" 0x1.0", " 0x1.00000000001"))
+    with pytest.raises(ArithmeticError):
+        step_code._checked(lambda x: (1.0 * x[0],), (1,), False)
+
+
+@needs_compiler
+def test_whatever_ops_computes_is_computed_alike_in_machine_code():
+    def compute(x):
+        a, b = x
+        squares = 1.0 + a * a, 1.0 + ops.squared(a, b) ** 2
+        condition = ops.where(a < b, a, -b) + (a == b) + (a >= 0.5) - (b <= 0.5) + (a != b) + (a > b)
+        functions = ops.sin(a), ops.cos(b), ops.sqrt(squares[0]), ops.exp(a), ops.log(squares[1]), ops.arctan(b)
+        angle = ops.arccos(ops.clip(a / b, -1.0, 1.0))
+        return (condition, angle, abs(a), 2 / squares[0], 3 - a, ops.where(a > 0, math.inf, b), *functions)
+
+    step_code._checked(compute, (2,), False)  # it compares
+
+
+def test_an_env_of_one_episode_makes_no_machine_code():
+    env = BallbotEnv("stabilize", "rk4")
+    env.reset()
+    assert step_code._begun == set()
+
+
+@needs_compiler
+def test_copies_go_on_in_machine_code():
+    import copy
+
+    env = BallbotEnv("weave", "rk4")
+    env.reset(seed=0), env.reset(), wait(), env.reset()
+    other = copy.deepcopy(env)
+    assert other._judge is not None
+    assert bits([other.step([0.3, -0.2])]) == bits([env.step([0.3, -0.2])])
