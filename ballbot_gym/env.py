@@ -65,8 +65,8 @@ class Outcome(NamedTuple):
     """The floor's force on the ball, N, and the friction that it needs, of robots whose friction is limited."""
     tilt: float | None = None
     """rad, if it is known already."""
-    seen: np.ndarray | None = None
-    """(no) float32 observation without noise, if it is known already."""
+    arrays: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    """(no) float32 observation without noise, (8,) state after the step and (2,) force, if they are known already."""
 
 
 class BallbotEnv(gymnasium.Env):
@@ -182,8 +182,9 @@ class BallbotEnv(gymnasium.Env):
         x, c = self._draw({} if options is None else options)
         self._resets += 1
         self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
-        self._set_constants(tuple(c.tolist()))
-        self._state = tuple(x.tolist())
+        outcome = self._start(x, c)
+        self._set_constants(c)
+        self._state = x
         if self._disturbance is not None:
             self._disturbance.reset(self.np_random)
             if self.randomization.varies_robot:
@@ -192,7 +193,7 @@ class BallbotEnv(gymnasium.Env):
         self._steps_left = self.task.steps
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._info(_START)
+        return self._observation(outcome), self._info(outcome)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -214,10 +215,8 @@ class BallbotEnv(gymnasium.Env):
         if self.render_mode == "human":
             self.render()
         survive, running, goal = outcome.reward
-        seen = outcome.seen
-        if seen is None or self._noisy:
-            seen = self._observation()
-        return seen, survive + running + goal, outcome.terminated, outcome.truncated, self._info(outcome)
+        reward = survive + running + goal
+        return self._observation(outcome), reward, outcome.terminated, outcome.truncated, self._info(outcome)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -375,9 +374,9 @@ class BallbotEnv(gymnasium.Env):
         self._steps_left -= 1
         judged = None if self._judge is None else self._judge.judge(before, force, x)
         if judged is None:
-            rate, tilt, violated, reached, seen = task.cost(before, force, c), None, task.violated(x, c), None, None
+            rate, tilt, violated, reached, arrays = task.cost(before, force, c), None, task.violated(x, c), None, None
         else:
-            rate, tilt, violated, reached, seen = judged
+            rate, tilt, violated, reached, arrays = judged
         running = rate * task.control_dt
         grip = _START.grip
         if self.params.grips:
@@ -394,7 +393,7 @@ class BallbotEnv(gymnasium.Env):
             self._steps_left = 0
         cost = running + ahead * failure
         truncated = last and not terminated
-        return Outcome(terminated, truncated, reward, cost, force, success, violated, clipped, grip, tilt, seen)
+        return Outcome(terminated, truncated, reward, cost, force, success, violated, clipped, grip, tilt, arrays)
 
     def _grip(self, x: State, total: tuple[float, float]) -> tuple[tuple[float, ...], bool]:
         """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
@@ -406,7 +405,26 @@ class BallbotEnv(gymnasium.Env):
         needed = max(map(dynamics.needed_friction, asked))
         return (*asked[0], needed), not dynamics.keeps_grip(robot, asked)
 
-    def _draw(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    def _start(self, x: State, c: State) -> Outcome:
+        """What `reset` reports of a start. Raises a ValueError if it is out of range."""
+        if self._judge is not None:
+            self._judge.set_constants(c)
+            judged = self._judge.judge(x, _START.force, x)
+            if judged is not None and not judged[2]:
+                return _START._replace(tilt=judged[1], arrays=judged[4])
+            if self._state:  # its episode goes on where this one cannot start
+                self._judge.set_constants(self._constants)
+        task = self.task
+        violated = [name for name, limit in zip(task.limit_names, task.limits(x, c), strict=True) if not limit >= 0]
+        if violated:
+            values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
+            raise ValueError(
+                f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
+                f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
+            )
+        return _START
+
+    def _draw(self, options: dict[str, Any]) -> tuple[State, State]:
         """Initial state and constants. Those that the options do not give are drawn."""
         if not isinstance(options, dict):
             raise ValueError(f"options must be a dict with 'state' and 'constants', not {options!r}")
@@ -416,26 +434,17 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError(f"unknown reset options {sorted(options)}; known: 'state', 'constants'")
         task = self.task
         draws = self.np_random.random(task.constant_draws + task.state_draws).tolist()
-        c = np.array(task.draw_constants(tuple(draws[: task.constant_draws]), self.params), np.float64)
+        c = _floats(task.draw_constants(tuple(draws[: task.constant_draws]), self.params))
         if constants is not None:
             if isinstance(constants, dict):
                 constants = self._replaced(c, constants)
-            c = _finite_vector(constants, len(task.constant_names), "constants")
-            task.check_constants(c, self.params)
-        x = np.array(task.draw_state(tuple(draws[task.constant_draws :]), tuple(c.tolist()), self.params), np.float64)
-        if state is not None:
-            x = _finite_vector(state, 8, "state")
-        limits = task.limits(tuple(x.tolist()), tuple(c.tolist()))
-        violated = [name for name, limit in zip(task.limit_names, limits, strict=True) if not limit >= 0]
-        if violated:
-            values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
-            raise ValueError(
-                f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
-                f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
-            )
-        return x, c
+            given = _finite_vector(constants, len(task.constant_names), "constants")
+            task.check_constants(given, self.params)
+            c = _floats(given)
+        x = _floats(task.draw_state(tuple(draws[task.constant_draws :]), c, self.params))
+        return x if state is None else _floats(_finite_vector(state, 8, "state")), c
 
-    def _replaced(self, c: np.ndarray, named: dict[str, float]) -> list[Any]:
+    def _replaced(self, c: State, named: dict[str, float]) -> list[Any]:
         """The drawn constants c, of which some are replaced by name."""
         names = self.task.constant_names
         check_constant_names(self.task, named)
@@ -461,13 +470,18 @@ class BallbotEnv(gymnasium.Env):
             x = self._disturbance.sensed(x, self.np_random)
         return self.task.observe(x, self._constants)
 
-    def _observation(self) -> np.ndarray:
-        return np.array(self._observed(), np.float32)
+    def _observation(self, outcome: Outcome) -> np.ndarray:
+        if outcome.arrays is None or self._noisy:
+            return np.array(self._observed(), np.float32)
+        return outcome.arrays[0]
 
     def _info(self, outcome: Outcome) -> dict[str, Any]:
         survive, running, goal = outcome.reward
+        state, force = (
+            (np.array(self._state), np.array(outcome.force)) if outcome.arrays is None else outcome.arrays[1:]
+        )
         info = {
-            "state": np.array(self._state),
+            "state": state,
             "cost": outcome.cost,
             "reward_survive": survive,
             "reward_cost": running,
@@ -476,7 +490,7 @@ class BallbotEnv(gymnasium.Env):
             "success": outcome.success,
             "failure": outcome.violated != "",
             "violated": outcome.violated,
-            "force": np.array(outcome.force),
+            "force": force,
             "clipped": outcome.clipped,
             "constants": self._constants_array.copy(),
         }
@@ -562,6 +576,10 @@ def check_constant_names(task: Task, named: dict[str, Any]) -> None:
             'the start with options={"state": x}'
         )
     raise ValueError(f"{task.id} has no constants {unknown}; it has {list(task.constant_names)}")
+
+
+def _floats(vector: Sequence[Any] | np.ndarray) -> State:
+    return tuple(map(float, vector))
 
 
 def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:

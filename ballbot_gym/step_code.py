@@ -87,6 +87,11 @@ class Motion:
         return tuple(end) if check == 0 else None
 
 
+Judgement = tuple[float, float, str, bool, tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""Cost rate, 1/s, tilt, rad, the violated limit's name or "", whether the goal holds; and what is seen, float32, state and
+force as arrays."""
+
+
 class Judge:
     """What a task says of control steps."""
 
@@ -94,7 +99,9 @@ class Judge:
         work = _Work(code)
         self._call, self._bytes, self._at, self._numbers = code.call, work.bytes, work.at, work.numbers
         self._first = work.first
-        self._seen = self._numbers[5 : 5 + len(task.observation_scale)]
+        seen, first = len(task.observation_scale), work.first
+        self._seen = self._numbers[5 : 5 + seen]
+        self._force, self._x = self._numbers[first + 8 : first + 10], self._numbers[first + 10 : first + 18]
         self._names = (*task.limit_names, "")  # the last one has index −1
 
     @staticmethod
@@ -120,16 +127,15 @@ class Judge:
         """Makes c the constants of the episode."""
         self._numbers[self._first + 18 :] = c
 
-    def judge(self, before: State, force: tuple[float, float], x: State) -> tuple | None:
-        """Cost rate, 1/s, tilt, rad, the violated limit's name or "", whether the goal holds, and what is seen in state x,
-        which a force led to; None where Python must compute it.
-        """
+    def judge(self, before: State, force: tuple[float, float], x: State) -> "Judgement | None":
+        """What a force, N, costs that led from one state to the state x, and what x is; None where Python must compute it."""
         _STEP.pack_into(self._bytes, 8 * self._first, *before, *force, *x)
         self._call(self._at)
         check, rate, tilt, violated, reached = _JUDGED.unpack_from(self._bytes)
         if check != 0:
             return None
-        return rate, tilt, self._names[int(violated)], reached != 0, self._seen.astype(np.float32)
+        arrays = self._seen.astype(np.float32), self._x.copy(), self._force.copy()
+        return rate, tilt, self._names[int(violated)], reached != 0, arrays
 
 
 _codes: dict[Any, Code | None] = {}
