@@ -160,7 +160,7 @@ class BallbotNative:
             flags[:, idle] = False
             violated[idle], force[:, idle], grip[:, idle] = -1, 0.0, 0.0
         ended = np.flatnonzero(terminated | truncated)
-        final_seen = seen.T[ended].astype(np.float32, copy=False)
+        final_seen = np.ascontiguousarray(seen.take(ended, 1).T, np.float32)
         begin = ended if restart else idle
         if begin is not None and begin.size:
             if restart:

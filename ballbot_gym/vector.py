@@ -273,7 +273,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             failed = np.flatnonzero(violated >= 0)
             parts[1, failed] = reward[failed] - self._survive  # the cost has a failure's price too
             if self.task.first_exit:
-                parts[2, ended] = (reward - parts[0] - parts[1])[ended] * success[ended]
+                parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * success[ended]
         if constants is None:
             self._ended = done
         elif ended.size:
@@ -282,11 +282,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             infos["final_obs"] = _some_rows(result.final_observation, ended, self.num_envs)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
-            cost, parts, force, clipped = cost.copy(), parts.copy(), force.copy(order="K"), clipped.copy()
-            cost[ended], parts[:, ended], force[ended], clipped[ended] = 0.0, 0.0, 0.0, False
-            success, violated = success & ~done, np.where(done, -1, violated)
-            if grip is not None:
-                grip = np.where(done[:, None], 0.0, grip).astype(self._dtype)
+            cost, parts, force, grip = (_without(part, ended) for part in (cost, parts, force.T, result.grip))
+            force, grip = force.T, grip.T if self.params.grips else None
+            clipped, success, violated = clipped & ~done, success & ~done, violated.copy()
+            violated[ended] = -1
         everywhere = np.ones(self.num_envs, np.bool_)
         infos |= self._info(
             *self._x_and_c(), cost, parts, result.tilt, force, success, violated, clipped, everywhere, grip
@@ -426,9 +425,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         x, c = x.T, c.T
         x.flags.writeable = c.flags.writeable = False
         failure, names = violated >= 0, self._no_names
-        if failure.any():
+        failed = failure.nonzero()[0]
+        if failed.size:
             names = names.copy()
-            names[failure] = self._limit_names[violated[failure]]
+            names[failed] = self._limit_names[violated[failed]]
         survive, running, goal = reward_parts
         values = (x, cost, survive, running, goal, tilt, success, failure, names, force, clipped, c)
         infos = {}
@@ -615,6 +615,14 @@ def _finite(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     if (np.abs(array) > LARGEST).any():
         raise ValueError(f"{what} must be numbers within ±{LARGEST:g}, not {reprlib.repr(value)}")
     return array
+
+
+def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """A copy of (B,) or (n, B) numbers with 0 in some columns."""
+    copied = rows.copy(order="K")
+    for row in np.atleast_2d(copied):  # one after the other, which NumPy does three times as fast
+        row[indices] = 0.0
+    return copied
 
 
 def _some_rows(rows: np.ndarray, indices: np.ndarray, size: int) -> np.ndarray:
