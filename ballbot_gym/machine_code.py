@@ -129,7 +129,6 @@ def _is_whole(path: Path) -> bool:
     return hashlib.sha256(content[:-_DIGEST]).digest() == content[-_DIGEST:]
 
 
-@cache
 def compiler() -> str | None:
     """The path of a C compiler; None where there is none."""
     return shutil.which(os.environ.get("CC", "cc")) or shutil.which("gcc") or shutil.which("clang")

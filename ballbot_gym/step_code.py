@@ -147,10 +147,11 @@ def _code(
 ) -> Code | None:
     """The code of a function; None where there is none, or none yet. If start, it is made in the background."""
     try:
-        if start and key not in _begun and machine_code.compiler() is not None:
+        if start and key not in _begun:
             _begun.add(key)
-            with contextlib.suppress(RuntimeError):  # there can be no more threads
-                threading.Thread(target=_make, args=(key, compute, counts, in_place), name="ballbot-code").start()
+            if machine_code.compiler() is not None:
+                with contextlib.suppress(RuntimeError):  # there can be no more threads
+                    threading.Thread(target=_make, args=(key, compute, counts, in_place), name="ballbot-code").start()
         return _codes.get(key)
     except TypeError:  # a task that has no hash
         return None

@@ -87,6 +87,7 @@ def test_machine_code_gives_the_bits_of_python(task, physics, robot, randomizati
         patch.setattr(machine_code, "compiler", lambda: None)
         python = bits(play(env))
         assert env._judge is None
+    step_code._begun.clear()
     reset_until_made(env)
     assert env._judge is not None
     assert physics == "bullet" or env._simulator._motion is not None
