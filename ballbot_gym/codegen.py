@@ -103,7 +103,65 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
         "DRAWS": task.constant_draws + task.state_draws,
     }
     defined = [f"#define {name} {value}" for name, value in sizes.items()]
-    return "\n".join([*defined, Path(__file__).with_name("native.c").read_text(encoding="utf-8"), *blocks])
+    return "\n".join([*defined, _text("real.h"), _text("native.c"), *blocks])
+
+
+def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
+    """The C code of functions that CasADi loads as external ones: each computes `lanes` stages, a column each, at once.
+
+    Args:
+        functions: with dense columns as arguments and results, and distinct names.
+        lanes: stages per call, a number that SIMD instructions suit.
+
+    Raises:
+        NotImplementedError: a function has an operation that is not known here.
+    """
+    parts = [f"#define DOUBLE 1\n#define LANES {lanes}", _text("real.h"), "typedef long long casadi_int;"]
+    for function in functions:
+        name = function.name()
+        symbols = [casadi.SX.sym(f"in{i}", function.size1_in(i)) for i in range(function.n_in())]
+        inputs = [(f"in{i}", casadi.vertsplit(part)) for i, part in enumerate(symbols)]
+        outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
+        parts.append(_block(f"{name}_lanes", inputs, outputs))
+        body = []
+        for i, (pointer, rows) in enumerate(inputs):
+            body.append(f"real {pointer}[{max(len(rows), 1)} * LANES]; gather({len(rows)}, arg[{i}], {pointer});")
+        body += [f"real {pointer}[{max(len(rows), 1)} * LANES];" for pointer, rows in outputs]
+        body.append(f"{name}_lanes({', '.join(f'{pointer}, LANES' for pointer, _ in (*inputs, *outputs))});")
+        body += [f"scatter({len(rows)}, {pointer}, res[{i}]);" for i, (pointer, rows) in enumerate(outputs)]
+        for direction, columns in (("in", inputs), ("out", outputs)):
+            parts.append(f"casadi_int {name}_n_{direction}(void) {{ return {len(columns)}; }}")
+            sizes = ", ".join(f"{{{len(rows)}, LANES, 1}}" for _, rows in columns)  # 1 says that a matrix is dense
+            parts.append(
+                f"const casadi_int *{name}_sparsity_{direction}(casadi_int i) {{\n"
+                f"    static const casadi_int sizes[][3] = {{{sizes}}};\n    return sizes[i];\n}}"
+            )
+        lines = "\n    ".join(body)
+        parts.append(
+            f"int {name}(const double **arg, double **res, casadi_int *iw, double *w, int mem) {{\n    {lines}\n"
+            "    return 0;\n}"
+        )
+    parts.insert(3, _TRANSPOSE)
+    return "\n".join(parts)
+
+
+_TRANSPOSE = """
+static void gather(int rows, const double *columns, real *out) {
+    for (int k = 0; k < LANES; ++k)
+        for (int i = 0; i < rows; ++i)
+            out[i * LANES + k] = columns ? columns[k * rows + i] : 0;
+}
+static void scatter(int rows, const real *in, double *columns) {
+    for (int k = 0; columns && k < LANES; ++k)
+        for (int i = 0; i < rows; ++i)
+            columns[k * rows + i] = in[i * LANES + k];
+}
+"""
+"""CasADi's matrices have a column per stage, and blocks a row per variable. A null pointer is a 0, or not wanted."""
+
+
+def _text(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def _advance(

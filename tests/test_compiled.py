@@ -8,9 +8,10 @@ import pytest
 pytest.importorskip("casadi")
 
 import casadi
+import numpy as np
 
 from ballbot_baselines import compiled
-from ballbot_gym import machine_code
+from ballbot_gym import codegen, machine_code
 
 needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
 posix = pytest.mark.skipif(os.name != "posix", reason="programs and permissions of POSIX")
@@ -43,6 +44,39 @@ def test_compiled_functions_give_the_interpreted_ones_values(folder):
     fast = compiled.compiled("powers", powers())
     assert not any(is_interpreted(f) for f in fast)
     assert values(fast) == values(powers()) == [9.0, 27.0]
+
+
+def blocks():
+    """Functions of one stage, with an argument of no rows, and an angle; and arguments of a whole block of stages."""
+    x, y, none = casadi.SX.sym("x", 3), casadi.SX.sym("y"), casadi.SX.sym("none", 0)
+    turned = casadi.Function("turned", [x, none, y], [casadi.vertcat(casadi.sin(y), casadi.cos(y)) * x[0], x / y])
+    product = casadi.Function("product", [x], [x[0] * x[1] * x[2]])
+    rng = np.random.default_rng(0)
+    return (turned, product), rng.normal(size=(3, compiled.LANES)), rng.normal(size=(1, compiled.LANES))
+
+
+@needs_compiler
+def test_lanes_give_the_values_of_every_stage(folder, caplog):
+    (turned, product), x, y = blocks()
+    fast_turned, fast_product = compiled.in_lanes("blocks", (turned, product))
+    assert not caplog.records
+    none = np.zeros((0, compiled.LANES))
+    for k in range(compiled.LANES):
+        for expected, found in zip(turned(x[:, k], [], y[:, k]), fast_turned(x, none, y), strict=True):
+            # vector versions of sine and cosine are wrong by up to 4 units in the last place
+            np.testing.assert_allclose(np.array(found)[:, k], np.array(expected).ravel(), rtol=1e-15, atol=2e-15)
+        assert float(fast_product(x)[k]) == pytest.approx(float(product(x[:, k])), rel=1e-15)
+
+
+@pytest.mark.parametrize("missing", ["a compiler", "an operation"])
+def test_lanes_work_without_machine_code_of_their_own(folder, monkeypatch, missing):
+    (_, product), x, _ = blocks()
+    if missing == "a compiler":
+        monkeypatch.setattr(machine_code, "_compiler", lambda: None)
+    else:
+        monkeypatch.delitem(codegen._C, casadi.OP_MUL)
+    (mapped,) = compiled.in_lanes("blocks", (product,))
+    np.testing.assert_allclose(np.array(mapped(x)).ravel(), x.prod(0), rtol=1e-15)
 
 
 @needs_compiler

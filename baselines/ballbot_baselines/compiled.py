@@ -8,7 +8,12 @@ import logging
 
 import casadi
 
-from ballbot_gym import machine_code
+from ballbot_gym import codegen, machine_code
+
+LANES = 8
+"""Stages that `in_lanes` computes at once: as many float64 as an AVX-512 register holds."""
+
+_SIMD = ("-O1", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 
 _log = logging.getLogger(__name__)
 
@@ -23,14 +28,37 @@ def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
     Raises:
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
+    return _loaded(name, _source(functions), functions, ("-O2",)) or functions
+
+
+def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.Function, ...]:
+    """The same functions of `LANES` stages at once, which SIMD instructions compute: a column for each stage.
+
+    Args: as of `compiled`; arguments and results are dense columns.
+
+    Raises:
+        ValueError: $BALLBOT_CACHE is no absolute path.
+    """
     try:
-        library = machine_code.library(name, _source(functions))
+        found = _loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, _SIMD)
+    except NotImplementedError:  # an operation that only CasADi knows as C
+        found = compiled(name, functions)
+        return tuple(function.map(LANES) for function in found)
+    return found or tuple(function.map(LANES) for function in functions)
+
+
+def _loaded(
+    name: str, source: str, functions: tuple[casadi.Function, ...], flags: tuple[str, ...]
+) -> tuple[casadi.Function, ...] | None:
+    """The functions of a library of C code; None where there is none."""
+    try:
+        library = machine_code.library(name, source, flags)
         return tuple(casadi.external(function.name(), str(library)) for function in functions)
     except RuntimeError as error:  # it cannot be compiled, or not be loaded
         reason = str(error)[-300:]
     if reason:
         _log.warning("derivatives of %s stay interpreted: %s", name, reason)
-    return functions
+    return None
 
 
 def _source(functions: tuple[casadi.Function, ...]) -> str:

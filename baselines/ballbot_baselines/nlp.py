@@ -26,14 +26,14 @@ Constraints g, in the order that fatrop needs:
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import compiled
+from ballbot_baselines.compiled import LANES, in_lanes
 
 
 class Stage:
     """A vector function out(z, p) of one stage, with the nonzeros of its Jacobian and of its Lagrangian's Hessian.
 
     A function that does not depend on p does not take p. So problems that differ only in their parameters share their
-    compiled dynamics.
+    compiled dynamics. With `of_stages` the functions are compiled, and compute `LANES` stages at once, a column each.
 
     | attribute | meaning |
     |---|---|
@@ -44,7 +44,7 @@ class Stage:
     | `size`, `width`, `params` | lengths of out, of z, and of the p that is taken |
     """
 
-    def __init__(self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, compile: bool):
+    def __init__(self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, of_stages: bool):
         p = p if casadi.depends_on(out, p) else casadi.SX.sym("p", 0)
         multipliers = casadi.SX.sym("l", out.shape[0])
         jacobian = casadi.jacobian(out, z)
@@ -55,7 +55,7 @@ class Stage:
             casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options),
             casadi.Function("hessian", [z, p, multipliers], [casadi.densify(gradient), _nonzeros(hessian)], options),
         )
-        self.value, self.jacobian, self.hessian = compiled(name, functions) if compile else functions
+        self.value, self.jacobian, self.hessian = in_lanes(name, functions) if of_stages else functions
         self.size, self.width, self.params = out.shape[0], z.shape[0], p.shape[0]
         self.jacobian_at = _triplets(jacobian)
         self.hessian_at = _triplets(hessian)
@@ -132,11 +132,12 @@ class StagedNlp:
 
     def values(self) -> tuple[casadi.MX, casadi.MX]:
         """The objective f, and the constraints g in the order that this module's table gives."""
-        running = self._over_stages(self._running, self._running.value)
+        (running,) = self._over_stages(self._running, self._running.value)
         final = self._final.value(self._last, self._p_of(self._final))
         f = casadi.sum2(running[0, :]) + final[0]
         next_states = casadi.horzcat(self._stages[: self._states, 1:], self._last)
-        gaps = next_states - self._over_stages(self._dynamics, self._dynamics.value)
+        (reached,) = self._over_stages(self._dynamics, self._dynamics.value)
+        gaps = next_states - reached
         stage_g = casadi.vertcat(gaps, running[1:, :])
         initial_g = casadi.mtimes(casadi.DM(self._initial), self._stages[: self._states, 0])
         return f, casadi.vertcat(stage_g[:, 0], initial_g, casadi.vec(stage_g[:, 1:]), final[1:, :])
@@ -226,8 +227,14 @@ class StagedNlp:
         """(nonzeros,)"""
         return self._final.jacobian(self._last, self._p_of(self._final))[1]
 
-    def _over_stages(self, stage: Stage, function: casadi.Function, *multipliers: casadi.MX) -> casadi.MX:
-        return function.map(self._n)(self._stages, self._p_all[: stage.params, :], *multipliers)
+    def _over_stages(self, stage: Stage, function: casadi.Function, *multipliers: casadi.MX) -> list[casadi.MX]:
+        """Results of all stages, a column each. The last block of stages is filled up with the last stage."""
+        blocks = -(-self._n // LANES)
+        last = [self._n - 1] * (blocks * LANES - self._n)
+        columns = [*range(self._n), *last]
+        given = (self._stages, self._p_all[: stage.params, :], *multipliers)
+        results = function.map(blocks).call([part[:, columns] if last else part for part in given])
+        return [part[:, : self._n] if last else part for part in results]
 
     def _p_of(self, stage: Stage) -> casadi.MX:
         return self.p[: stage.params]

@@ -34,7 +34,7 @@ from typing import Literal
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import compiled
+from ballbot_baselines.compiled import LANES, in_lanes
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.lqr import final_weight
 from ballbot_baselines.optimum import Backoff, Optimum, plan_to_track
@@ -230,22 +230,27 @@ class HorizonQp:
         self._make_program(nodes, min(count, _MARGINS), grips)
 
     def _make_stage(self, task: Task, params: BallbotParams, n: int, m: int, grips: int) -> None:
-        nc = len(task.constant_names)
-        self.x, self.a = np.zeros((n + 1, 8)), np.zeros((n + 1, 2))
-        self.h, self.c = np.zeros(n + 1), np.zeros((n + 1, nc))
-        self._next, self._jacobian = np.zeros((n + 1, 8)), np.zeros((n + 1, 10, 8))
-        self._gradient = np.zeros((n + 1, 10))
-        self._margin, self._margin_jacobian = np.zeros((n + 1, m)), np.zeros((n + 1, 8, m))
-        self._grip, self._grip_jacobian = np.zeros((n + 1, grips)), np.zeros((n + 1, 10, grips))
-        self.reserve = np.zeros(n + 1)
-        """(nodes + 1,) of normal force, as a fraction of the weight, where the robot's grip is limited."""
-        inputs = [self.x, self.a, self.h, self.c]
-        outputs = [self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian]
+        blocks = -(-n // LANES)  # of intervals; the last one is filled up with zeros
+        computed = slice(0, blocks * LANES)
+
+        def rows(*shape: int) -> np.ndarray:
+            return np.zeros((max(n + 1, computed.stop), *shape))
+
+        inputs = [rows(8), rows(2), rows(), rows(len(task.constant_names)), *([rows()] if grips else [])]
+        outputs = [rows(8), rows(10, 8), rows(10), rows(m), rows(8, m)]
+        outputs += [rows(grips), rows(10, grips)] if grips else []
         self._stage = _InPlace(
-            _stage_function(task, params).map(n + 1),
-            [*inputs, self.reserve] if grips else inputs,
-            [*outputs, self._grip, self._grip_jacobian] if grips else outputs,
+            _stage_function(task, params).map(blocks),
+            [array[computed] for array in inputs],
+            [array[computed] for array in outputs],
         )
+        self.x, self.a, self.h, self.c, *reserve = (array[: n + 1] for array in inputs)
+        self.reserve = reserve[0] if grips else np.zeros(n + 1)
+        """(nodes + 1,) of normal force, as a fraction of the weight, where the robot's grip is limited."""
+        self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian, *grip = (
+            array[: n + 1] for array in outputs
+        )
+        self._grip, self._grip_jacobian = grip if grips else (np.zeros((n + 1, 0)), np.zeros((n + 1, 10, 0)))
 
     def _make_program(self, n: int, m: int, grips: int) -> None:
         hessian, constraints = _patterns(n, m, grips)
@@ -765,6 +770,8 @@ def _horizon_qp(task: Task, params: BallbotParams, nodes: int) -> HorizonQp:
 def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
     """(x, a, h, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
 
+    It computes `LANES` intervals at once, and matrices are columns.
+
     Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
     """
     x, a, h = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("h")
@@ -774,10 +781,10 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
     margins = casadi.vertcat(*task.margins(x, c))
     outputs = [
         after,
-        casadi.densify(casadi.jacobian(after, z)),
+        casadi.vec(casadi.densify(casadi.jacobian(after, z))),
         casadi.densify(casadi.gradient(task.cost(x, u, c) * h, z)),
         margins,
-        casadi.densify(casadi.jacobian(margins, x)),
+        casadi.vec(casadi.densify(casadi.jacobian(margins, x))),
     ]
     inputs = [x, a, h, c]
     if params.grips:
@@ -789,9 +796,9 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
         )
         # only the end of a control step that is nearer to slipping: each row costs time
         grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT
-        outputs += [grip, casadi.densify(casadi.jacobian(grip, z))]
+        outputs += [grip, casadi.vec(casadi.densify(casadi.jacobian(grip, z)))]
     function = casadi.Function("stage", inputs, outputs, {"cse": True})
-    return compiled(f"{task.id}-nmpc", (function,))[0]
+    return in_lanes(f"{task.id}-nmpc", (function,))[0]
 
 
 def _grips(params: BallbotParams) -> int:

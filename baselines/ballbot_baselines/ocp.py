@@ -158,9 +158,11 @@ class OcpSolver:
         final_path = casadi.vertcat(final_equal, ocp.final_inequalities(s, p))
         final_cost = ocp.final_cost(s, p)
         z = casadi.vertcat(s, w)
-        dynamics = Stage("dynamics", z, p, casadi.densify(casadi.SX(ocp.next(s, w, p))), compile=True)
-        running = Stage(ocp.name, z, p, casadi.densify(casadi.vertcat(ocp.cost(s, w, p), path)), compile=True)
-        final = Stage(f"{ocp.name}-final", s, p, casadi.densify(casadi.vertcat(final_cost, final_path)), compile=False)
+        dynamics = Stage("dynamics", z, p, casadi.densify(casadi.SX(ocp.next(s, w, p))), of_stages=True)
+        running = Stage(ocp.name, z, p, casadi.densify(casadi.vertcat(ocp.cost(s, w, p), path)), of_stages=True)
+        final = Stage(
+            f"{ocp.name}-final", s, p, casadi.densify(casadi.vertcat(final_cost, final_path)), of_stages=False
+        )
 
         paths, finals = path.shape[0], final_path.shape[0]
         initial_matrix = np.zeros((0, ocp.states)) if ocp.initial_matrix is None else ocp.initial_matrix
