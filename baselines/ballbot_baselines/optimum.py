@@ -41,10 +41,13 @@ _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a se
 _BARRIER = 0.1  # of the first iterate
 _NEAR_BARRIER = 1e-3  # near a solution of nearly the same problem: about half the iterations
 _COARSE = 2  # control steps per interval when several guesses are compared
+_COARSEST = 4  # the same when choices of sides are compared first
+_ROUGH = 1e-4  # tolerance there: costs are then right to 1e-5 of their value, in four iterations less
 _BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
 _SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
-_GRID_DOUBT = 0.002  # relative: how differently the coarse grid may order choices of sides; 0.0007 was measured
+_COARSEST_DOUBT = 0.005  # relative: how differently the coarsest grid may order choices of sides; 0.0035 was measured
+_GRID_DOUBT = 0.002  # the same of the coarse grid; 0.0007 was measured
 _GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip: 130 to 270 are common
 _GRIPPING_DOUBT = 0.02  # in place of both doubts: predictions leave friction out, coarse grids are rough about it
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
@@ -292,9 +295,11 @@ def _solver(
     coarseness: int = 1,
     iterations: int = _MOST_ITERATIONS,
     barrier: float = _BARRIER,
+    tolerance: float | None = None,
 ) -> OcpSolver:
     ocp = shooting_ocp(task, params, coarseness)
-    return OcpSolver(ocp, steps, solver, _tolerance(params), max_iterations=iterations, barrier=barrier)
+    tolerance = tolerance or _tolerance(params)
+    return OcpSolver(ocp, steps, solver, tolerance, max_iterations=iterations, barrier=barrier)
 
 
 @lru_cache(maxsize=8)
@@ -438,19 +443,18 @@ def _solve_likely_sides(
     there is no motion without obstacles, nothing is solved.
     """
     iterations, side_doubt, grid_doubt = _QUICK_ITERATIONS, _SIDE_DOUBT, _GRID_DOUBT
+    coarsest, tolerance = (_COARSEST if task.steps % _COARSEST == 0 else _COARSE), _ROUGH
     if params.grips:
         iterations, side_doubt, grid_doubt = _GRIPPING_ITERATIONS, _GRIPPING_DOUBT, _GRIPPING_DOUBT
-    far, near = (
-        _solver(task, params, task.steps // _COARSE, "fatrop", _COARSE, iterations, barrier)
-        for barrier in (_BARRIER, _NEAR_BARRIER)
-    )
+        coarsest, tolerance = _COARSE, None
 
-    def solved_from(path: np.ndarray, c: np.ndarray, solver: OcpSolver) -> OcpSolution:
+    def solved_from(path: np.ndarray, c: np.ndarray, barrier: float) -> OcpSolution:
+        solver = _solver(task, params, task.steps // coarsest, "fatrop", coarsest, iterations, barrier, tolerance)
         x, u = guess.along_path(params, path, task.control_dt, start=x0)
-        return _solve_with(solver, params, x[::_COARSE], u[::_COARSE] / params.force_limit, c, backoff)
+        return _solve_with(solver, params, x[::coarsest], u[::coarsest] / params.force_limit, c, backoff)
 
-    free = solved_from(_straight(task, params, x0, c), task.without_obstacles(c), near)
-    if not is_feasible(free):
+    free = solved_from(_straight(task, params, x0, c), task.without_obstacles(c), _NEAR_BARRIER)
+    if not free.success:
         return []
     along = guess.resampled(free.states[:, :2], task.steps)
     prediction = sides.predict(task, params, x0, c, along, obstacles)
@@ -462,14 +466,26 @@ def _solve_likely_sides(
         if solved and predicted[i] > predicted[solved[0][0]] * (1 + side_doubt):
             break
         motion = np.column_stack([along[:, 0], prediction.y[row_of[i]]])
-        for start, solver in ((motion, near), (motion, far), (paths[i], far)):
-            solution = solved_from(start, c, solver)
-            if is_feasible(solution):
+        for start, barrier in ((motion, _NEAR_BARRIER), (motion, _BARRIER), (paths[i], _BARRIER)):
+            solution = solved_from(start, c, barrier)
+            if solution.success:
                 solved.append((i, solution))
                 break
+    if coarsest > _COARSE and len(_distinct(solved, _COARSEST_DOUBT)) > 1:
+        solved = _on_coarse_grid(task, params, c, backoff, _distinct(solved, _COARSEST_DOUBT)) or solved
     fine = _refined(task, solved, grid_doubt)
     starts = fine or _starts(task, params, x0, paths[:most])
     return _solve_all(task, params, c, backoff, starts, near=bool(fine))
+
+
+def _on_coarse_grid(
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, solved: list[tuple[int, OcpSolution]]
+) -> list[tuple[int, OcpSolution]]:
+    """Solutions with forces held for `_COARSE` control steps, from those on the coarsest grid."""
+    n = task.steps // _COARSE
+    solver = _solver(task, params, n, "fatrop", _COARSE, _QUICK_ITERATIONS, _NEAR_BARRIER, _ROUGH)
+    found = [(i, _solve_with(solver, params, *_on_grid(s, n), c, backoff)) for i, s in solved]
+    return [(i, solution) for i, solution in found if solution.success]
 
 
 def _straight(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -506,15 +522,16 @@ def _contenders(
 
 def _refined(task: Task, solved: list[tuple[int, OcpSolution]], doubt: float = _BASIN_DOUBT) -> list[_Start]:
     """Starts at the coarse solutions within a relative `doubt` of the best."""
-    fine = []
-    for index, solution in _distinct(solved, doubt):
-        x = guess.resampled(solution.states, task.steps)
-        fine.append((index, x, np.repeat(solution.inputs, _COARSE, axis=0)))
-    return fine
+    return [(index, *_on_grid(solution, task.steps)) for index, solution in _distinct(solved, doubt)]
+
+
+def _on_grid(solution: OcpSolution, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """States and actions of a solution on a finer grid."""
+    return guess.resampled(solution.states, steps), np.repeat(solution.inputs, steps // len(solution.inputs), axis=0)
 
 
 def _distinct(solved: list[tuple[int, OcpSolution]], doubt: float = _BASIN_DOUBT) -> list[tuple[int, OcpSolution]]:
-    """The feasible solutions within a relative `doubt` of the best, sorted by cost, without repetitions."""
+    """The solutions within a relative `doubt` of the best, sorted by cost, without repetitions."""
     kept: list[tuple[int, OcpSolution]] = []
     for index, solution in sorted(solved, key=lambda pair: pair[1].cost):
         contends = not kept or solution.cost < kept[0][1].cost * (1 + doubt)
