@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ballbot_baselines import trajopt
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.rollout import PlanError
@@ -184,12 +185,17 @@ def test_ghosts_from_the_start_are_drawn_beside_every_take_but_their_own():
     assert not changed[:110, :160].any()
 
 
-def test_where_the_expert_is_too_late_the_replay_says_so():
+def test_where_the_expert_is_too_late_the_replay_says_so(monkeypatch):
     shown = certified_replay("stabilize", ["lqr", "trajopt"], FALLING, physics="rk4")
     late, early = with_ghosts(shown, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4").takes
     assert late.ghosts == ()
     assert late.note.endswith("trajopt finds no way on from 0.36 s")
     assert len(early.ghosts) == 1
+
+    def find_none(*arguments):
+        raise PlanError("no feasible episode")
+
+    monkeypatch.setattr(trajopt, "plan_to_track", find_none)  # it looks for long, and found none above
     alone = Replay("", shown.takes[:1])
     with pytest.raises(PlanError, match=r"finds no way on from 0\.36 s under LQR"):
         with_ghosts(alone, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4")
