@@ -39,6 +39,16 @@ def rng():
 
 
 @pytest.fixture
+def interpreted(monkeypatch):
+    """Solvers that the test makes are not compiled.
+
+    For a problem that no other test solves, compiling takes longer than solving without machine code.
+    """
+    nlp = pytest.importorskip("ballbot_baselines.nlp")
+    monkeypatch.setattr(nlp, "compiled", lambda name, functions: functions)
+
+
+@pytest.fixture
 def make_env():
     """Makes environments that are closed after the test."""
     envs = []

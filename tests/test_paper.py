@@ -13,6 +13,8 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.orbit import orbit_tilt
 from ballbot_gym.trajectory import Trajectory
 
+pytestmark = pytest.mark.usefixtures("interpreted")  # each problem is solved a few times, in a tenth of a second
+
 SOLVERS = ("ipopt", "fatrop")
 
 # J*, final time in s and peak |lean| in degrees, from two independent programs that agree to every digit

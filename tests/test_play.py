@@ -263,7 +263,7 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, robot, seed, physi
     assert (score.failure != "") == expected.failure
 
 
-def test_another_robot_keeps_the_controllers_that_it_has(play):
+def test_another_robot_keeps_the_controllers_that_it_has(play, interpreted):
     playground = play(controller="lqr", ghosts=["you", "shac"])
     playground.set_robot("kugle")
     playground.settle()

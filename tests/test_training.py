@@ -79,7 +79,7 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     task, params = TASKS["stabilize"](), default_params()
     config = replace(
         LEARNERS["shac"].settings("stabilize"),
-        total_iterations=30,
+        total_iterations=15,
         num_envs=64,
         horizon=25,
         hidden=(32,),
