@@ -1,5 +1,6 @@
 """Fixtures that parametrize tests over everything registered, so that a new task arrives tested."""
 
+import functools
 import os
 
 # Before torch is imported, here and in the processes that tests start: nothing in them is big enough for a second thread,
@@ -40,12 +41,14 @@ def rng():
 
 @pytest.fixture
 def interpreted(monkeypatch):
-    """Solvers that the test makes are not compiled.
+    """The test's solvers are its own, and not compiled.
 
     For a problem that no other test solves, compiling takes longer than solving without machine code.
     """
-    nlp = pytest.importorskip("ballbot_baselines.nlp")
+    nlp, optimum = (pytest.importorskip(f"ballbot_baselines.{name}") for name in ("nlp", "optimum"))
     monkeypatch.setattr(nlp, "compiled", lambda name, functions: functions)
+    for made in ("_solver", "_free_time_solver"):
+        monkeypatch.setattr(optimum, made, functools.cache(getattr(optimum, made).__wrapped__))
 
 
 @pytest.fixture

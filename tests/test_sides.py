@@ -55,7 +55,7 @@ def test_the_optimal_choice_is_predicted_among_the_best(slaloms, params):
 def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
     task, known = Weave(), certified.load("weave")
     doubt = []
-    for i in range(4):
+    for i in range(6):
         x0, c = known.states[i], known.constants[i]
         free = find_optimum(task, params, x0, task.without_obstacles(c), guesses=1)
         assert free.cost < known.costs[i]

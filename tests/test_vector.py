@@ -511,18 +511,17 @@ def test_gradient_of_the_cost_agrees_with_finite_differences_and_casadi(steps, f
     cost = rollout_cost(batch, x0, gain, leaf[:, None])
     (gradient,) = torch.autograd.grad(cost.sum(), leaf)
 
-    # central differences in many forces at once, each pair of perturbed rollouts in one batch
-    some, eps = torch.arange(0, 2 * steps, 7 if feedback else 1), 1e-3
-    count = len(some)
-    nudges = eps * torch.eye(2 * steps, dtype=torch.float64)[some].reshape(count, steps, 2).transpose(0, 1)
+    # central differences in all 2n forces at once, each pair of perturbed rollouts in one batch
+    count, eps = 2 * steps, 1e-3
+    nudges = eps * torch.eye(count, dtype=torch.float64).reshape(count, steps, 2).transpose(0, 1)
     wide = BallbotBatch("stabilize", 2 * count, dtype=torch.float64, compile=False)
     with torch.no_grad():
         costs = rollout_cost(wide, x0, gain, forces[:, None] + torch.cat([nudges, -nudges], dim=1))
-    differences = (costs[:count] - costs[count:]) / (2 * eps)
+    differences = ((costs[:count] - costs[count:]) / (2 * eps)).reshape(steps, 2)
 
-    scale, found = gradient.abs().max(), gradient.flatten()[some]
-    assert (found - differences).abs().max() < 1e-4 * scale
-    assert (found - differences).norm() < 1e-4 * differences.norm()
+    scale = gradient.abs().max()
+    assert (gradient - differences).abs().max() < 1e-4 * scale
+    assert (gradient - differences).norm() < 1e-4 * differences.norm()
     exact = casadi_gradient(batch.task, params, x0, gain, forces)
     np.testing.assert_allclose(gradient, exact, rtol=1e-8, atol=1e-9 * scale.item())
 
@@ -572,7 +571,7 @@ def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wh
         assert torch.equal(c, b[:, 7:12])
     for a, b in zip(results, eager, strict=True):
         # 10 steps to an end, over which rounding grows by e^(7.8 · 0.1)
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(a, b, rtol=5e-5, atol=5e-5)
     for name in last._fields:
         a, b = getattr(last, name), getattr(last_eager, name)
         assert (a.dtype, a.shape) == (b.dtype, b.shape), name
