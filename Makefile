@@ -15,10 +15,10 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(MAKE) --jobs 2 types pytest
 
-types:
+types: $(VENV)/installed
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
-pytest:
+pytest: $(VENV)/installed
 	$(BIN)/pytest -m "not slow" -n auto --dist worksteal
 
 test-slow: $(VENV)/installed
