@@ -10,6 +10,7 @@ the next knot as input. `nlp.py` builds the nonlinear program and its derivative
 once (`compiled.py`). So time and memory grow linearly with N.
 """
 
+import functools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -74,6 +75,33 @@ class Ocp:
     """(s, p) -> (mi,), each ≥ 0."""
     initial_matrix: np.ndarray | None = None
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
+
+    @functools.cached_property
+    def stages(self) -> "Stages":
+        """The stage functions with their derivatives, made once for solvers of every horizon."""
+        s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", self.states), ("w", self.inputs), ("p", self.params)))
+        equal, final_equal = self.equalities(s, w, p), self.final_equalities(s, p)
+        z, path = casadi.vertcat(s, w), casadi.vertcat(equal, self.inequalities(s, w, p))
+        final_path = casadi.vertcat(final_equal, self.final_inequalities(s, p))
+        costs, final_costs = casadi.vertcat(self.cost(s, w, p), path), casadi.vertcat(self.final_cost(s, p), final_path)
+        return Stages(
+            dynamics=Stage("dynamics", z, p, casadi.densify(casadi.SX(self.next(s, w, p))), of_stages=True),
+            running=Stage(self.name, z, p, casadi.densify(costs), of_stages=True),
+            final=Stage(f"{self.name}-final", s, p, casadi.densify(final_costs), of_stages=False),
+            equalities=equal.shape[0],
+            final_equalities=final_equal.shape[0],
+        )
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Next state; [cost, equalities, inequalities] of a stage and of the end; and how many are equalities."""
+
+    dynamics: Stage
+    running: Stage
+    final: Stage
+    equalities: int
+    final_equalities: int
 
 
 @dataclass(frozen=True)
@@ -152,29 +180,18 @@ class OcpSolver:
         """
         began = time.perf_counter()
         self.ocp, self.intervals, self.solver = ocp, intervals, solver
-        s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", ocp.states), ("w", ocp.inputs), ("p", ocp.params)))
-        equal, final_equal = ocp.equalities(s, w, p), ocp.final_equalities(s, p)
-        path = casadi.vertcat(equal, ocp.inequalities(s, w, p))
-        final_path = casadi.vertcat(final_equal, ocp.final_inequalities(s, p))
-        final_cost = ocp.final_cost(s, p)
-        z = casadi.vertcat(s, w)
-        dynamics = Stage("dynamics", z, p, casadi.densify(casadi.SX(ocp.next(s, w, p))), of_stages=True)
-        running = Stage(ocp.name, z, p, casadi.densify(casadi.vertcat(ocp.cost(s, w, p), path)), of_stages=True)
-        final = Stage(
-            f"{ocp.name}-final", s, p, casadi.densify(casadi.vertcat(final_cost, final_path)), of_stages=False
-        )
-
-        paths, finals = path.shape[0], final_path.shape[0]
+        stages = ocp.stages
+        paths, finals = stages.running.size - 1, stages.final.size - 1
         initial_matrix = np.zeros((0, ocp.states)) if ocp.initial_matrix is None else ocp.initial_matrix
         initials = len(initial_matrix)
         self._rows, self._initials = ocp.states + paths, initials
-        of_stage = _equality(ocp.states + equal.shape[0], ocp.states + paths)
-        of_end = _equality(final_equal.shape[0], finals)
+        of_stage = _equality(ocp.states + stages.equalities, ocp.states + paths)
+        of_end = _equality(stages.final_equalities, finals)
         equality = of_stage + [True] * initials + of_stage * (intervals - 1) + of_end
         self._g_lower = np.zeros(len(equality))
         self._g_upper = np.where(equality, 0.0, np.inf)
 
-        nlp = StagedNlp(dynamics, running, final, intervals, ocp.params, initial_matrix)
+        nlp = StagedNlp(stages.dynamics, stages.running, stages.final, intervals, ocp.params, initial_matrix)
         oracle, derivatives, for_ipopt = nlp.functions()
         options: dict = {"print_time": False, "error_on_fail": False, "calc_lam_p": False, "cache": derivatives}
         if solver == "fatrop":

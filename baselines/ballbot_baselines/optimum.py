@@ -230,6 +230,7 @@ def _rank(tried: tuple[int, OcpSolution]) -> tuple[bool, float]:
     return not tried[1].success, tried[1].cost
 
 
+@lru_cache(maxsize=64)
 def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
     """A task on its env's discretization, or with forces held for several control steps.
 
