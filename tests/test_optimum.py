@@ -18,6 +18,7 @@ from ballbot_gym import dynamics, machine_code
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.weave import Weave, split_constants
 
@@ -188,6 +189,13 @@ def test_hopeless_start_raises_with_every_solvers_status_and_violation(params):
 
 
 @pytest.mark.slow
+def test_an_episode_where_fatrop_goes_in_circles_has_an_optimum_nevertheless(params):
+    x0 = np.array([0.25444759690884416, 1.0531376213391865, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    found = find_optimum(Orbit(), params, x0, np.array([1.0834400902000283, 3.9722615268345076]))
+    assert found.is_optimal
+    assert found.cost == pytest.approx(19.5707702, rel=1e-6)  # that of other guessed paths too
+
+
 def test_exhaustive_search_over_sides_rarely_finds_a_better_slalom(params):
     task, better = Weave(), []
     for seed in range(30):

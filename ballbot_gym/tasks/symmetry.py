@@ -52,8 +52,9 @@ class Frame:
 def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     """Orbit's observation as seen from the ball: outwards is forwards, and the commanded motion goes to the left.
 
-    The last feature is the commanded centripetal acceleration, v²/r, in units of 10 m/s². Leans and forces of the steady
-    orbit are nearly linear in it, and so slow orbits need no other rule than fast ones.
+    Then comes the commanded centripetal acceleration, v²/r, in units of 10 m/s². Leans and forces of the steady orbit are
+    nearly linear in it, and so slow orbits need no other rule than fast ones. The last five tell small errors apart
+    (`_fine`): of radius, velocity, and of the lean from the steady orbit's. Without them a policy rides beside the circle.
 
     The body's axis is rotated instead of the angles γ and θ, because a rotation about the vertical takes axis to axis
     exactly. The body's inertia about its own axis, 1 % of the other, is what the symmetry leaves out.
@@ -69,16 +70,26 @@ def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     sin_gamma, cos_gamma = ops.sin(gamma), ops.cos(gamma)
     sin_theta, cos_theta = ops.sin(theta), ops.cos(theta)
     axis_x_rate = cos_gamma * cos_theta * gamma_dot - sin_gamma * sin_theta * theta_dot
+    lean_out, lean_along = rotated(sin_gamma * cos_theta, sin_theta)
+    error_out, error_along = rotated(ex, ey)
+    pull = speed * speed / radius * (5.0**2 / 3.0 / 10.0)  # as observed they are divided by 5 m/s and by 3 m
     features = (
         distance,
-        *rotated(sin_gamma * cos_theta, sin_theta),
+        lean_out,
+        lean_along,
         *rotated(vx, vy),
         *rotated(axis_x_rate, cos_theta * theta_dot),
         radius_error,
-        *rotated(ex, ey),
+        error_out,
+        error_along,
         radius,
         side * speed,
-        speed * speed / radius * (5.0**2 / 3.0 / 10.0),  # as observed they are divided by 5 m/s and by 3 m
+        pull,
+        _fine(radius_error, 0.05),
+        _fine(error_out, 0.2 / 5),
+        _fine(error_along, 0.2 / 5),
+        _fine(lean_out + _steady_lean(pull, 3.0 * radius), 0.05),
+        _fine(lean_along, 0.05),
     )
 
     def back(action: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -86,6 +97,17 @@ def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
         return cos * outwards - sin * along, sin * outwards + cos * along
 
     return features, back
+
+
+def _steady_lean(pull: Any, radius: Any) -> Any:
+    """Sine of the lean on a circle of this radius, m, to 0.003, where the ball is pulled inwards by `pull` times 10 m/s².
+
+    See `orbit.orbit_speed`, whose equation three substitutions solve, with J/h of the paper's robot.
+    """
+    slope = pull
+    for _ in range(3):
+        slope = pull / (_GRAVITY + _INERTIA_BY_MOMENT * pull / radius / ops.sqrt(1.0 + slope * slope))
+    return slope / ops.sqrt(1.0 + slope * slope)
 
 
 def _slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
@@ -135,19 +157,23 @@ def _gate(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     x, y, _, _, vx, vy, _, _, speed = observation
     steps = [ops.where(5.0 * speed > switch, 0.5, -0.5) for switch in _SWITCHES]
 
-    def near(error: Any, tolerance: float) -> Any:
-        return error / ops.sqrt(error * error + tolerance * tolerance)
-
-    fine = near(x, 0.2 / 5), near(y, 0.2 / 5), near(vx, 0.5 / 5), near(vy, 0.5 / 5)
+    fine = _fine(x, 0.2 / 5), _fine(y, 0.2 / 5), _fine(vx, 0.5 / 5), _fine(vy, 0.5 / 5)
     return (*observation, *steps, *fine), lambda action: action
 
 
+def _fine(error: Any, tolerance: float) -> Any:
+    """An error in which what is small beside the tolerance shows, and what is large is ±1."""
+    return error / ops.sqrt(error * error + tolerance * tolerance)
+
+
+_GRAVITY = 0.981  # 10 m/s²
+_INERTIA_BY_MOMENT = 0.743  # m
 _SWITCHES = tuple(3.4 + 0.1 * i for i in range(13))  # m/s
 _OBSTACLES_SEEN = 4
 _BALL_RADIUS = 0.1  # m, about
 
 FRAMES: dict[str, Frame] = {
-    "radial": Frame(13, _radial),
+    "radial": Frame(18, _radial),
     "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom),
     "gate": Frame(13 + len(_SWITCHES), _gate),
 }

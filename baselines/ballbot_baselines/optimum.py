@@ -39,6 +39,7 @@ _FREE_TIME_INTERVALS = 60
 _MOST_ITERATIONS = 200
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
 _BARRIER = 0.1  # of the first iterate
+_HIGH_BARRIER = 1.0  # with the other, fatrop goes in circles from one start in thousands
 _NEAR_BARRIER = 1e-3  # near a solution of nearly the same problem: about half the iterations
 _COARSE = 2  # control steps per interval when several guesses are compared
 _COARSEST = 4  # the same when choices of sides are compared first
@@ -167,6 +168,8 @@ def find_optimum(
         tried = solve(task, params, x0, c, backoff, paths)
     if not _any_optimal(tried):
         tried += _solve_from_righting(task, params, x0, c, backoff)
+    if alone and not _any_optimal(tried):
+        tried += _solve_quickly(task, params, x0, c, backoff, paths, _HIGH_BARRIER)
     if alone and not _any_optimal(tried):
         tried += _solve_fixed_time(task, params, x0, c, backoff, paths)
     best = min((t for t in tried if is_within_limits(t[1])), key=_rank, default=None)
@@ -366,10 +369,16 @@ def _solve_all(
 
 
 def _solve_quickly(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, paths: list[np.ndarray]
+    task: Task,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff,
+    paths: list[np.ndarray],
+    barrier: float = _BARRIER,
 ) -> list[tuple[int, OcpSolution]]:
     """From every path with fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
-    solver = _solver(task, params, task.steps, "fatrop", iterations=_QUICK_ITERATIONS)
+    solver = _solver(task, params, task.steps, "fatrop", iterations=_QUICK_ITERATIONS, barrier=barrier)
     return [(i, _solve_with(solver, params, x, a, c, backoff)) for i, x, a in _starts(task, params, x0, paths)]
 
 
