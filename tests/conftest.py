@@ -47,7 +47,7 @@ def interpreted(monkeypatch):
     """
     compiled, optimum = (pytest.importorskip(f"ballbot_baselines.{name}") for name in ("compiled", "optimum"))
     monkeypatch.setattr(compiled, "_loaded", lambda *_: None)
-    for made in ("_solver", "_free_time_solver"):
+    for made in ("shooting_ocp", "_solver", "_free_time_solver"):
         monkeypatch.setattr(optimum, made, functools.cache(getattr(optimum, made).__wrapped__))
 
 

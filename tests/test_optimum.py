@@ -188,7 +188,6 @@ def test_hopeless_start_raises_with_every_solvers_status_and_violation(params):
         assert float(part[part.index("violation ") + 10 :].split(";")[0].rstrip(")")) > FEASIBLE
 
 
-@pytest.mark.slow
 def test_an_episode_where_fatrop_goes_in_circles_has_an_optimum_nevertheless(params):
     x0 = np.array([0.25444759690884416, 1.0531376213391865, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     found = find_optimum(Orbit(), params, x0, np.array([1.0834400902000283, 3.9722615268345076]))
@@ -196,6 +195,7 @@ def test_an_episode_where_fatrop_goes_in_circles_has_an_optimum_nevertheless(par
     assert found.cost == pytest.approx(19.5707702, rel=1e-6)  # that of other guessed paths too
 
 
+@pytest.mark.slow
 def test_exhaustive_search_over_sides_rarely_finds_a_better_slalom(params):
     task, better = Weave(), []
     for seed in range(30):
