@@ -85,7 +85,8 @@ class SymmetricReplay(ReplayBuffer):
     def __init__(self, *args: Any, demos: Demos | None, reward_scale: float, mirrors: Mirrors = (), **kwargs: Any):
         """Args: mirrors: signs of observation and action in each; each sample is as it was, or one of its mirror images."""
         super().__init__(*args, **kwargs)
-        self._mirrors = [(torch.tensor(signs), torch.tensor(acted)) for signs, acted in mirrors]
+        # of observations and actions: (images, entries), the first image being the step as it was
+        self._signs = [torch.tensor([[1] * len(part[0]), *part]) for part in zip(*mirrors, strict=True)]
         self._demos: tuple[torch.Tensor, ...] | None = None
         if demos is not None:
             columns = (
@@ -105,16 +106,12 @@ class SymmetricReplay(ReplayBuffer):
             chosen = torch.randint(len(self._demos[0]), (batch_size - batch_size // 2,))
             both = zip(own[:5], self._demos, strict=True)
             samples = ReplayBufferSamples(*(torch.cat([a, b[chosen]]) for a, b in both))
-        if not self._mirrors:
+        if not self._signs:
             return samples
         observations, actions, next_observations, dones, rewards, *_ = samples
-        seen = torch.randint(1 + len(self._mirrors), (batch_size, 1))
-        for number, (signs, acted) in enumerate(self._mirrors, 1):
-            here = seen == number
-            observations = torch.where(here, signs * observations, observations)
-            next_observations = torch.where(here, signs * next_observations, next_observations)
-            actions = torch.where(here, acted * actions, actions)
-        return ReplayBufferSamples(observations, actions, next_observations, dones, rewards)
+        image = torch.randint(len(self._signs[0]), (batch_size,))
+        seen, acted = (signs[image] for signs in self._signs)
+        return ReplayBufferSamples(seen * observations, acted * actions, seen * next_observations, dones, rewards)
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the buffer, without the demonstrations."""
