@@ -123,6 +123,13 @@ def test_no_episodes_are_no_error(params):
     assert batched.find_optima(Stabilize(), params, np.zeros((0, 8))).costs.shape == (0,)
 
 
+def test_an_optimum_does_not_depend_on_the_others(optima, params):
+    some = [20, 3, 15, 7, 11]
+    found = batched.find_optima(Stabilize(), params, optima.states[some, 0])
+    for name in ("costs", "states", "forces", "gains", "slopes", "iterations"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(optima, name)[some], err_msg=name)
+
+
 def test_threads_do_not_disturb_each_other(optima, params):
     starts = [optima.states[i : i + 4, 0] for i in (0, 4)]
     with ThreadPoolExecutor(2) as threads:

@@ -23,7 +23,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines import righting
-from ballbot_baselines.compiled import compiled
+from ballbot_baselines.compiled import LANES, in_lanes
 from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
 from ballbot_gym import dynamics, ops
 from ballbot_gym.params import BallbotParams
@@ -38,7 +38,8 @@ _SHORTER_STEPS = (0.5, 0.2, 0.05, 0.01)  # shares of a step that are tried in tu
 _TOLERANCE = 1e-5  # relative: an iteration that promises to lower the cost by less is the last
 _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
 _FORCE_BACKOFF = 1e-7  # of the force limit, as in `optimum.Backoff`
-
+_AT_ONCE = 256  # episodes in memory between iterations
+_NO_GAINS, _NO_STATES, _NO_FORCES = np.zeros((1, 1, 16)), np.zeros((1, 1, 8)), np.zeros((1, 1, 2))
 
 _one_at_a_time = threading.Lock()  # a task's compiled functions read and write the same arrays in every call
 
@@ -78,7 +79,7 @@ def solves(task: Task, params: BallbotParams) -> bool:
 
 
 def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.ndarray | None = None) -> BatchOptima:
-    """Optimizes B episodes, one after the other, on one core.
+    """Optimizes B episodes on one core.
 
     Args:
         task: one that `solves` admits.
@@ -110,8 +111,9 @@ def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.nd
         iterations=np.zeros(count, int),
     )
     with _one_at_a_time:
-        for i in range(count):
-            optima.costs[i] = solver.solve(x0[i], None if forces is None else forces[i, :steps], optima, i)
+        for first in range(0, count, _AT_ONCE):
+            rows = slice(first, first + _AT_ONCE)
+            solver.solve(x0[rows], None if forces is None else forces[rows, :steps], optima, rows)
     optima.solved[:] = np.isfinite(optima.costs)
     return optima
 
@@ -122,16 +124,35 @@ def optimized_steps(task: Task) -> int:
 
 
 @dataclass(frozen=True)
-class _Episode:
-    """A simulated episode: states (n+1, 8), forces (n, 2), their cost, and that with LQR's cost-to-go after them.
+class _Episodes:
+    """B simulated episodes, the steps first: states (n+1, B, 8), forces (n, B, 2), N.
 
-    The last is infinite where a margin is violated.
+    `held` (B,) are their costs, `cost` (B,) those with LQR's cost-to-go, infinite where a margin is violated.
     """
 
     x: np.ndarray
     u: np.ndarray
-    held: float
-    cost: float
+    held: np.ndarray
+    cost: np.ndarray
+
+    def of(self, rows: np.ndarray) -> "_Episodes":
+        """Some of them, copied."""
+        return _Episodes(self.x[:, rows], self.u[:, rows], self.held[rows], self.cost[rows])
+
+    def put(self, rows: np.ndarray, others: "_Episodes") -> None:
+        """Puts others in the place of some of them."""
+        self.x[:, rows], self.u[:, rows], self.held[rows], self.cost[rows] = (
+            others.x,
+            others.u,
+            others.held,
+            others.cost,
+        )
+
+    def improve(self, rows: np.ndarray, others: "_Episodes") -> np.ndarray:
+        """Puts others in the place of some of them where they are cheaper, and says where (len(rows),)."""
+        cheaper = others.cost < self.cost[rows]
+        self.put(rows[cheaper], others.of(cheaper))
+        return cheaper
 
 
 class _Solver:
@@ -144,92 +165,121 @@ class _Solver:
         self._lqr, self._p = discrete_lqr(task, params, rest.x[-1], rest.u[-1], np.zeros(0))
         limit = params.force_limit * (1 - _FORCE_BACKOFF)
         n, rest_steps = self._steps, task.steps - self._steps
-        functions = compiled(
+        follow, steer, sweep = in_lanes(
             f"{task.id}-batch",
             (
-                _following(task, params, limit).mapaccum("follow", n),
-                _following(task, params, limit).mapaccum("follow_to_end", max(rest_steps, 1)),
-                _steering(task, params, limit, self._rest[:2]).mapaccum("steer", n),
-                _sweeping(task, params, limit).mapaccum("sweep", n),
+                _following(task, params, limit),
+                _steering(task, params, limit, self._rest[:2]),
+                _sweeping(task, params, limit),
             ),
         )
-        self._follow, self._follow_to_end, self._steer, self._sweep = map(_Call, functions)
-        self._no_gains = np.zeros((n, 16))
-        self._lqr_gains = np.tile(self._lqr.ravel(), (rest_steps, 1))
-        self._at_rest, self._no_forces = np.tile(self._rest, (rest_steps, 1)), np.zeros((rest_steps, 2))
+        self._follow, self._follow_to_end = _Call(follow, n), _Call(follow, max(rest_steps, 1))
+        self._steer, self._sweep = _Call(steer, n), _Call(sweep, n, last_alone=True)
+        self._lqr_gains, self._at_rest = self._lqr.reshape(1, 1, 16), self._rest.reshape(1, 1, 8)
         self._end_value = np.array([2 * self._p[i, j] for i, j in _UPPER])
-        times = task.control_dt * np.arange(n)[:, None]
+        times = task.control_dt * np.arange(n)
         self._fading = {fade: np.exp(-times / fade) for *_, fade in (*_FAMILY, *_SIDEWAYS_FAMILY)}
 
-    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, row: int) -> float:
-        """Optimizes one episode from x0 (8,), and writes it into a row of `optima`, but for the cost.
+    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, rows: slice) -> None:
+        """Optimizes B episodes, and writes them into rows of `optima`.
 
         Args:
-            x0: (8,).
-            forces: (T, 2) to start from where they are cheaper than recoveries.
-            optima: to be filled.
-            row: of these.
-
-        Returns:
-            The cost of the whole episode; NaN if it did not converge, or violates a margin.
+            x0: (B, 8) initial states.
+            forces: (B, T, 2) to start from where they are cheaper than recoveries.
+            optima: to be filled. Costs become NaN where it did not converge, or a margin is violated.
+            rows: B of these.
         """
-        best = self._recovery(x0)
+        n, count = self._steps, len(x0)
+        best = self._recoveries(x0)
         if forces is not None:
-            given = self._roll(x0, forces, self._no_gains, np.zeros((self._steps, 8)))
-            best = min(best, given, key=lambda episode: episode.cost)
-        converged, gains, slopes = False, self._no_gains, np.zeros((self._steps, 8))
-        while np.isfinite(best.cost) and not converged and optima.iterations[row] < _MOST_ITERATIONS:
-            change, gains, slopes, promised = self._backward(best)
-            optima.iterations[row] += 1
-            tried = (self._roll(x0, best.u + share * change, gains, best.x[:-1]) for share in (1.0, *_SHORTER_STEPS))
-            lower = next((episode for episode in tried if episode.cost < best.cost), None)
-            if lower is None:
-                break
-            converged = promised < _TOLERANCE * best.cost
-            best = lower
-        n = self._steps
-        x, u = optima.states[row], optima.forces[row]
-        x[: n + 1], u[:n], optima.slopes[row, :n] = best.x, best.u, slopes
-        optima.gains[row, :n], optima.gains[row, n:] = gains.reshape(n, 2, 8), self._lqr
-        cost, room = best.held, min(np.min(margin) for margin in self._task.margins(x0, np.zeros(0)))
-        if len(self._no_forces):
-            x[n + 1 :], u[n:], costs, rooms = self._follow_to_end(x[n], self._no_forces, self._lqr_gains, self._at_rest)
-            cost, room = cost + float(costs.sum()), min(room, rooms.min())
-        optima.slopes[row, n:] = 2 * (x[n:-1] - self._rest) @ self._p
-        return cost if converged and room >= 0 else np.nan
+            best.improve(np.arange(count), self._roll(x0, forces.swapaxes(0, 1), _NO_GAINS, _NO_STATES))
+        gains, slopes = np.zeros((n, count, 16)), np.zeros((n, count, 8))
+        iterations, converged = optima.iterations[rows], np.zeros(count, bool)
+        active = np.flatnonzero(np.isfinite(best.cost))
+        current = best.of(active)
+        while len(active):
+            change, feedback, slope, promised = self._backward(current)
+            iterations[active] += 1
+            before, x = current, current.x[:-1]
+            current = self._roll(x[0], before.u + change, feedback, x)
+            dearer = np.flatnonzero(~(current.cost < before.cost))
+            current.put(dearer, before.of(dearer))
+            for share in _SHORTER_STEPS:
+                if len(dearer):
+                    u = before.u[:, dearer] + share * change[:, dearer]
+                    tried = self._roll(x[0, dearer], u, feedback[:, dearer], x[:, dearer])
+                    dearer = dearer[~current.improve(dearer, tried)]
+            stuck = np.isin(np.arange(len(active)), dearer)
+            done = ~stuck & (promised < _TOLERANCE * before.cost)
+            over = stuck | done | (iterations[active] == _MOST_ITERATIONS)
+            if over.any():
+                best.put(active[over], current.of(over))
+                gains[:, active[over]], slopes[:, active[over]] = feedback[:, over], slope[:, over]
+                converged[active[done]] = True
+                active, current = active[~over], current.of(~over)
+        x, u = optima.states[rows], optima.forces[rows]
+        x[:, : n + 1], u[:, :n] = best.x.swapaxes(0, 1), best.u.swapaxes(0, 1)
+        optima.slopes[rows, :n] = slopes.swapaxes(0, 1)
+        optima.gains[rows, :n] = gains.swapaxes(0, 1).reshape(count, n, 2, 8)
+        optima.gains[rows, n:] = self._lqr
+        costs, room = best.held, np.min(np.broadcast_arrays(*self._task.margins(x0, np.zeros(0))), axis=0)
+        if n < self._task.steps:
+            after, held, running, rooms = self._follow_to_end(best.x[-1:], _NO_FORCES, self._lqr_gains, self._at_rest)
+            x[:, n + 1 :], u[:, n:] = after.swapaxes(0, 1), held.swapaxes(0, 1)
+            costs, room = costs + _total(running), np.minimum(room, rooms.min(axis=(0, 2)))
+        optima.slopes[rows, n:] = 2 * _product(x[:, n:-1] - self._rest, self._p)
+        optima.costs[rows] = np.where(converged & (room >= 0), costs, np.nan)
 
-    def _recovery(self, x0: np.ndarray) -> _Episode:
-        """The cheapest simulated recovery. Where none in the plane of the fall survives, those to its sides are tried."""
-        best = _Episode(np.zeros((self._steps + 1, 8)), np.zeros((self._steps, 2)), 0.0, np.inf)
-        side = righting.leaning_aside(x0, np.ones(1))[:, 0]
+    def _recoveries(self, x0: np.ndarray) -> _Episodes:
+        """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
+        n, count = self._steps, len(x0)
+        best = _Episodes(np.zeros((n + 1, count, 8)), np.zeros((n, count, 2)), np.zeros(count), np.full(count, np.inf))
+        side = righting.leaning_aside(x0, np.ones(count)).T
         for family in (_FAMILY, _SIDEWAYS_FAMILY):
-            for bandwidth, seconds, lean, fade in family:
-                found = self._episode(x0, self._steer(x0, lean * self._fading[fade] * side, [bandwidth, seconds]))
-                best = min(best, found, key=lambda episode: episode.cost)
-            if np.isfinite(best.cost):
-                break
+            rows = np.flatnonzero(np.isinf(best.cost))
+            for bandwidth, seconds, lean, fade in family if len(rows) else ():
+                aside = lean * self._fading[fade][:, None, None] * side[rows]
+                best.improve(
+                    rows,
+                    self._episodes(x0[rows], self._steer(x0[None, rows], aside, np.array([[[bandwidth, seconds]]]))),
+                )
         return best
 
-    def _roll(self, x0: np.ndarray, u: np.ndarray, gains: np.ndarray, about: np.ndarray) -> _Episode:
+    def _roll(self, x0: np.ndarray, u: np.ndarray, gains: np.ndarray, about: np.ndarray) -> _Episodes:
         """Simulates u − K (x − about)."""
-        return self._episode(x0, self._follow(x0, u, gains, about))
+        return self._episodes(x0, self._follow(x0[None], u, gains, about))
 
-    def _episode(self, x0: np.ndarray, simulated: Sequence[np.ndarray]) -> _Episode:
-        """An episode of the optimized steps, with LQR's cost-to-go after them."""
+    def _episodes(self, x0: np.ndarray, simulated: Sequence[np.ndarray]) -> _Episodes:
+        """Episodes of the optimized steps, with LQR's cost-to-go after them."""
         after, u, costs, room = simulated
-        held, cost = float(costs.sum()), np.inf
-        if room.min() > 0:  # NaN is not
-            off = after[-1] - self._rest
-            cost = held + float(off @ self._p @ off)
-        return _Episode(np.concatenate([x0[None], after]), u, held, cost)
+        held, off = _total(costs), after[-1] - self._rest
+        safe = room.min(axis=(0, 2)) > 0  # NaN is not
+        with np.errstate(over="ignore", invalid="ignore"):  # of what fell
+            cost = np.where(safe, held + (_product(off, self._p) * off).sum(axis=1), np.inf)
+        return _Episodes(np.concatenate([x0[None], after]), u, held, cost)
 
-    def _backward(self, episode: _Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Changes of the forces (T, 2), feedback K (T, 16), slopes of the cost-to-go (T, 8), and by how much the linear model
-        says that the changes lower the cost.
+    def _backward(self, episodes: _Episodes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Changes of the forces (T, B, 2), feedback K (T, B, 16), slopes of the cost-to-go (T, B, 8), and by how much the
+        linear model says that the changes lower the costs (B,).
         """
-        end = np.concatenate([self._end_value, 2 * self._p @ (episode.x[-1] - self._rest), [0.0]])
-        ahead, change, gains = self._sweep(end, episode.x[-2::-1], episode.u[::-1])
-        return change[::-1], gains[::-1], ahead[::-1, 36:44], float(ahead[-1, 44])
+        count = len(episodes.cost)
+        slope = 2 * _product(episodes.x[-1] - self._rest, self._p)
+        end = np.concatenate([np.tile(self._end_value, (count, 1)), slope, np.zeros((count, 1))], axis=1)
+        ahead, change, gains, slopes = self._sweep(end[None], episodes.x[-2::-1], episodes.u[::-1])
+        return change[::-1], gains[::-1], slopes[::-1], ahead[-1, :, -1]
+
+
+# NumPy's own sums and products add in an order that depends on the number of episodes.
+
+
+def _total(costs: np.ndarray) -> np.ndarray:
+    """(B,) sums of (n, B, 1)."""
+    return np.cumsum(costs[..., 0], axis=0)[-1]
+
+
+def _product(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """(..., 8) products of rows (..., 8) and a matrix (8, 8)."""
+    return functools.reduce(np.add, (rows[..., i, None] * row for i, row in enumerate(matrix)))
 
 
 @functools.lru_cache(maxsize=4)
@@ -238,27 +288,50 @@ def _solver(task: Task, params: BallbotParams) -> _Solver:
 
 
 class _Call:
-    """A CasADi function that reads and writes NumPy arrays (n, k), which CasADi sees as (k, n), without a copy of its own."""
+    """A function of `LANES` episodes and one control step, for n steps of any number of episodes.
 
-    def __init__(self, function: casadi.Function):
+    Its first result is its first argument in the next step. Arguments and results are arrays (n, B, k); of arguments n and B
+    may be 1. CasADi sees them as (k, n · LANES).
+    """
+
+    def __init__(self, step: casadi.Function, n: int, last_alone: bool = False):
+        """Args: last_alone: whether of the first result only that of the last step is wanted."""
+        function = step.mapaccum(n)
         self._buffer, self._evaluate = function.buffer()
-        self._arguments = [np.zeros(function.size_in(i)[::-1]) for i in range(function.n_in())]
-        self._results = [np.zeros(function.size_out(i)[::-1]) for i in range(function.n_out())]
+        self._arguments = [self._array(function.size_in(i)) for i in range(function.n_in())]
+        self._results = [self._array(function.size_out(i)) for i in range(function.n_out())]
         # CasADi's type stubs ask for a size too, and NumPy's do not know that arrays are buffers.
         for i, array in enumerate(self._arguments):
             self._buffer.set_arg(i, memoryview(array))  # pyright: ignore[reportArgumentType, reportCallIssue]
         for i, array in enumerate(self._results):
             self._buffer.set_res(i, memoryview(array))  # pyright: ignore[reportArgumentType, reportCallIssue]
+        self._wanted = [self._results[0][-1:] if last_alone else self._results[0], *self._results[1:]]
 
-    def __call__(self, *arguments: np.ndarray | Sequence[float]) -> list[np.ndarray]:
+    @staticmethod
+    def _array(size: tuple[int, int]) -> np.ndarray:
+        return np.zeros((size[1] // LANES, LANES, size[0]))
+
+    def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
+        count = max(array.shape[1] for array in arguments)
+        each = []
         for kept, given in zip(self._arguments, arguments, strict=True):
-            kept[:] = given
-        self._evaluate()
-        return [result.copy() for result in self._results]
+            if given.shape[1] == count:
+                each.append((kept, given))
+            else:
+                kept[:] = given  # the same for all episodes
+        results = [np.empty((len(kept), count, kept.shape[2])) for kept in self._wanted]
+        for first in range(0, count, LANES):
+            width = min(LANES, count - first)
+            episodes, lanes = slice(first, first + width), slice(width)
+            for kept, given in each:
+                kept[:, lanes] = given[:, episodes]  # other lanes compute what was there before
+            self._evaluate()
+            for result, kept in zip(results, self._wanted, strict=True):
+                result[:, episodes] = kept[:, lanes]
+        return results
 
 
-# The functions of one control step. `mapaccum` calls them for one step after the other, with the first result as the first
-# argument of the next.
+# The functions of one control step and one episode.
 
 
 def _held(task: Task, params: BallbotParams, x: casadi.SX, u: Sequence[casadi.SX]) -> list[casadi.SX]:
@@ -288,7 +361,8 @@ def _sweeping(task: Task, params: BallbotParams, limit: float) -> casadi.Functio
     """One control step of the Riccati recursion.
 
     What is ahead, and comes out for the step before: 36 second derivatives of the cost-to-go in the order of `_UPPER`, its 8
-    slopes, and by how much the changes lower the cost. The other results are the change of the force (2,) and K (16,).
+    slopes, and by how much the changes lower the cost. The other results are the change of the force (2,), K (16,), and the
+    slopes again.
     """
     ahead, x, u = (casadi.SX.sym(name, size) for name, size in (("ahead", 45), ("x", 8), ("u", 2)))
     z, dt = casadi.vertcat(x, u), task.control_dt
@@ -307,7 +381,9 @@ def _sweeping(task: Task, params: BallbotParams, limit: float) -> casadi.Functio
     promised = ahead[44] - 0.5 * casadi.dot(change, moved + slope[8:])
     slope_before = slope[:8] + mixed.T @ change - feedback.T @ moved
     out = casadi.vertcat(*(before[i, j] for i, j in _UPPER), slope_before, promised)
-    return casadi.Function("sweep_step", [ahead, x, u], [out, change, casadi.vec(feedback.T)], {"cse": True})
+    return casadi.Function(
+        "sweep_step", [ahead, x, u], [out, change, casadi.vec(feedback.T), slope_before], {"cse": True}
+    )
 
 
 _UPPER = [(i, j) for i in range(8) for j in range(i, 8)]
@@ -323,14 +399,16 @@ def _box_step(hessian: casadi.SX, gradient: casadi.SX, low: casadi.SX, high: cas
     inverse = casadi.vertcat(casadi.horzcat(c, -b), casadi.horzcat(-b, a)) / determinant
     free = -inverse @ gradient
     inside = casadi.logic_and(casadi.mmin(free - low) >= 0, casadi.mmin(high - free) >= 0)
-    step, least = casadi.SX.nan(2), casadi.SX.inf()
+    on_edges = []
     for edge in (low, high):
         first = casadi.vertcat(edge[0], ops.clip(-(gradient[1] + b * edge[0]) / c, low[1], high[1]))
         second = casadi.vertcat(ops.clip(-(gradient[0] + b * edge[1]) / a, low[0], high[0]), edge[1])
-        for tried in (first, second):
-            cost = 0.5 * casadi.dot(tried, hessian @ tried) + casadi.dot(gradient, tried)
-            step = casadi.if_else(cost < least, tried, step)
-            least = casadi.fmin(cost, least)
+        on_edges += [first, second]
+    costs = [0.5 * casadi.dot(tried, hessian @ tried) + casadi.dot(gradient, tried) for tried in on_edges]
+    step, least = on_edges[0], costs[0]
+    for tried, cost in zip(on_edges[1:], costs[1:], strict=True):
+        step = casadi.if_else(cost < least, tried, step)
+        least = casadi.fmin(cost, least)
     step = casadi.if_else(inside, free, step)
     moves = [casadi.logic_and(step[i] > low[i], step[i] < high[i]) for i in range(2)]
     both = casadi.logic_and(*moves)
