@@ -112,7 +112,7 @@ def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.nd
     )
     with _one_at_a_time:
         for first in range(0, count, _AT_ONCE):
-            rows = slice(first, first + _AT_ONCE)
+            rows = np.arange(first, min(first + _AT_ONCE, count))
             solver.solve(x0[rows], None if forces is None else forces[rows, :steps], optima, rows)
     optima.solved[:] = np.isfinite(optima.costs)
     return optima
@@ -180,54 +180,66 @@ class _Solver:
         times = task.control_dt * np.arange(n)
         self._fading = {fade: np.exp(-times / fade) for *_, fade in (*_FAMILY, *_SIDEWAYS_FAMILY)}
 
-    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, rows: slice) -> None:
-        """Optimizes B episodes, and writes them into rows of `optima`.
+    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, rows: np.ndarray) -> None:
+        """Optimizes B episodes, and writes those that some recovery survives into `optima`.
 
         Args:
             x0: (B, 8) initial states.
             forces: (B, T, 2) to start from where they are cheaper than recoveries.
-            optima: to be filled. Costs become NaN where it did not converge, or a margin is violated.
-            rows: B of these.
+            optima: to be filled. Costs stay NaN where it did not converge, or a margin is violated.
+            rows: (B,) of these.
         """
-        n, count = self._steps, len(x0)
-        best = self._recoveries(x0)
+        current = self._recoveries(x0)
         if forces is not None:
-            best.improve(np.arange(count), self._roll(x0, forces.swapaxes(0, 1), _NO_GAINS, _NO_STATES))
-        gains, slopes = np.zeros((n, count, 16)), np.zeros((n, count, 8))
-        iterations, converged = optima.iterations[rows], np.zeros(count, bool)
-        active = np.flatnonzero(np.isfinite(best.cost))
-        current = best.of(active)
+            current.improve(np.arange(len(x0)), self._roll(x0, forces.swapaxes(0, 1), _NO_GAINS, _NO_STATES))
+        active = np.flatnonzero(np.isfinite(current.cost))
+        current, iterations = current.of(active), 0
         while len(active):
-            change, feedback, slope, promised = self._backward(current)
-            iterations[active] += 1
+            change, gains, slopes, promised = self._backward(current)
+            iterations += 1
             before, x = current, current.x[:-1]
-            current = self._roll(x[0], before.u + change, feedback, x)
+            current = self._roll(x[0], before.u + change, gains, x)
             dearer = np.flatnonzero(~(current.cost < before.cost))
             current.put(dearer, before.of(dearer))
             for share in _SHORTER_STEPS:
                 if len(dearer):
                     u = before.u[:, dearer] + share * change[:, dearer]
-                    tried = self._roll(x[0, dearer], u, feedback[:, dearer], x[:, dearer])
+                    tried = self._roll(x[0, dearer], u, gains[:, dearer], x[:, dearer])
                     dearer = dearer[~current.improve(dearer, tried)]
             stuck = np.isin(np.arange(len(active)), dearer)
-            done = ~stuck & (promised < _TOLERANCE * before.cost)
-            over = stuck | done | (iterations[active] == _MOST_ITERATIONS)
+            converged = ~stuck & (promised < _TOLERANCE * before.cost)
+            over = stuck | converged | (iterations == _MOST_ITERATIONS)
             if over.any():
-                best.put(active[over], current.of(over))
-                gains[:, active[over]], slopes[:, active[over]] = feedback[:, over], slope[:, over]
-                converged[active[done]] = True
+                optima.iterations[rows[active[over]]] = iterations
+                self._write(
+                    optima, rows[active[over]], current.of(over), gains[:, over], slopes[:, over], converged[over]
+                )
                 active, current = active[~over], current.of(~over)
-        x, u = optima.states[rows], optima.forces[rows]
-        x[:, : n + 1], u[:, :n] = best.x.swapaxes(0, 1), best.u.swapaxes(0, 1)
+
+    def _write(
+        self,
+        optima: BatchOptima,
+        rows: np.ndarray,
+        episodes: _Episodes,
+        gains: np.ndarray,
+        slopes: np.ndarray,
+        converged: np.ndarray,
+    ) -> None:
+        """Writes episodes, followed by LQR, with gains (T, B, 16) and slopes (T, B, 8), into rows (B,) of `optima`."""
+        n, costs = self._steps, episodes.held
+        margins = self._task.margins(episodes.x[0], np.zeros(0))
+        room = np.min(np.broadcast_arrays(*margins), axis=0)
+        optima.states[rows, : n + 1] = episodes.x.swapaxes(0, 1)
+        optima.forces[rows, :n] = episodes.u.swapaxes(0, 1)
+        optima.gains[rows, :n] = gains.swapaxes(0, 1).reshape(len(rows), n, 2, 8)
         optima.slopes[rows, :n] = slopes.swapaxes(0, 1)
-        optima.gains[rows, :n] = gains.swapaxes(0, 1).reshape(count, n, 2, 8)
-        optima.gains[rows, n:] = self._lqr
-        costs, room = best.held, np.min(np.broadcast_arrays(*self._task.margins(x0, np.zeros(0))), axis=0)
         if n < self._task.steps:
-            after, held, running, rooms = self._follow_to_end(best.x[-1:], _NO_FORCES, self._lqr_gains, self._at_rest)
-            x[:, n + 1 :], u[:, n:] = after.swapaxes(0, 1), held.swapaxes(0, 1)
+            x, u, running, rooms = self._follow_to_end(episodes.x[-1:], _NO_FORCES, self._lqr_gains, self._at_rest)
             costs, room = costs + _total(running), np.minimum(room, rooms.min(axis=(0, 2)))
-        optima.slopes[rows, n:] = 2 * _product(x[:, n:-1] - self._rest, self._p)
+            x = np.concatenate([episodes.x[-1:], x])
+            optima.states[rows, n:], optima.forces[rows, n:] = x.swapaxes(0, 1), u.swapaxes(0, 1)
+            optima.gains[rows, n:] = self._lqr
+            optima.slopes[rows, n:] = 2 * _product(x[:-1] - self._rest, self._p).swapaxes(0, 1)
         optima.costs[rows] = np.where(converged & (room >= 0), costs, np.nan)
 
     def _recoveries(self, x0: np.ndarray) -> _Episodes:
