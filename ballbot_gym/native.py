@@ -159,7 +159,7 @@ class BallbotNative:
             pay[:, idle] = 0.0
             flags[:, idle] = False
             violated[idle], force[:, idle], grip[:, idle] = -1, 0.0, 0.0
-        ended = np.flatnonzero(terminated | truncated)
+        ended = (terminated | truncated).nonzero()[0]
         final_seen = np.ascontiguousarray(seen.take(ended, 1).T, np.float32)
         begin = ended if restart else idle
         if begin is not None and begin.size:
@@ -249,7 +249,17 @@ class BallbotNative:
 
 
 def _pointers(*arrays: np.ndarray) -> list[int]:
-    return [array.ctypes.data for array in arrays]
+    return [_pointer(array) for array in arrays]
+
+
+def _pointer(array: np.ndarray) -> int:
+    """Where an array's memory begins; `array.ctypes.data` takes five times as long, which is a third of a step of one env."""
+    if not array.size:
+        return 0
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    except (TypeError, ValueError):  # it is read-only, or not contiguous
+        return array.ctypes.data
 
 
 @cache
