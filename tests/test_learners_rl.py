@@ -348,6 +348,19 @@ def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
             np.testing.assert_allclose(REACH * np.array(back(tuple(there))), action, atol=1e-6)
 
 
+@pytest.mark.parametrize(("task", "most"), [("stabilize", 4.0), ("turn", 16.0)])
+def test_targets_of_sac_do_not_exceed_what_can_be_earned(task, most):
+    settings = replace(TINY["sac"], gamma=0.99, reward_scale=0.02, products=False)
+    model = LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None)._model
+    for critic in (model.critic, model.critic_target):
+        for network in critic.q_networks:
+            torch.nn.init.constant_(network[-1].bias, 1e3)
+    seen = torch.zeros(3, *model.observation_space.shape), torch.zeros(3, 2)
+    assert min(float(value.min()) for value in model.critic(*seen)) > 500
+    for value in model.critic_target(*seen):
+        torch.testing.assert_close(value, torch.full((3, 1), most))
+
+
 def test_sac_in_a_frame_goes_on_from_a_state_as_if_never_stopped():
     def learner():
         settings = replace(TINY["sac"], symmetry="frame")

@@ -72,6 +72,15 @@ def value_of_living(task: Task, reward_scale: float, gamma: float) -> float:
     return paid / (1 - gamma) if gamma < 1 else paid * task.steps
 
 
+def highest_value(task: Task, reward_scale: float, gamma: float) -> float:
+    """The most that a discounted sum of scaled rewards can be, because costs are not negative.
+
+    Where an episode ends at its goal, the time that is left is paid at once, without a discount.
+    """
+    living = value_of_living(task, reward_scale, gamma)
+    return max(living, value_of_living(task, reward_scale, 1.0)) if task.first_exit else living
+
+
 def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float, power: float = 1.0) -> torch.Tensor:
     """Advantages relative to the cost to go, normalized, of returns and values of any one shape.
 

@@ -26,7 +26,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, value_of_living
+from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value, value_of_living
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
@@ -226,6 +226,13 @@ class Sac(ModelFree):
             for critic in (*model.critic.q_networks, *model.critic_target.q_networks):
                 last = cast(torch.nn.Linear, cast(torch.nn.Sequential, critic)[-1])
                 torch.nn.init.constant_(last.bias, value)
+        if not config.curriculum.shaping:  # which adds to rewards
+            # Critics overestimate, more and more, because they learn from their own estimates. Costs are not negative, so
+            # there is a limit, and values drift no farther.
+            highest = highest_value(task, config.reward_scale, config.gamma)
+            model.critic_target.register_forward_hook(
+                lambda _module, _inputs, values: tuple(value.clamp(max=highest) for value in values)
+            )
         self._set_model(
             model,
             torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
