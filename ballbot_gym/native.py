@@ -257,7 +257,8 @@ def _pointer(array: np.ndarray) -> int:
     if not array.size:
         return 0
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+        # NumPy's type stubs do not know that arrays are buffers
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError):  # it is read-only, or not contiguous
         return array.ctypes.data
 
