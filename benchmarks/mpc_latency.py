@@ -31,6 +31,7 @@ class Setting:
     horizon: float = 1.0
     control_dt: float = 0.02
     iterations: int = 1
+    duration: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,15 @@ def settings(tasks: tuple[str, ...], quick: bool) -> Iterator[Setting]:
     sweeps = [{"horizon": h} for h in (0.5, 2.0)] if quick else [{"horizon": h} for h in (0.4, 0.8, 1.5, 2.0)]
     sweeps += [{"nodes": n} for n in ((20,) if quick else (10, 20, 30, 50))]
     sweeps += [{"control_dt": dt} for dt in ((0.01,) if quick else (0.01, 0.005))]
+    if not quick:  # plans of whole episodes would take minutes
+        sweeps.append({"nodes": 20, "horizon": 0.5, "control_dt": 0.001, "duration": 2.0})
     for change in sweeps:
         yield replace(first, **change)
 
 
 def measure(setting: Setting, episodes: int) -> Latency:
     """Runs the first certified episodes in PyBullet."""
-    env = BallbotEnv(TASKS[setting.task](control_dt=setting.control_dt))
+    env = BallbotEnv(TASKS[setting.task](control_dt=setting.control_dt, duration=setting.duration))
     nmpc = NmpcController(env.task, env.params, setting.nodes, setting.horizon, setting.iterations)
     timed, regrets, falls = Timed(nmpc), [], 0
     for i in range(episodes):
@@ -123,7 +126,7 @@ def main(
     for setting in settings(tasks, quick):
         rows.append(row := measure(setting, 2 if quick else episodes))
         print(
-            f"{row.task:10s} {row.mode:20s} {row.nodes:3d} nodes over {row.horizon:.1f} s at {1 / row.control_dt:3.0f} Hz: "
+            f"{row.task:10s} {row.mode:20s} {row.nodes:3d} nodes over {row.horizon:.1f} s at {1 / row.control_dt:4.0f} Hz: "
             f"median {row.median_ms:.3f} ms, p99 {row.p99_ms:.3f} ms, max {row.max_ms:.2f} ms, "
             f"regret {row.regret_percent:+.2f} %, {row.failed} failed, {row.falls} falls",
             flush=True,
