@@ -14,6 +14,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, relative_advantages, value_of_living
+from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
@@ -192,6 +193,16 @@ def test_half_of_what_sac_learns_from_is_demonstrated(demos):
     assert shown == [False] * 8 + [True] * 8
 
 
+def test_rewards_beside_demonstrations_are_shaped_for_ppo_alone(params):
+    task = make_task("turn")
+    none, flags = np.zeros((1, len(task.observation_scale)), np.float32), np.ones(1, bool)
+    shown = Demos(none, np.zeros((1, 2), np.float32), np.zeros(1, np.float32), none, flags, ~flags, none[:, :2])
+    shaped = {"curriculum": Curriculum(shaping=10.0), "symmetry": "none"}
+    assert ppo.Ppo(task, params, replace(TINY["ppo"], **shaped), 0, shown)
+    with pytest.raises(ValueError, match="shaping cannot be used with sac's demonstrations"):
+        sac.Sac(task, params, replace(TINY["sac"], **shaped), 0, shown)
+
+
 def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
     one = np.ones((1, 8), np.float32)
     action, flag = np.zeros((1, 2), np.float32), np.ones(1, bool)
@@ -356,7 +367,8 @@ def test_targets_of_sac_do_not_exceed_what_can_be_earned(task, most):
         for network in critic.q_networks:
             torch.nn.init.constant_(network[-1].bias, 1e3)
     seen = torch.zeros(3, *model.observation_space.shape), torch.zeros(3, 2)
-    assert min(float(value.min()) for value in model.critic(*seen)) > 500
+    with torch.no_grad():
+        assert min(float(value.min()) for value in model.critic(*seen)) > 500
     for value in model.critic_target(*seen):
         torch.testing.assert_close(value, torch.full((3, 1), most))
 

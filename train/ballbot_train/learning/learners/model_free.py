@@ -88,10 +88,6 @@ class ModelFree(ABC):
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
         self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
-        if demos is not None and config.curriculum.shaping:
-            raise ValueError(
-                "curriculum.shaping cannot be used with demonstrations, because their rewards are not shaped"
-            )
         self._env = TrainingEnv(
             task,
             params,

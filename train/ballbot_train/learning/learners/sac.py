@@ -179,8 +179,12 @@ class Sac(ModelFree):
         """Takes demonstrations to learn from as well, or None.
 
         Raises:
-            ValueError: the task has no frame, and the settings ask for it.
+            ValueError: the task has no frame, and the settings ask for it; or they shape rewards beside demonstrations.
         """
+        if demos is not None and config.curriculum.shaping:
+            raise ValueError(
+                "curriculum.shaping cannot be used with sac's demonstrations, because their rewards are not shaped"
+            )
         self._spec = spec_for(task, config.symmetry, config.hidden)
         frame = None if self._spec.frame is None else FRAMES[self._spec.frame]
         if demos is not None and frame is not None:
