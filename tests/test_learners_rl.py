@@ -203,6 +203,29 @@ def test_rewards_beside_demonstrations_are_shaped_for_ppo_alone(params):
         sac.Sac(task, params, replace(TINY["sac"], **shaped), 0, shown)
 
 
+def test_without_pay_a_reward_is_minus_the_running_cost_and_a_failure_costs_its_price(name):
+    learner = make(name, num_envs=1, pay=False, failure_price=7.0, reward_scale=0.5, episode_seconds=8.0)
+    observation = torch.as_tensor(learner._env.reset())
+    _, reward, done, _ = learner._env.step(np.zeros((learner._settings.num_envs, 2), np.float32))
+    assert not done.any()
+    assert (reward < 0).all()  # with pay, 1 less the cost
+    assert (reward > -3.5).all()
+    for _ in range(60):  # it falls
+        _, reward, done, _ = learner._env.step(np.ones((learner._settings.num_envs, 2), np.float32))
+        if done.any():
+            break
+    assert (reward[done] < -0.5 * 7.0).all()
+    assert (reward[done] > -0.5 * (7.0 + 8.0)).all()
+    with torch.no_grad():
+        values = learner._model.policy.predict_values(observation) if name == "ppo" else torch.zeros(1)
+    assert values.abs().max() < 1.0  # not the value of living
+
+
+def test_demonstrations_that_pay_for_living_are_no_use_to_sac_without_pay(demos):
+    with pytest.raises(ValueError, match="sac's demonstrations pay for living; leave out --no-pay, or --demos"):
+        make("sac", demos, pay=False)
+
+
 def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
     one = np.ones((1, 8), np.float32)
     action, flag = np.zeros((1, 2), np.float32), np.ones(1, bool)

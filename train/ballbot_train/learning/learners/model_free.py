@@ -19,6 +19,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
+from ballbot_train.learning.critics import value_of_living
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
 from ballbot_train.learning.demonstrations import Demos
 from ballbot_train.learning.frames import seen_in, to_world
@@ -50,6 +51,10 @@ class ModelFreeConfig:
     """Whether the critics have a linear path, and see the products of all pairs of their inputs; see `learning.critics`."""
     curriculum: Curriculum = Curriculum()
     """What training makes easier at first."""
+    pay: bool = True
+    """Whether living pays in training. If not, the reward is minus the running cost. Evaluation is the same."""
+    failure_price: float = 300.0
+    """What a failure costs at once in training where living does not pay."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
@@ -97,6 +102,8 @@ class ModelFree(ABC):
             config.curriculum,
             config.gamma,
             frame,
+            pay=config.pay,
+            failure_price=config.failure_price,
         )
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
@@ -110,6 +117,10 @@ class ModelFree(ABC):
         )
         optimizers[0].register_step_pre_hook(self._add_imitation)
         self._random = ScopedRng()
+
+    def _value_of_living(self, gamma: float) -> float:
+        """Value of living for ever without cost."""
+        return value_of_living(self._task, self._settings.reward_scale, gamma) if self._settings.pay else 0.0
 
     @property
     @abstractmethod
@@ -208,6 +219,8 @@ class TrainingEnv(VecEnvWrapper):
         curriculum: Curriculum = Curriculum(),
         gamma: float = 1.0,
         frame: Frame | None = None,
+        pay: bool = True,
+        failure_price: float = 0.0,
     ):
         """Makes the envs.
 
@@ -220,13 +233,16 @@ class TrainingEnv(VecEnvWrapper):
             curriculum: what is easier at first.
             gamma: the learner's discount factor, for the curriculum's shaping.
             frame: in which observations are shown and actions taken; default, the task's own.
+            pay, failure_price: as of `CurriculumBatch`.
 
         Raises:
             ValueError: the task has not what the curriculum asks for.
         """
         shorter = replace(task, duration=episode_seconds)
         self._vector = BallbotVectorEnv(num_envs, shorter, params=params, compile=False, engine="torch")
-        self.batch = CurriculumBatch(shorter, num_envs, params, curriculum, gamma, full=task)
+        self.batch = CurriculumBatch(
+            shorter, num_envs, params, curriculum, gamma, full=task, pay=pay, failure_price=failure_price
+        )
         self._vector.batch = self.batch
         self._scale = np.float32(reward_scale)
         self._frame, self._axes = frame, np.zeros(0)

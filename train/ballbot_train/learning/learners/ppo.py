@@ -4,7 +4,6 @@
 complex dexterous manipulation with deep reinforcement learning and demonstrations", 2018.
 """
 
-import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, average_of, spec_for
-from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages, value_of_living
+from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
 from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
@@ -182,7 +181,7 @@ class Ppo(ModelFree):
         self.config = config
         self._std = config.std if demos is None else config.demo_std
         rate = config.learning_rate if demos is None else config.demo_learning_rate
-        value = value_of_living(task, config.reward_scale, config.gamma)
+        value = self._value_of_living(config.gamma)
         plain = config.symmetry == "none" and not config.products
         model = PPO(
             "MlpPolicy" if plain else BranchedPolicy,
@@ -203,7 +202,7 @@ class Ppo(ModelFree):
             rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
             rollout_buffer_kwargs=(
                 {
-                    "living": functools.partial(value_of_living, task, config.reward_scale),
+                    "living": self._value_of_living,
                     "power": config.relative_advantages,
                 }
                 if config.relative_advantages
@@ -251,11 +250,11 @@ class Ppo(ModelFree):
 
     def _raise_gamma(self, gamma: float) -> None:
         """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
-        policy, scale = cast(ActorCriticPolicy, self._model.policy), self.config.reward_scale
-        old = value_of_living(self._task, scale, self._model.gamma)
+        policy = cast(ActorCriticPolicy, self._model.policy)
+        more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
         critic = policy.branches.critic.linear if isinstance(policy, BranchedPolicy) else policy.value_net
         with torch.no_grad():
-            cast(torch.nn.Linear, critic).bias.add_(value_of_living(self._task, scale, gamma) - old)
+            cast(torch.nn.Linear, critic).bias.add_(more)
         self._take_gamma(gamma)
 
     def _take_gamma(self, gamma: float) -> None:

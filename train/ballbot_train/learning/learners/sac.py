@@ -26,7 +26,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value, value_of_living
+from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
@@ -179,12 +179,14 @@ class Sac(ModelFree):
         """Takes demonstrations to learn from as well, or None.
 
         Raises:
-            ValueError: the task has no frame, and the settings ask for it; or they shape rewards beside demonstrations.
+            ValueError: the task has no frame, and the settings ask for it; or they change rewards beside demonstrations.
         """
         if demos is not None and config.curriculum.shaping:
             raise ValueError(
                 "curriculum.shaping cannot be used with sac's demonstrations, because their rewards are not shaped"
             )
+        if demos is not None and not config.pay:
+            raise ValueError("sac's demonstrations pay for living; leave out --no-pay, or --demos")
         self._spec = spec_for(task, config.symmetry, config.hidden)
         frame = None if self._spec.frame is None else FRAMES[self._spec.frame]
         if demos is not None and frame is not None:
@@ -192,7 +194,7 @@ class Sac(ModelFree):
         super().__init__(task, params, config, demos, frame)
         self.config = config
         rate = config.learning_rate
-        value = value_of_living(task, config.reward_scale, config.gamma)
+        value = self._value_of_living(config.gamma)
         model = SAC(
             ProductPolicy if config.products else "MlpPolicy",
             self._env,
@@ -233,7 +235,7 @@ class Sac(ModelFree):
         if not config.curriculum.shaping:  # which adds to rewards
             # Critics overestimate, more and more, because they learn from their own estimates. Costs are not negative, so
             # there is a limit, and values drift no farther.
-            highest = highest_value(task, config.reward_scale, config.gamma)
+            highest = highest_value(task, config.reward_scale, config.gamma) if config.pay else 0.0
             model.critic_target.register_forward_hook(
                 lambda _module, _inputs, values: tuple(value.clamp(max=highest) for value in values)
             )
