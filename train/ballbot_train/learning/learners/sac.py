@@ -27,6 +27,7 @@ from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value
+from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
@@ -39,8 +40,8 @@ class SacConfig(ModelFreeConfig):
     """Settings of `Sac`."""
 
     products: bool = False
-    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions. The only
-    trial so far, 50,000 steps on Stabilize, learnt nothing with them."""
+    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions. In both
+    trials on Stabilize the values then diverged."""
     rl_iterations: int = 200
     num_envs: int = 16
     num_steps: int = 63
@@ -72,6 +73,21 @@ class SacConfig(ModelFreeConfig):
 
 
 TUNED: dict[str, SacConfig] = {
+    "stabilize": SacConfig(
+        symmetry="mirrors",
+        rl_iterations=300,
+        num_envs=128,
+        num_steps=25,
+        gradient_steps=16,
+        batch_size=512,
+        learning_rate=1e-3,
+        final_learning_rate_fraction=0.05,
+        gamma=0.99,
+        std=0.3,
+        target_entropy=-4.0,
+        evaluations=30,
+        curriculum=Curriculum(short_episodes=0.3),
+    ),
     "orbit": SacConfig(symmetry="frame"),
     "turn": SacConfig(episode_seconds=8.0, symmetry="frame"),
     "weave": SacConfig(episode_seconds=8.0, symmetry="frame"),
