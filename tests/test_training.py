@@ -225,6 +225,21 @@ def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_t
     assert described["chosen_by"]["cost"] == 20.0
 
 
+def test_a_policy_of_the_preparation_is_kept_only_until_there_is_a_later_one(short_run, tmp_path, monkeypatch):
+    costs, kept = iter((30.0, 20.0, 25.0)), []
+    monkeypatch.setattr(shac.Shac, "preparation", 1, raising=False)
+    monkeypatch.setattr(training._Run, "_save_policy", lambda run, network: kept.append(run._about()))
+    monkeypatch.setattr(training._Run, "save", lambda run: None)
+    monkeypatch.setattr(
+        training,
+        "score_and_validate",
+        lambda *policy: (training.Score(1.1, 0.1, 0.1, 1.0, 0), training.Validation(next(costs), 1.0, 0, 1.0)),
+    )
+    short_run()
+    assert [about["chosen_by"]["cost"] for about in kept] == [30.0, 20.0, 25.0]
+    assert [about["iteration"] for about in kept] == [0, 1, 2]
+
+
 def test_a_checkpoint_of_an_earlier_version_goes_on(short_run, tmp_path):
     short_run()
     path = tmp_path / "checkpoint.pt"

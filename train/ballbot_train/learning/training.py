@@ -113,6 +113,16 @@ class Staged(Protocol):
         ...
 
 
+@runtime_checkable
+class Prepared(Protocol):
+    """A learner that begins by something else, as with imitating demonstrations."""
+
+    @property
+    def preparation(self) -> int:
+        """Iterations of that. A run keeps a policy of theirs only as long as there is no later one."""
+        ...
+
+
 @dataclass(frozen=True)
 class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
@@ -342,6 +352,9 @@ class _Run:
             }
         )
         self._write_rows()
+        before = [row["iteration"] for row in self.rows[:-1]]
+        if self._preparation and max(before, default=0) <= self._preparation < self.learner.iteration:
+            self.best = math.inf
         if validation.cost < self.best:
             self.best = validation.cost
             self._save_policy(network)
@@ -349,10 +362,20 @@ class _Run:
         return certified_figures | {f"validation/{name}": value for name, value in asdict(validation).items()}
 
     @property
+    def _preparation(self) -> int:
+        return self.learner.preparation if isinstance(self.learner, Prepared) else 0
+
+    @property
+    def _chosen(self) -> dict[str, Any]:
+        """The evaluation whose policy is kept."""
+        known = [row for row in self.rows if not math.isnan(row["validation_cost"])] or self.rows
+        later = [row for row in known if row["iteration"] > self._preparation] if self._preparation else known
+        return min(later or known, key=lambda row: row["validation_cost"])
+
+    @property
     def best_text(self) -> str:
         """The best so far, for the progress bar."""
-        known = [row for row in self.rows if not math.isnan(row["validation_cost"])]
-        best = min(known or self.rows, key=lambda row: row["validation_cost"])
+        best = self._chosen
         return f"cost {best['validation_cost']:.2f}, {best['validation_failures']} fail"
 
     def save(self) -> None:
@@ -403,7 +426,7 @@ class _Run:
         return {
             "training": self.config,
             "chosen_by": {"episodes": f"{VALIDATION_EPISODES} fresh, for validation", "cost": self.best},
-            "iteration": self.learner.iteration,
+            "iteration": self._chosen["iteration"],
             "training_seconds": round(self.seconds, 1),
             **({"curriculum_reached": reached} if reached else {}),
         }

@@ -132,6 +132,11 @@ class ModelFree(ABC):
         """Factor of the imitation loss, the mean squared difference of the actions, besides its weight."""
 
     @property
+    def preparation(self) -> int:
+        """Iterations that imitate demonstrations, and of the critic alone."""
+        return self._clone_iterations + self._warmup_iterations
+
+    @property
     def difficulty(self) -> dict[str, float]:
         """How far the curriculum has come."""
         return self._env.batch.difficulty
