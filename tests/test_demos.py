@@ -150,8 +150,8 @@ def test_a_policy_that_comes_with_the_package_can_demonstrate(tmp_path):
     demos = load_demos(folder, task)
     policy = load_policy(shipped_policies(task)["dagger"], task)
     np.testing.assert_allclose(policy.predict(demos.observations)[0], demos.actions, atol=1e-5)
-    with pytest.raises(ValueError, match="unknown expert ppo; known: lqr, trajopt, nmpc, dagger"):
-        DemoConfig("orbit", "ppo")
+    with pytest.raises(ValueError, match="unknown expert shac; known: lqr, trajopt, nmpc, dagger, ppo, sac"):
+        DemoConfig("orbit", "shac")
 
 
 def test_experts_that_take_a_back_off_get_the_one_of_the_dataset():
