@@ -5,7 +5,7 @@ complex dexterous manipulation with deep reinforcement learning and demonstratio
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -73,35 +73,33 @@ class PpoConfig(ModelFreeConfig):
     """In place of `std` if there are demonstrations."""
 
 
+_BULK = PpoConfig(
+    num_envs=2048,
+    num_steps=24,
+    batch_size=3072,
+    hidden=(64, 64),
+    learning_rate=2e-3,
+    final_learning_rate_fraction=0.05,
+    max_grad_norm=1.0,
+)  # as `rsl_ppo` trains, with averages over many envs
+
 TUNED: dict[str, PpoConfig] = {
-    "stabilize": PpoConfig(
+    "stabilize": replace(
+        _BULK,
         symmetry="odd",
         rl_iterations=560,
-        num_envs=2048,
-        num_steps=24,
-        batch_size=3072,
-        hidden=(64, 64),
-        learning_rate=2e-3,
-        final_learning_rate_fraction=0.05,
         final_gamma=0.999,
         gae_lambda=0.9,
         final_std=0.05,
-        max_grad_norm=1.0,
         evaluations=28,
         curriculum=Curriculum(short_episodes=0.85),
     ),
-    "orbit": PpoConfig(
+    "orbit": replace(
+        _BULK,
         symmetry="frame",
         rl_iterations=600,
-        num_envs=2048,
-        num_steps=24,
-        batch_size=3072,
-        hidden=(64, 64),
-        learning_rate=2e-3,
-        final_learning_rate_fraction=0.05,
         gamma=0.99,
         relative_advantages=1.0,
-        max_grad_norm=1.0,
         evaluations=40,
         curriculum=Curriculum(short_episodes=0.3),
     ),
