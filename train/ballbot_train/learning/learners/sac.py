@@ -40,8 +40,8 @@ class SacConfig(ModelFreeConfig):
     """Settings of `Sac`."""
 
     products: bool = False
-    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions. In both
-    trials on Stabilize the values then diverged."""
+    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions. Two
+    trials on Stabilize, of 50,000 and 200,000 steps, learnt nothing with them."""
     rl_iterations: int = 200
     num_envs: int = 16
     num_steps: int = 63
