@@ -9,7 +9,7 @@ import torch
 from stable_baselines3 import PPO, SAC
 
 from ballbot_gym import dynamics
-from ballbot_gym.env import make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
@@ -19,7 +19,7 @@ from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos,
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
 from ballbot_train.learning.learners.model_free import ScopedRng, TrainingEnv
-from ballbot_train.policy import load_network, save_policy
+from ballbot_train.policy import load_network, save_policy, shipped_policies
 
 IMITATING = {"clone_iterations": 2, "clone_gradient_steps": 5, "clone_batch_size": 32, "critic_warmup_iterations": 1}
 TINY = {
@@ -203,6 +203,27 @@ def test_rewards_beside_demonstrations_are_shaped_for_ppo_alone(params):
         sac.Sac(task, params, replace(TINY["sac"], **shaped), 0, shown)
 
 
+def test_the_layers_of_sacs_critics_can_be_normalized():
+    learner = make("sac", products=False, layer_norm=True)
+    start = [value.clone() for value in learner._model.critic.parameters()]
+    for critics in (learner._model.critic, learner._model.critic_target):
+        for network in critics.q_networks:
+            assert sum(isinstance(layer, torch.nn.LayerNorm) for layer in network) == len(TINY["sac"].hidden)
+            living = value_of_living(make_task("stabilize"), learner.config.reward_scale, learner.config.gamma)
+            assert float(network[-1].bias.detach()) == pytest.approx(living)
+    run(learner)
+    assert all(not torch.equal(*pair) for pair in zip(start, learner._model.critic.parameters(), strict=True))
+
+
+def test_sac_without_pay_learns_from_demonstrations_without_pay():
+    one, flag = np.ones((1, 8), np.float32), np.ones(1, bool)
+    shown = Demos(one, one[:, :2], np.array([1.5], np.float32), one, ~flag, flag, one[:, :2])
+    learner = sac.Sac(make_task("stabilize"), default_params(), replace(TINY["sac"], pay=False), 0, shown)
+    run(learner, TINY["sac"].clone_iterations + 1)
+    sample = learner._model.replay_buffer.sample(2)
+    assert float(sample.rewards[1]) == pytest.approx(-0.5 * TINY["sac"].reward_scale)  # living pays 2 in a step
+
+
 def test_without_pay_a_reward_is_minus_the_running_cost_and_a_failure_costs_its_price(name):
     learner = make(name, num_envs=1, pay=False, failure_price=7.0, reward_scale=0.5, episode_seconds=8.0)
     observation = torch.as_tensor(learner._env.reset())
@@ -221,9 +242,29 @@ def test_without_pay_a_reward_is_minus_the_running_cost_and_a_failure_costs_its_
     assert values.abs().max() < 1.0  # not the value of living
 
 
-def test_demonstrations_that_pay_for_living_are_no_use_to_sac_without_pay(demos):
-    with pytest.raises(ValueError, match="sac's demonstrations pay for living; leave out --no-pay, or --demos"):
-        make("sac", demos, pay=False)
+@pytest.mark.parametrize("name", ["turn", "stabilize"])
+def test_demonstrations_without_pay_cost_what_the_episodes_did(name):
+    """One episode arrives or rests, one falls, one is cut short by the next."""
+    task = make_task(name)
+    env = BallbotEnv(task, physics="rk4")
+    network = load_network(next(iter(shipped_policies(task).values())), task)
+    rewards, costs, ends = [], [], []
+    for seed, act in ((0, network), (1, lambda seen: torch.ones(2)), (2, network)):
+        observation, info = env.reset(seed=seed)
+        terminated = truncated = False
+        while not (terminated or truncated):
+            with torch.no_grad():
+                action = act(torch.as_tensor(observation)).numpy()
+            observation, reward, terminated, truncated, info = env.step(action)
+            rewards.append(reward)
+            costs.append(40.0 * info["failure"] - info["reward_cost"])
+            ends.append((terminated, truncated))
+    env.close()
+    terminations, truncations = np.array(ends).T
+    assert terminations.sum() == (3 if task.first_exit else 1)
+    none = np.zeros((len(rewards), len(task.observation_scale)), np.float32)
+    paid = Demos(none, none[:, :2], np.array(rewards, np.float32), none, terminations, truncations, none[:, :2])
+    np.testing.assert_allclose(paid.without_pay(task, 40.0).rewards, -np.array(costs), atol=1e-3)
 
 
 def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():

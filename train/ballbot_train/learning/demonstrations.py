@@ -29,7 +29,7 @@ import shlex
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
@@ -128,6 +128,19 @@ class Demos:
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    def without_pay(self, task: Task, failure_price: float) -> "Demos":
+        """The same steps where living does not pay: rewards are minus the running cost, and a failure costs its price.
+
+        The step that arrives at the goal of a first-exit task is known by its reward, the pay of all the time that was left.
+        """
+        pay = task.survival_reward * task.control_dt
+        starts = np.flatnonzero(np.append(True, (self.terminations | self.truncations)[:-1]))
+        step = np.arange(len(self)) - np.repeat(starts, np.diff(np.append(starts, len(self))))
+        arrived = self.terminations & (self.rewards > pay) & task.first_exit
+        failed = self.terminations & ~arrived
+        rewards = self.rewards - pay - arrived * pay * (task.steps - step - 1) - failed * failure_price
+        return replace(self, rewards=rewards.astype(np.float32))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ online reinforcement learning with offline data", 2023). `ModelFree` says what e
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -17,7 +17,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac.policies import SACPolicy
 
@@ -52,6 +52,8 @@ class SacConfig(ModelFreeConfig):
     symmetry: Literal["none", "mirrors", "frame"] = "none"
     """Whether actor and critics learn from the task's mirror images as well, over which the policy is averaged; or see the
     task's frame, and act in it."""
+    layer_norm: bool = False
+    """Whether the critics' hidden layers are normalized, as Ball et al. do, unless they see products."""
     num_critics: int = 2
     """Critics, whose smallest value counts."""
     learning_rate: float = 5e-4
@@ -146,8 +148,8 @@ class SymmetricReplay(ReplayBuffer):
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class ProductCritic(ContinuousCritic):
-    """SB3's critics, each a `QuadraticCritic` on observation and action."""
+class Critics(ContinuousCritic):
+    """SB3's critics, each with another network."""
 
     def __init__(
         self,
@@ -157,10 +159,10 @@ class ProductCritic(ContinuousCritic):
         *,
         features_dim: int,
         activation_fn: type[torch.nn.Module],
-        value: float,
+        network: "CriticNetwork",
         **kwargs: Any,
     ):
-        """Args: value: of every state and action at the start; the others are SB3's."""
+        """Args: network: makes one critic's network; the others are SB3's."""
         super().__init__(
             observation_space,
             action_space,
@@ -169,23 +171,38 @@ class ProductCritic(ContinuousCritic):
             activation_fn=activation_fn,
             **kwargs,
         )
-        inputs = CriticInputs(features_dim + get_action_dim(action_space))
-        self.q_networks = [QuadraticCritic(inputs, net_arch, activation_fn, value) for _ in range(self.n_critics)]
+        inputs = features_dim + get_action_dim(action_space)
+        self.q_networks = [network(inputs, net_arch, activation_fn) for _ in range(self.n_critics)]
         for index, critic in enumerate(self.q_networks):
             self.add_module(f"qf{index}", critic)
 
 
-class ProductPolicy(SACPolicy):
-    """SB3's policy with critics that see products."""
+class CriticPolicy(SACPolicy):
+    """SB3's policy with critics of another network."""
 
-    def __init__(self, *args: Any, value: float, **kwargs: Any):
-        """Args: value: of every state and action at the start; the others are SB3's."""
-        self._value = value
+    def __init__(self, *args: Any, network: "CriticNetwork", **kwargs: Any):
+        """Args: network: makes one critic's network; the others are SB3's."""
+        self._network = network
         super().__init__(*args, **kwargs)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return ProductCritic(**kwargs, value=self._value).to(self.device)
+        return Critics(**kwargs, network=self._network).to(self.device)
+
+
+CriticNetwork = Callable[[int, list[int], type[torch.nn.Module]], torch.nn.Module]
+"""From number of inputs, units of the hidden layers and activation to a network with one output."""
+
+
+def _critic_network(config: SacConfig, value: float) -> CriticNetwork:
+    """What makes critics that see products and expect `value` everywhere at the start, or whose layers are normalized."""
+
+    def network(inputs: int, hidden: list[int], activation: type[torch.nn.Module]) -> torch.nn.Module:
+        if config.products:
+            return QuadraticCritic(CriticInputs(inputs), hidden, activation, value)
+        return torch.nn.Sequential(*create_mlp(inputs, 1, hidden, activation, post_linear_modules=[torch.nn.LayerNorm]))
+
+    return network
 
 
 class Sac(ModelFree):
@@ -195,14 +212,14 @@ class Sac(ModelFree):
         """Takes demonstrations to learn from as well, or None.
 
         Raises:
-            ValueError: the task has no frame, and the settings ask for it; or they change rewards beside demonstrations.
+            ValueError: the task has no frame, and the settings ask for it; or they shape rewards beside demonstrations.
         """
         if demos is not None and config.curriculum.shaping:
             raise ValueError(
                 "curriculum.shaping cannot be used with sac's demonstrations, because their rewards are not shaped"
             )
         if demos is not None and not config.pay:
-            raise ValueError("sac's demonstrations pay for living; leave out --no-pay, or --demos")
+            demos = demos.without_pay(task, config.failure_price)
         self._spec = spec_for(task, config.symmetry, config.hidden)
         frame = None if self._spec.frame is None else FRAMES[self._spec.frame]
         if demos is not None and frame is not None:
@@ -212,7 +229,7 @@ class Sac(ModelFree):
         rate = config.learning_rate
         value = self._value_of_living(config.gamma)
         model = SAC(
-            ProductPolicy if config.products else "MlpPolicy",
+            CriticPolicy if config.products or config.layer_norm else "MlpPolicy",
             self._env,
             learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
             buffer_size=config.rl_iterations * config.num_steps * config.num_envs,
@@ -233,7 +250,7 @@ class Sac(ModelFree):
                 "net_arch": list(config.hidden),
                 "n_critics": config.num_critics,
                 "activation_fn": torch.nn.SiLU,
-                **({"value": value} if config.products else {}),
+                **({"network": _critic_network(config, value)} if config.products or config.layer_norm else {}),
             },
             seed=seed,
             device="cpu",
