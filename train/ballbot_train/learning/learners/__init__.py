@@ -79,9 +79,11 @@ _MAY_BE_ZERO = {
 _MAY_BE_NEGATIVE = {"target_entropy"}
 _SHARES = {"batch_dear_share", "beta", "final_gamma", "gae_lambda", "gamma", "tau"}
 _POSITIVE = {
+    "demo_critic_learning_rate",
     "demo_std",
     "final_learning_rate",
     "final_std",
+    "finetune_critic_learning_rate",
     "finetune_learning_rate",
     "finetune_std",
     "learning_rate",

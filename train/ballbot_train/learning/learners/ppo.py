@@ -53,6 +53,8 @@ class PpoConfig(ModelFreeConfig):
     """Learning rate at the start."""
     demo_learning_rate: float = 1e-4
     """In place of `learning_rate` if there are demonstrations."""
+    demo_critic_learning_rate: float | None = None
+    """Learning rate of the critic throughout if there are demonstrations; default, the actor's, which is small."""
     final_learning_rate_fraction: float = 0.02
     """Learning rate at the end, as a fraction of that at the start. It falls linearly."""
     update_epochs: int = 5
@@ -230,6 +232,8 @@ class Ppo(ModelFree):
             actor = policy.branches.actor
         else:
             actor = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
+        if demos is not None and config.demo_critic_learning_rate is not None:
+            _set_critic_rate(policy, actor, config.demo_critic_learning_rate)
         self._model: PPO
         self._set_model(model, actor, (policy.optimizer,))
         self._average = average_of(actor, config.averaged_iterations)
@@ -275,6 +279,20 @@ class Ppo(ModelFree):
 
     def _imitation_scale(self) -> float:
         return float(self._log_std.detach().exp()[0]) ** -2
+
+
+def _set_critic_rate(policy: ActorCriticPolicy, actor: torch.nn.Module, rate: float) -> None:
+    """Gives a policy an optimizer in which all but the actor has a learning rate of its own."""
+    of_actor = list(actor.parameters())
+    ids = {id(parameter) for parameter in of_actor}
+    of_critic = [parameter for parameter in policy.parameters() if id(parameter) not in ids]
+    groups: Any = [{"params": of_actor, "lr": rate}, {"params": of_critic, "lr": rate}]
+    policy.optimizer = policy.optimizer_class(groups, **policy.optimizer_kwargs)
+
+    def keep_rate(optimizer: torch.optim.Optimizer, *_: object) -> None:
+        optimizer.param_groups[1]["lr"] = rate  # SB3 gives one to all groups
+
+    policy.optimizer.register_step_pre_hook(keep_rate)
 
 
 def make(task: Task, params: BallbotParams, config: PpoConfig, seed: int, demos: str | Path | None) -> Ppo:

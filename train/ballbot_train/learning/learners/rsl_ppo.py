@@ -86,6 +86,8 @@ class RslPpoConfig:
     """Gradient steps of a pass."""
     finetune_learning_rate: float = 3e-5
     """In place of `learning_rate` if training starts from a policy file."""
+    finetune_critic_learning_rate: float | None = None
+    """Step size of the critic throughout if training starts from a policy file; default, the actor's, which is small."""
     finetune_std: float = 0.03
     """In place of `std` if training starts from a policy file."""
     critic_warmup_iterations: int = 40
@@ -253,12 +255,14 @@ class RslPpo:
             with torch.no_grad():  # so that the first policy does next to nothing
                 last_layer(network.mlp).weight.mul_(0.1)
             self._rate, self._std, self._warmup_iterations = config.learning_rate, config.std, 0
+            self._critic_rate: float | None = None
             self._make(network)
 
     def start_from(self, network: PolicyNetwork) -> None:
         """Takes a policy of any shape as the actor; the critic is trained alone at first."""
         self._rate, self._std = self.config.finetune_learning_rate, self.config.finetune_std
         self._warmup_iterations = self.config.critic_warmup_iterations
+        self._critic_rate = self.config.finetune_critic_learning_rate
         mine = self._actor.network.spec
         started = PolicyNetwork(replace(network.spec, task=mine.task, robot=mine.robot))
         started.load_state_dict(network.state_dict())
@@ -285,6 +289,8 @@ class RslPpo:
             max_grad_norm=config.max_grad_norm,
             schedule="fixed",
         )
+        groups = [{"params": list(part.parameters())} for part in (self._actor, self._critic)]
+        self._ppo.optimizer = torch.optim.Adam(groups, self._rate)
 
     @property
     def network(self) -> PolicyNetwork:
@@ -305,8 +311,8 @@ class RslPpo:
         progress = self.iteration / max(1, self.iterations - 1)
         rate = schedules.geometric(self._rate, config.final_learning_rate, progress)
         std = schedules.geometric(self._std, config.final_std, progress)
-        for group in self._ppo.optimizer.param_groups:
-            group["lr"] = rate
+        of_actor, of_critic = self._ppo.optimizer.param_groups
+        of_actor["lr"], of_critic["lr"] = rate, rate if self._critic_rate is None else self._critic_rate
         self._actor.set_std(std)
         self._set_gamma(schedules.discount(config.gamma, config.final_gamma, progress))
         ended = early = paid = 0.0
