@@ -120,7 +120,7 @@ def _contact(
 
 
 def held_contact(
-    params: BallbotParams, x: Vector, u: Vector, hold: float
+    params: BallbotParams, x: Vector, u: Vector, hold: Any
 ) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
     """The floor's force, as `contact`, when force u begins in state x and after it was held for so many seconds.
 
@@ -145,7 +145,7 @@ def held_contact(
     return _contact(params, x, u, acceleration), contact(params, end, u)
 
 
-def limits(params: BallbotParams, x: Vector, u: Vector, backoff: Any = 0.0, hold: float = 0.0) -> tuple[Any, ...]:
+def limits(params: BallbotParams, x: Vector, u: Vector, backoff: Any = 0.0, hold: Any = None) -> tuple[Any, ...]:
     """The robot grips the floor iff every entry is ≥ 0; () where friction is unlimited. See `grip_limits`.
 
     Args:
@@ -153,11 +153,12 @@ def limits(params: BallbotParams, x: Vector, u: Vector, backoff: Any = 0.0, hold
         x: (..., 8) state.
         u: (..., 2) force, N.
         backoff: as of `grip_limits`.
-        hold: s that the force is held: then the robot must grip at the end of this time too, see `held_contact`.
+        hold: s that the force is held: then the robot must grip at the end of this time too, see `held_contact`. Default, at
+            the start alone.
     """
     if not params.grips:
         return ()
-    forces = held_contact(params, x, u, hold) if hold else (contact(params, x, u),)
+    forces = (contact(params, x, u),) if hold is None else held_contact(params, x, u, hold)
     return tuple([limit for force in forces for limit in grip_limits(params, force, backoff)])
 
 

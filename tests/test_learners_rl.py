@@ -203,6 +203,17 @@ def test_rewards_beside_demonstrations_are_shaped_for_ppo_alone(params):
         sac.Sac(task, params, replace(TINY["sac"], **shaped), 0, shown)
 
 
+@pytest.mark.parametrize("plain", [False, True])
+def test_after_cloning_the_critic_of_ppo_may_take_larger_steps_than_its_actor(plain, demos):
+    rates = {"demo_learning_rate": 1e-5, "demo_critic_learning_rate": 1e-3}
+    learner = make("ppo", demos, products=not plain, symmetry="none", **rates)
+    run(learner, TINY["ppo"].clone_iterations + 2)
+    of_actor, of_critic = learner._optimizers[0].param_groups
+    assert of_actor["lr"] <= 1e-5
+    assert of_critic["lr"] == 1e-3
+    assert {id(p) for p in of_actor["params"]} == {id(p) for p in learner._actor.parameters()}
+
+
 def test_the_layers_of_sacs_critics_can_be_normalized():
     learner = make("sac", products=False, layer_norm=True)
     start = [value.clone() for value in learner._model.critic.parameters()]

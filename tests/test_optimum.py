@@ -13,7 +13,15 @@ from ballbot_baselines import compiled
 from ballbot_baselines import optimum as optimum_module
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
-from ballbot_baselines.optimum import FEASIBLE, Backoff, find_optimum, is_feasible, plan_to_track
+from ballbot_baselines.optimum import (
+    FEASIBLE,
+    Backoff,
+    find_optimum,
+    is_feasible,
+    plan_to_track,
+    shooting_ocp,
+    shooting_parameters,
+)
 from ballbot_gym import dynamics, machine_code
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
@@ -418,6 +426,20 @@ def test_problems_with_different_parameters_share_their_compiled_dynamics(monkey
         )
         assert is_feasible(solution)
     assert sum(library.name.startswith("dynamics-") for library in tmp_path.iterdir()) == 1
+
+
+def test_the_dynamics_of_a_task_depend_on_how_long_forces_are_held_and_on_nothing_else_that_is_its_own(task, params):
+    compiled_dynamics = shooting_ocp(task, params).stages.dynamics
+    assert compiled_dynamics.params == 1
+    x, a = task.sample(np.random.default_rng(0), params)[0], np.array([0.3, -0.2])
+    for coarseness in (1, 2):
+        p = shooting_parameters(task, params, np.zeros(len(task.constant_names)), Backoff(), coarseness)
+        held = coarseness * task.control_dt
+        columns = [np.tile(column[:, None], compiled.LANES) for column in (np.append(x, a), np.array(p[:1]))]
+        reached = np.array(compiled_dynamics.value(*columns))[:, 0]
+        np.testing.assert_allclose(
+            reached, dynamics.step(params, x, params.force_limit * a, held), rtol=1e-13, atol=1e-13
+        )
 
 
 @needs_compiler

@@ -91,6 +91,18 @@ def test_from_a_policy_the_critic_is_trained_first_and_the_policy_keeps_its_shap
     assert torch.equal(weights(run(second, 1)), weights(learner))
 
 
+def test_from_a_policy_the_critic_may_take_larger_steps_than_the_actor():
+    learner = make(finetune_learning_rate=1e-5, final_learning_rate=1e-5, finetune_critic_learning_rate=1e-3)
+    assert [group["lr"] for group in run(learner, 1)._ppo.optimizer.param_groups] == [2e-3, 2e-3]  # it starts afresh
+    learner.start_from(learner.network)
+    run(learner, 1)
+    of_actor, of_critic = learner._ppo.optimizer.param_groups
+    assert of_actor["lr"] == pytest.approx(1e-5)
+    assert of_critic["lr"] == 1e-3
+    owned = {id(parameter) for parameter in learner._ppo.critic.parameters()}
+    assert {id(parameter) for parameter in of_critic["params"]} == owned
+
+
 def test_the_mean_action_of_a_squashed_policy_is_squashed():
     torch.manual_seed(5)
     network = PolicyNetwork(spec_for(make_task("turn"), "none", (5,), linear=True))

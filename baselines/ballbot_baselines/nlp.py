@@ -32,8 +32,8 @@ from ballbot_baselines.compiled import LANES, in_lanes
 class Stage:
     """A vector function out(z, p) of one stage, with the nonzeros of its Jacobian and of its Lagrangian's Hessian.
 
-    A function that does not depend on p does not take p. So problems that differ only in their parameters share their
-    compiled dynamics. With `of_stages` the functions are compiled, and compute `LANES` stages at once, a column each.
+    A function takes the parameters up to the last one that it depends on. So problems that differ only in the others share
+    their compiled dynamics. With `of_stages` the functions are compiled, and compute `LANES` stages at once, a column each.
 
     | attribute | meaning |
     |---|---|
@@ -45,7 +45,8 @@ class Stage:
     """
 
     def __init__(self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, of_stages: bool):
-        p = p if casadi.depends_on(out, p) else casadi.SX.sym("p", 0)
+        used = max(np.flatnonzero(casadi.which_depends(out, p, 1)) + 1, default=0)
+        p = p[:used] if used else casadi.SX.sym("p", 0)
         multipliers = casadi.SX.sym("l", out.shape[0])
         jacobian = casadi.jacobian(out, z)
         hessian, gradient = casadi.hessian(casadi.dot(multipliers, out), z)

@@ -234,19 +234,19 @@ def _rank(tried: tuple[int, OcpSolution]) -> tuple[bool, float]:
 
 
 @lru_cache(maxsize=64)
-def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
-    """A task on its env's discretization, or with forces held for several control steps.
+def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
+    """A task on its env's discretization, or with forces held longer than its control steps.
 
-    Inputs are actions, force / limit; p = [c, margin backoff, goal backoff], and the grip backoff where friction is limited.
+    Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, so that
+    problems on fine and coarse grids share all compiled functions, and all tasks of a robot share those of the dynamics.
     """
-    nc = len(task.constant_names)
-    dt, limit = task.control_dt * coarseness, params.force_limit
+    nc, limit = len(task.constant_names), params.force_limit
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(*task.margins(x, p[:nc])) - p[nc]
+        return casadi.vertcat(*task.margins(x, p[1 : 1 + nc])) - p[1 + nc]
 
     def path(x: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[nc + 2], dt))
+        return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[3 + nc], p[0]))
 
     def final(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not task.first_exit:
@@ -257,9 +257,9 @@ def shooting_ocp(task: Task, params: BallbotParams, coarseness: int = 1) -> Ocp:
         name=task.id,
         states=8,
         inputs=2,
-        params=nc + 2 + params.grips,
-        next=lambda x, a, p: dynamics.step(params, x, limit * a, dt, dynamics.substeps_for(task.control_dt)),
-        cost=lambda x, a, p: task.cost(x, limit * a, p[:nc]) * dt,
+        params=nc + 3 + params.grips,
+        next=lambda x, a, p: dynamics.step(params, x, limit * a, p[0], dynamics.substeps_for(task.control_dt)),
+        cost=lambda x, a, p: task.cost(x, limit * a, p[1 : 1 + nc]) * p[0],
         inequalities=path if params.grips else lambda x, a, p: margins(x, p),
         final_inequalities=final,
     )
@@ -274,20 +274,28 @@ def free_time_ocp(task: Task, params: BallbotParams) -> Ocp:
         name=f"{task.id}-free-time",
         states=9,
         next=lambda s, a, p: casadi.vertcat(dynamics.step(params, s[:8], limit * a, s[8], 2), s[8]),
-        cost=lambda s, a, p: task.cost(s[:8], limit * a, p[:nc]) * s[8],
+        cost=lambda s, a, p: task.cost(s[:8], limit * a, p[1 : 1 + nc]) * s[8],
         inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
         final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], p),
     )
 
 
-def shooting_parameters(params: BallbotParams, c: np.ndarray, backoff: Backoff) -> list[float]:
-    """p of `shooting_ocp`."""
-    return [*c, backoff.margin, backoff.goal, *([backoff.grip] if params.grips else [])]
+def shooting_parameters(
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, coarseness: int = 1
+) -> list[float]:
+    """p of `shooting_ocp`: s that forces are held, c, back-offs from margins and goal, and of grip if friction is limited."""
+    return [
+        task.control_dt * coarseness,
+        *c,
+        backoff.margin,
+        backoff.goal,
+        *([backoff.grip] if params.grips else []),
+    ]
 
 
 def _goal_room(task: Task, x: casadi.SX, p: casadi.SX, nc: int) -> casadi.SX:
     # Goal functions are normalized, q/tolerance² − 1: keeping a fraction b of the tolerance asks (1−b)² − 1 − g ≥ 0.
-    return (1 - p[nc + 1]) ** 2 - 1 - casadi.vertcat(*task.goal(x, p[:nc]))
+    return (1 - p[2 + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, p[1 : 1 + nc]))
 
 
 @lru_cache(maxsize=256)
@@ -296,12 +304,11 @@ def _solver(
     params: BallbotParams,
     steps: int,
     solver: str,
-    coarseness: int = 1,
     iterations: int = _MOST_ITERATIONS,
     barrier: float = _BARRIER,
     tolerance: float | None = None,
 ) -> OcpSolver:
-    ocp = shooting_ocp(task, params, coarseness)
+    ocp = shooting_ocp(task, params)
     tolerance = tolerance or _tolerance(params)
     return OcpSolver(ocp, steps, solver, tolerance, max_iterations=iterations, barrier=barrier)
 
@@ -334,17 +341,24 @@ def _solve_from(
     solutions = []
     for name, barrier in (*tries, ("fatrop", _BARRIER), ("ipopt", _BARRIER)):
         solver = _solver(task, params, len(a), name, barrier=barrier)
-        solutions.append(_solve_with(solver, params, x, a, c, backoff))
+        solutions.append(_solve_with(solver, task, params, x, a, c, backoff))
         if is_feasible(solutions[-1]):
             break
     return solutions
 
 
 def _solve_with(
-    solver: OcpSolver, params: BallbotParams, x: np.ndarray, a: np.ndarray, c: np.ndarray, backoff: Backoff
+    solver: OcpSolver,
+    task: Task,
+    params: BallbotParams,
+    x: np.ndarray,
+    a: np.ndarray,
+    c: np.ndarray,
+    backoff: Backoff,
+    coarseness: int = 1,
 ) -> OcpSolution:
     bounds = _bounds(solver.ocp, len(a), x[0], backoff)
-    return solver.solve(x, a, bounds, shooting_parameters(params, c, backoff))
+    return solver.solve(x, a, bounds, shooting_parameters(task, params, c, backoff, coarseness))
 
 
 def _solve_fixed_time(
@@ -379,7 +393,7 @@ def _solve_quickly(
 ) -> list[tuple[int, OcpSolution]]:
     """From every path with fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
     solver = _solver(task, params, task.steps, "fatrop", iterations=_QUICK_ITERATIONS, barrier=barrier)
-    return [(i, _solve_with(solver, params, x, a, c, backoff)) for i, x, a in _starts(task, params, x0, paths)]
+    return [(i, _solve_with(solver, task, params, x, a, c, backoff)) for i, x, a in _starts(task, params, x0, paths)]
 
 
 def _starts(task: Task, params: BallbotParams, x0: np.ndarray, paths: list[np.ndarray]) -> list[_Start]:
@@ -406,7 +420,7 @@ def _solve_from_righting(
                 relaxed = _relax_time(task, params, x, a, c, backoff)
                 solved = _whole_steps(task, params, c, backoff, relaxed) if is_feasible(relaxed) else [relaxed]
             else:
-                solved = [_solve_with(_solver(task, params, len(a), "fatrop"), params, x, a, c, backoff)]
+                solved = [_solve_with(_solver(task, params, len(a), "fatrop"), task, params, x, a, c, backoff)]
             found += [(FROM_RIGHTING, s) for s in solved]
     return found
 
@@ -459,9 +473,11 @@ def _solve_likely_sides(
         coarsest, tolerance = _COARSE, None
 
     def solved_from(path: np.ndarray, c: np.ndarray, barrier: float) -> OcpSolution:
-        solver = _solver(task, params, task.steps // coarsest, "fatrop", coarsest, iterations, barrier, tolerance)
+        solver = _solver(task, params, task.steps // coarsest, "fatrop", iterations, barrier, tolerance)
         x, u = guess.along_path(params, path, task.control_dt, start=x0)
-        return _solve_with(solver, params, x[::coarsest], u[::coarsest] / params.force_limit, c, backoff)
+        return _solve_with(
+            solver, task, params, x[::coarsest], u[::coarsest] / params.force_limit, c, backoff, coarsest
+        )
 
     free = solved_from(_straight(task, params, x0, c), task.without_obstacles(c), _NEAR_BARRIER)
     if not free.success:
@@ -493,8 +509,8 @@ def _on_coarse_grid(
 ) -> list[tuple[int, OcpSolution]]:
     """Solutions with forces held for `_COARSE` control steps, from those on the coarsest grid."""
     n = task.steps // _COARSE
-    solver = _solver(task, params, n, "fatrop", _COARSE, _QUICK_ITERATIONS, _NEAR_BARRIER, _ROUGH)
-    found = [(i, _solve_with(solver, params, *_on_grid(s, n), c, backoff)) for i, s in solved]
+    solver = _solver(task, params, n, "fatrop", _QUICK_ITERATIONS, _NEAR_BARRIER, _ROUGH)
+    found = [(i, _solve_with(solver, task, params, *_on_grid(s, n), c, backoff, _COARSE)) for i, s in solved]
     return [(i, solution) for i, solution in found if solution.success]
 
 
@@ -521,10 +537,10 @@ def _contenders(
 ) -> list[_Start]:
     """Starts at the coarse solutions within `_BASIN_DOUBT` of the best; none, if no coarse solution is feasible."""
     n = task.steps // _COARSE
-    solver = _solver(task, params, n, "fatrop", _COARSE)
+    solver = _solver(task, params, n, "fatrop")
     solved = []
     for index, x, a in starts:
-        solution = _solve_with(solver, params, x[::_COARSE], a[::_COARSE], c, backoff)
+        solution = _solve_with(solver, task, params, x[::_COARSE], a[::_COARSE], c, backoff, _COARSE)
         if is_feasible(solution):
             solved.append((index, solution))
     return _refined(task, solved)
@@ -593,7 +609,7 @@ def _in_free_time(
         bounds = _bounds(solver.ocp, n, x[0], backoff)
         bounds.state_lower[:, 8], bounds.state_upper[:, 8] = task.control_dt / 4, task.duration / n
         states = np.column_stack([x, np.full(n + 1, h)])
-        solution = solver.solve(states, a, bounds, shooting_parameters(params, c, backoff))
+        solution = solver.solve(states, a, bounds, shooting_parameters(task, params, c, backoff))
         if is_feasible(solution):
             break
     return solution

@@ -47,7 +47,7 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
         (n,) rad; NaN where no recoverable lean was found. The search goes outward from the value nearest 0. It starts from
         the neighbouring value's solution and from a recovery to the side, and if both fail from standing.
     """
-    p = shooting_parameters(params, np.zeros(0), Backoff(0.0, 0.0, 0.0, 0.0))
+    p = shooting_parameters(task, params, np.zeros(0), Backoff(0.0, 0.0, 0.0, 0.0))
     solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
     leans = np.full(len(values), np.nan)
     middle = int(np.argmin(np.abs(values)))
