@@ -90,9 +90,10 @@ def test_the_radial_frame_sees_the_same_wherever_on_the_circle_the_robot_is(para
         np.testing.assert_allclose(back_elsewhere(tuple(u)), rotation @ back(tuple(u)), rtol=1e-9, atol=1e-6)
 
 
-def test_the_slalom_frame_sees_a_mirror_image_as_the_same(params, rng):
+@pytest.mark.parametrize("name", ["frame", "fine_frame"])
+def test_the_slalom_frames_see_a_mirror_image_as_the_same(params, rng, name):
     task = TASKS["weave"]()
-    frame, signs = FRAMES[task.frame], np.array(task.observation_signs(task.mirrors[0]))
+    frame, signs = FRAMES[getattr(task, name)], np.array(task.observation_signs(task.mirrors[0]))
     for _ in range(50):
         seen = task.observe(*task.sample(rng, params)) + rng.normal(size=len(signs))
         features, back = frame.features(tuple(seen))
@@ -119,6 +120,32 @@ def test_the_slalom_frame_forgets_obstacles_that_are_passed(params, rng):
         _, y, radius = shown[0]  # the next one, or the last; it is to the left of the goal's line
         nearer_way = np.sign(y) * (y - np.sign(y) * (radius + 0.1) - state[1]) / 5
         np.testing.assert_allclose(features[9], nearer_way if len(ahead) else 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["stabilize", "weave"])
+def test_a_fine_frame_shows_small_errors_of_rest(params, rng, name):
+    task = TASKS[name]()
+    _, c = task.sample(rng, params)
+    rest = np.array([*(c[:2] if len(c) else np.zeros(2)), *np.zeros(6)])
+
+    def fine(x):
+        return np.array(FRAMES[task.fine_frame].features(tuple(task.observe(x, c)))[0][-6:])
+
+    np.testing.assert_allclose(fine(rest), 0.0, atol=1e-12)
+    for i, (state, error) in enumerate([(0, 0.05), (1, 0.05), (4, 0.2), (5, 0.2), (2, 0.05), (3, 0.05)]):
+        off = rest.copy()
+        off[state] += error
+        assert np.flatnonzero(np.abs(fine(off)) > 1e-9).tolist() == [i]
+        assert abs(fine(off)[i]) == pytest.approx(0.5**0.5)
+
+
+def test_a_fine_frame_shows_what_the_task_or_its_frame_shows(params, rng):
+    for task in (TASKS["stabilize"](), TASKS["weave"]()):
+        seen = tuple(task.observe(*task.sample(rng, params)))
+        shown = seen if task.frame is None else FRAMES[task.frame].features(seen)[0]
+        fine = FRAMES[task.fine_frame].features(seen)[0]
+        assert fine[:-6] == tuple(shown)
+        assert len(fine) == FRAMES[task.fine_frame].size
 
 
 def test_the_radial_frame_shows_small_errors_and_none_on_a_steady_orbit(params, rng):

@@ -72,6 +72,8 @@ class Task(ABC):
     """Its mirror images; with no change they form a group."""
     frame: ClassVar[str | None] = None
     """Name in `symmetry.FRAMES` of a frame in which the task looks the same wherever it takes place, or None."""
+    fine_frame: ClassVar[str | None] = None
+    """Name of the same frame with features that tell small errors apart, where `frame` has none; or None."""
     constant_draws: ClassVar[int] = 0
     """Uniform numbers that `draw_constants` takes."""
     state_draws: ClassVar[int] = 0

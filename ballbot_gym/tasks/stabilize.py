@@ -78,6 +78,7 @@ class Stabilize(Task):
 
     state_draws = 8
     id = "BallbotStabilize-v0"
+    fine_frame = "fine_rest"
     mirrors = (MIRROR_X, MIRROR_Y, HALF_TURN)
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0)
     reward_threshold = 771.5

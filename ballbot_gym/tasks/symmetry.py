@@ -142,6 +142,24 @@ def _slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     return tuple(features), back
 
 
+def _fine_slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
+    """As `_slalom`, and then what tells small errors of rest at the goal apart, for learning from scratch."""
+    features, back = _slalom(observation)
+    return (*features, *_fine_rest(features)), back
+
+
+def _rest(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
+    """Stabilize's observation, and then what tells small errors of rest at the goal apart, for learning from scratch."""
+    return (*observation, *_fine_rest(observation)), lambda action: action
+
+
+def _fine_rest(seen: tuple[Any, ...]) -> list[Any]:
+    """Small errors of position, velocity and lean (`_fine`) at a goal where the robot rests."""
+    x, y, gamma, theta, vx, vy, *_ = seen
+    errors = ((x, 0.05 / 5), (y, 0.05 / 5), (vx, 0.2 / 5), (vy, 0.2 / 5), (gamma, 0.05), (theta, 0.05))
+    return [_fine(*error) for error in errors]
+
+
 def _passed(dx: Any, dy: Any, radius: Any) -> Any:
     """Whether the ball is beyond an obstacle, given as observed."""
     return 5.0 * dx < -(radius + _BALL_RADIUS)
@@ -175,6 +193,8 @@ _BALL_RADIUS = 0.1  # m, about
 FRAMES: dict[str, Frame] = {
     "radial": Frame(18, _radial),
     "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom),
+    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom),
+    "fine_rest": Frame(14, _rest),
     "gate": Frame(13 + len(_SWITCHES), _gate),
 }
 """Every frame by the name that tasks and policy files give."""

@@ -84,6 +84,7 @@ class Weave(Task):
 
     id = "BallbotWeave-v0"
     frame = "slalom"
+    fine_frame = "fine_slalom"
     mirrors = (replace(MIRROR_Y, constants=(1, -1) + (1, -1, 1) * MAX_OBSTACLES),)
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0) + (5.0, 5.0, 1.0) * MAX_OBSTACLES
     margin_names = ("tilt", *(f"obstacle {i}" for i in range(MAX_OBSTACLES)))

@@ -109,7 +109,7 @@ class DaggerConfig:
     """Samples per gradient step."""
     symmetry: Symmetry = "none"
     """How the policy respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame."""
+    over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the policy's hidden layers."""
     learning_rate: float = 3e-3

@@ -40,7 +40,7 @@ class PpoConfig(ModelFreeConfig):
     """Weight of the imitation loss, the expert's negative log-likelihood, at the start; falls linearly to 0."""
     symmetry: Symmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame."""
+    over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
     final_gamma: float | None = None
     """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
     averaged_iterations: int = 10

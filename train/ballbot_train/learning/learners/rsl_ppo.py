@@ -71,7 +71,7 @@ class RslPpoConfig:
     """Whether the critic sees the products of all pairs of observed quantities."""
     symmetry: Symmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame."""
+    over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
     learning_rate: float = 2e-3
     """Step size at the start."""
     final_learning_rate: float = 1e-4

@@ -49,9 +49,9 @@ class SacConfig(ModelFreeConfig):
     imitation_weight: float = 300.0
     gradient_steps: int = 4
     """Gradient steps after each control step of all envs."""
-    symmetry: Literal["none", "mirrors", "frame"] = "none"
+    symmetry: Literal["none", "mirrors", "frame", "fine_frame"] = "none"
     """Whether actor and critics learn from the task's mirror images as well, over which the policy is averaged; or see the
-    task's frame, and act in it."""
+    task's frame, or its fine frame, and act in it."""
     layer_norm: bool = False
     """Whether the critics' hidden layers are normalized, as Ball et al. do, unless they see products."""
     num_critics: int = 2

@@ -48,7 +48,7 @@ class ShacConfig:
     """Units of the hidden layers of policy and critic."""
     symmetry: Symmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame."""
+    over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
     learning_rate: float = 3e-3
     """Learning rate of policy and critic at the start."""
     finetune_learning_rate: float = 5e-4
