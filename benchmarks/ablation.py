@@ -1,5 +1,8 @@
 """What makes Stabilize learnable by PPO: `ballbot train rsl_ppo` with all that helps, and without one part after the other.
 
+`--share 0.15` trains only the first seventh of each run, as it is in the whole one: with fewer iterations alone the step size
+and the deviation of the actions fall too early, and no variant learns.
+
 Every variant trains on several seeds, as a queue of one-core runs that goes on where it was stopped. Then the learning curves
 of all variants are drawn: interquartile means over the seeds, against env steps and against minutes.
 """
@@ -13,8 +16,10 @@ import tyro
 from ballbot_train.commands.curves import curves
 from ballbot_train.commands.train import train
 from ballbot_train.console import check_names, console
+from ballbot_train.learning import schedules
 from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.learners.rsl_ppo import RslPpoConfig
 
 FAILURE_PRICE = 300.0  # of a failure, where living does not pay
 
@@ -50,7 +55,7 @@ def main(
     task: str = "stabilize",
     variants: tuple[str, ...] = tuple(VARIANTS),
     seeds: str = "0:5",
-    total_iterations: int | None = None,
+    share: float = 1.0,
     num_envs: int | None = None,
     workers: int = 1,
     out: Path = Path("runs/ablation"),
@@ -61,19 +66,31 @@ def main(
         task: name of a task; the step size and the deviation that stay constant are those of stabilize.
         variants: names of variants.
         seeds: as of `ballbot train --seeds`.
-        total_iterations: of each training; default, as tuned for the task. Schedules end with it.
+        share: in (0, 1]: only so much of the beginning of each run is trained, with the schedules of the whole one.
         num_envs: of each training; default, as tuned.
         workers: runs at once, each on one core.
         out: folder of all runs; the curves are in its folder `curves`.
     """
     check_names("variant", variants, VARIANTS)
-    sizes = {"total_iterations": total_iterations, "num_envs": num_envs}
+    if not 0 < share <= 1:
+        raise SystemExit(f"--share must be above 0 and at most 1, not {share:g}")
     for name in variants:
-        changes = VARIANTS[name] | {size: value for size, value in sizes.items() if value is not None}
+        changes = VARIANTS[name] | ({} if num_envs is None else {"num_envs": num_envs})
         console.print(f"{name}: {changes or 'as tuned'}")
-        settings = replace(LEARNERS["rsl_ppo"].settings(task), **changes)
+        settings = beginning(replace(LEARNERS["rsl_ppo"].settings(task), **changes), share)
         train("rsl_ppo", task=task, settings=settings, seeds=seeds, workers=workers, out=out / task / name)
     curves(tuple(out / task / name for name in variants), out=out / "curves" / task)
+
+
+def beginning(settings: RslPpoConfig, share: float) -> RslPpoConfig:
+    """The settings of a run that is the first share of another one, its schedules included."""
+    return replace(
+        settings,
+        total_iterations=max(1, round(share * settings.total_iterations)),
+        final_learning_rate=schedules.geometric(settings.learning_rate, settings.final_learning_rate, share),
+        final_std=schedules.geometric(settings.std, settings.final_std, share),
+        final_gamma=schedules.discount(settings.gamma, settings.final_gamma, share),
+    )
 
 
 if __name__ == "__main__":
