@@ -21,6 +21,7 @@ from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.learning.learners.rsl_ppo import RslPpoConfig
 
+_TEST_EPISODES = 10  # in PyBullet at the end of a run: the curves are those of the closed form
 FAILURE_PRICE = 300.0  # of a failure, where living does not pay
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -78,7 +79,16 @@ def main(
         changes = VARIANTS[name] | ({} if num_envs is None else {"num_envs": num_envs})
         console.print(f"{name}: {changes or 'as tuned'}")
         settings = beginning(replace(LEARNERS["rsl_ppo"].settings(task), **changes), share)
-        train("rsl_ppo", task=task, settings=settings, seeds=seeds, workers=workers, out=out / task / name)
+        folder = out / task / name
+        train(
+            "rsl_ppo",
+            task=task,
+            settings=settings,
+            seeds=seeds,
+            workers=workers,
+            test_episodes=_TEST_EPISODES,
+            out=folder,
+        )
     curves(tuple(out / task / name for name in variants), out=out / "curves" / task)
 
 

@@ -167,6 +167,7 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed):
         (["shac", "--threads", "0"], 1, "threads must be 1 to 1024, not 0"),
         (["shac", *SETTINGS, "--total-iterations", "-5"], 1, "total_iterations must be 1 to 1000000000, not -5"),
         (["shac", *SETTINGS, "--test-episodes", "201"], 1, "test_episodes must be 1 to 200, not 201"),
+        (["shac", *SETTINGS, "--validation-episodes", "0"], 1, "validation_episodes must be 1 to 100000, not 0"),
         (["shac", *SETTINGS, "--evaluations", "0"], 1, "evaluations must be 1 to 1000000000, not 0"),
     ],
 )
@@ -223,6 +224,18 @@ def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_t
     described = json.loads((tmp_path / "policy.json").read_text())
     assert described["iteration"] == 1
     assert described["chosen_by"]["cost"] == 20.0
+
+
+def test_a_run_may_ask_for_more_validation_episodes_and_says_so(tmp_path, typed):
+    command = ["train", "shac", *SETTINGS, "--total-iterations", "1", "--evaluations", "1", "--test-episodes", "1"]
+    assert typed(*command, "--validation-episodes", "3", "--out", tmp_path / "three")[0] == 0
+    assert typed(*command, "--out", tmp_path / "usual")[0] == 0
+    three, usual = (json.loads((tmp_path / name / "policy.json").read_text()) for name in ("three", "usual"))
+    assert three["chosen_by"]["episodes"] == "3 fresh, for validation"
+    assert usual["chosen_by"]["episodes"] == "200 fresh, for validation"
+    assert three["training"]["validation_episodes"] == 3
+    validated = [[float(row["validation_mean_cost"]) for row in evaluations(tmp_path / n)] for n in ("three", "usual")]
+    assert validated[0] != validated[1]
 
 
 def test_a_policy_of_the_preparation_is_kept_only_until_there_is_a_later_one(short_run, tmp_path, monkeypatch):

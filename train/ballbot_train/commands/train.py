@@ -14,10 +14,12 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
 from ballbot_train.executors import Workers
+from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.learners import LEARNERS, check_settings
 from ballbot_train.policy_files import paths_of
 
 _MOST_THREADS = 1024
+_MOST_VALIDATION_EPISODES = 100_000
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class Run:
     """Folder of the run, or of all runs of --seeds; default runs/train/TASK-LEARNER."""
     test_episodes: int = certified.EPISODES
     """On how many of the certified episodes the policy is measured in the end, from the first."""
+    validation_episodes: int = VALIDATION_EPISODES
+    """On how many fresh episodes the policy is chosen that the run keeps. More show rarer failures, and take longer."""
     resume: bool = False
     """Continue the run in this folder, if there is one."""
 
@@ -60,6 +64,7 @@ def train(
     threads: int | None = None,
     out: Path | None = None,
     test_episodes: int = certified.EPISODES,
+    validation_episodes: int = VALIDATION_EPISODES,
     resume: bool = False,
     command: str | None = None,
     seeds: str | None = None,
@@ -78,6 +83,7 @@ def train(
         threads: threads of torch; default, torch's own choice. Another number changes the last digits.
         out: folder of the run; default runs/train/TASK-LEARNER.
         test_episodes: on how many of the certified episodes the policy is measured in the end, from the first.
+        validation_episodes: on how many fresh episodes the policy is chosen that the run keeps.
         resume: continue the run in this folder, if there is one.
         command: the command that was typed, for the record; default, one with all settings.
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
@@ -93,13 +99,25 @@ def train(
         raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
     if not 1 <= test_episodes <= certified.EPISODES:
         raise ValueError(f"test_episodes must be 1 to {certified.EPISODES}, not {test_episodes}")
+    if not 1 <= validation_episodes <= _MOST_VALIDATION_EPISODES:
+        raise ValueError(f"validation_episodes must be 1 to {_MOST_VALIDATION_EPISODES}, not {validation_episodes}")
     if demos is not None and not algorithm.demonstrations:
         raise ValueError(f"{learner} uses no demonstrations")
     workers = Workers.of(workers)
     if workers.ray is not None and seeds is None:
         raise ValueError("--ray does the runs of --seeds; a single training runs here")
     out = Path("runs") / "train" / f"{file_name(task, robot)}-{learner}" if out is None else out
-    run = Run(task, robot, _text(demos), start, seed, threads=threads, out=out, test_episodes=test_episodes)
+    run = Run(
+        task,
+        robot,
+        _text(demos),
+        start,
+        seed,
+        threads=threads,
+        out=out,
+        test_episodes=test_episodes,
+        validation_episodes=validation_episodes,
+    )
     if seeds is not None:
         _train_seeds(learner, run, out, settings, seeds, workers)
         return
@@ -136,6 +154,7 @@ def train(
         "start": None if start is None else str(start),
         "command": command,
         **robot_setting(robot),
+        **({} if validation_episodes == VALIDATION_EPISODES else {"validation_episodes": validation_episodes}),
     }
     made = algorithm.make(problem, named_robot(robot), settings, seed, demos)
     if start is not None:
@@ -236,7 +255,11 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
 def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
-    defaults = {"robot": PAPER, "test_episodes": certified.EPISODES}  # settings of which older records know nothing
+    defaults = {  # settings of which older records know nothing
+        "robot": PAPER,
+        "test_episodes": certified.EPISODES,
+        "validation_episodes": VALIDATION_EPISODES,
+    }
     for name, value in _shallow(run).items():
         if value is not None and name not in ("resume", "seeds", "workers") and value != defaults.get(name):
             words += [f"--{name.replace('_', '-')}", str(value)]

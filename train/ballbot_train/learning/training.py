@@ -52,13 +52,11 @@ from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate, fresh
+from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
 from ballbot_train.provenance import provenance
 
 _CONFIG = "config.json"
-VALIDATION_EPISODES = 200
-"""Episodes of the validation set, the same in every run; see `evaluation.fresh.draw`."""
-
 _VALIDATION_SEED = 0
 _CHECKPOINT_LIMIT = 2**34  # bytes
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
@@ -182,23 +180,25 @@ _COLUMNS = (
 """Of evaluations.csv."""
 
 
-def validate(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Validation:
+def validate(network: PolicyNetwork, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES) -> Validation:
     """Measures a policy on the validation set, which shares no episode with the certified ones nor with `evaluate_fresh`."""
-    (run,) = _runs(network, task, robot, _validation_set(task, robot))
+    (run,) = _runs(network, task, robot, _validation_set(task, robot, episodes))
     return _validation(run, task)
 
 
-def score_and_validate(network: PolicyNetwork, task: Task, robot: str = PAPER) -> tuple[Score, Validation]:
+def score_and_validate(
+    network: PolicyNetwork, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES
+) -> tuple[Score, Validation]:
     """`score` and `validate` in one batch, in half the time."""
-    episodes = certified.load(task, robot=robot)
-    sets = (episodes.states, episodes.constants), _validation_set(task, robot)
+    known = certified.load(task, robot=robot)
+    sets = (known.states, known.constants), _validation_set(task, robot, episodes)
     scored, validated = _runs(network, task, robot, *sets)
-    return _score(scored, task, episodes.costs), _validation(validated, task)
+    return _score(scored, task, known.costs), _validation(validated, task)
 
 
-def _validation_set(task: Task, robot: str) -> tuple[np.ndarray, np.ndarray]:
+def _validation_set(task: Task, robot: str, episodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Initial states (B, 8) and constants (B, nc) of the validation set."""
-    return fresh.draw(task, range(VALIDATION_EPISODES), _VALIDATION_SEED, "validation", robot)
+    return fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot)
 
 
 def _runs(
@@ -298,6 +298,7 @@ class _Run:
         self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
         self.best, self.rows = math.inf, []
         self.robot = self.config.get("robot", PAPER)
+        self.validation_episodes = self.config.get("validation_episodes", VALIDATION_EPISODES)
         if (out / _CONFIG).exists() and not resume:
             raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
         jobs.claim(out, self.config, _CONFIG, {"about": provenance()})
@@ -323,7 +324,7 @@ class _Run:
             if "best_validation" in state:
                 self.best = float(state["best_validation"])
             else:  # of an earlier version, which chose the best policy on the certified episodes
-                self.best = validate(best, self.task, self.robot).cost
+                self.best = validate(best, self.task, self.robot, self.validation_episodes).cost
         except MemoryError:
             raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
@@ -338,7 +339,7 @@ class _Run:
             The figures by their name in TensorBoard.
         """
         network = self.learner.network
-        scored, validation = score_and_validate(network, self.task, self.robot)
+        scored, validation = score_and_validate(network, self.task, self.robot, self.validation_episodes)
         certified_score = asdict(scored)
         named = {f"validation_{name}": value for name, value in asdict(validation).items()}
         self.rows.append(
@@ -425,7 +426,7 @@ class _Run:
         reached = self.learner.difficulty if isinstance(self.learner, Staged) else {}
         return {
             "training": self.config,
-            "chosen_by": {"episodes": f"{VALIDATION_EPISODES} fresh, for validation", "cost": self.best},
+            "chosen_by": {"episodes": f"{self.validation_episodes} fresh, for validation", "cost": self.best},
             "iteration": self._chosen["iteration"],
             "training_seconds": round(self.seconds, 1),
             **({"curriculum_reached": reached} if reached else {}),
