@@ -115,12 +115,14 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
     np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
 
 
-def test_the_policy_of_ppo_is_a_running_average_of_its_actor():
-    learner = make("ppo", averaged_iterations=2)
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_the_policy_is_a_running_average_of_the_actor(name):
+    learner = make(name, averaged_iterations=2)
     seen, last = [], parameters(learner)
     for _ in range(3):
         learner.iterate()
-        actor = torch.cat([value.flatten() for value in learner._actor.network.state_dict().values()])
+        network = learner._actor.network if name == "ppo" else learner._actor
+        actor = torch.cat([value.flatten() for value in network.state_dict().values()])
         seen.append(actor)
         share = max(1 / 2, 1 / len(seen))
         last = last + share * (actor - last)

@@ -19,6 +19,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
+from ballbot_train.learning.actors import average_of
 from ballbot_train.learning.critics import value_of_living
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
 from ballbot_train.learning.demonstrations import Demos
@@ -65,6 +66,8 @@ class ModelFreeConfig:
     """Learning rate of behaviour cloning at the start; falls linearly to 0."""
     critic_warmup_iterations: int = 10
     """Iterations of reinforcement learning that train the critic alone, if there are demonstrations."""
+    averaged_iterations: int = 1
+    """Iterations over which the policy is a running average of the actor; 1: it is the actor."""
     imitation_weight: float = 0.0
     """Weight of the imitation loss at the start of reinforcement learning; falls linearly to 0."""
 
@@ -109,6 +112,7 @@ class ModelFree(ABC):
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
         self._model, self._actor, self._optimizers = model, actor, optimizers
+        self._average = average_of(actor, self._settings.averaged_iterations)
         model.set_logger(Logger(folder=None, output_formats=[]))
         model._last_obs = self._env.reset()
         model._last_episode_starts = np.ones(self._settings.num_envs, bool)
@@ -121,6 +125,11 @@ class ModelFree(ABC):
     def _value_of_living(self, gamma: float) -> float:
         """Value of living for ever without cost."""
         return value_of_living(self._task, self._settings.reward_scale, gamma) if self._settings.pay else 0.0
+
+    @property
+    def _kept(self) -> nn.Module:
+        """The running average of the actor; while it is cloned, the actor."""
+        return self._actor if self.iteration <= self._clone_iterations else self._average.module
 
     @property
     @abstractmethod
@@ -152,6 +161,7 @@ class ModelFree(ABC):
         return {
             "iteration": self.iteration,
             "policy": model.policy.state_dict(),
+            "average": self._average.state_dict(),
             "optimizers": [optimizer.state_dict() for optimizer in self._optimizers],
             "imitation": self._imitation and self._imitation.state_dict(),
             "env_steps": model.num_timesteps,
@@ -165,6 +175,7 @@ class ModelFree(ABC):
         model = self._model
         self.iteration = state["iteration"]
         model.policy.load_state_dict(state["policy"])
+        self._average.load_state_dict(state["average"])
         for optimizer, old in zip(self._optimizers, state["optimizers"], strict=True):
             optimizer.load_state_dict(old)
         if self._imitation is not None:
@@ -197,6 +208,7 @@ class ModelFree(ABC):
         # SB3 takes None as "never" for its own printing
         model.learn(settings.num_envs * settings.num_steps, log_interval=cast(int, None), reset_num_timesteps=False)
         self._actor.requires_grad_(True)
+        self._average.update_parameters(self._actor)
         reached = {f"curriculum/{name}": value for name, value in self.difficulty.items()}
         return {**model.logger.name_to_value, "train/env_steps": model.num_timesteps, **reached}
 

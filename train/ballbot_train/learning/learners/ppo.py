@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import Symmetry, average_of, spec_for
+from ballbot_train.learning.actors import Symmetry, spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
 from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
@@ -44,7 +44,6 @@ class PpoConfig(ModelFreeConfig):
     final_gamma: float | None = None
     """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
     averaged_iterations: int = 10
-    """Iterations over which the policy is a running average of the actor."""
     gae_lambda: float = 0.95
     """λ of generalized advantage estimation."""
     relative_advantages: float = 0.0
@@ -236,22 +235,19 @@ class Ppo(ModelFree):
             _set_critic_rate(policy, actor, config.demo_critic_learning_rate)
         self._model: PPO
         self._set_model(model, actor, (policy.optimizer,))
-        self._average = average_of(actor, config.averaged_iterations)
 
     @property
     def network(self) -> PolicyNetwork:
-        """A running average of the actor over its last iterations; while it is cloned, the actor."""
-        actor = self._actor if self.iteration <= self._clone_iterations else self._average.module
+        actor = self._kept
         if isinstance(actor, MeanAction):
             return actor.network
         return as_policy(actor.children(), self._task, activation="tanh", squash="clip")
 
     def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"average": self._average.state_dict(), "gamma": self._model.gamma}
+        return super().state_dict() | {"gamma": self._model.gamma}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
-        self._average.load_state_dict(state["average"])
         self._take_gamma(state["gamma"])
 
     def _improve(self) -> dict[str, float]:
@@ -261,7 +257,6 @@ class Ppo(ModelFree):
         if config.final_gamma is not None:
             self._raise_gamma(schedules.discount(config.gamma, config.final_gamma, progress))
         figures = super()._improve()
-        self._average.update_parameters(self._actor)
         return {**figures, "train/gamma": self._model.gamma}
 
     def _raise_gamma(self, gamma: float) -> None:

@@ -282,7 +282,7 @@ class Sac(ModelFree):
     def network(self) -> PolicyNetwork:
         squash = "tanh" if self._spec.frame is None else "tanh_in_frame"
         symmetry = {"frame": self._spec.frame, "mirrors": self._spec.mirrors}
-        return as_policy(self._actor.children(), self._task, activation="silu", squash=squash, **symmetry)
+        return as_policy(self._kept.children(), self._task, activation="silu", squash=squash, **symmetry)
 
     def state_dict(self) -> dict[str, Any]:
         own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}
