@@ -417,6 +417,7 @@ POLICIES = [
     (policy(linear="false"), "linear must be true or false, not 'false'"),
     (policy(odd=1), "odd must be true or false, not 1"),
     (policy(odd=True, activation="relu"), "odd needs the activation tanh"),
+    (policy(centred=True), "centred needs a frame in which rest at the goal looks the same always, not None"),
     (policy(hidden="128"), "hidden must be a list of whole numbers, not '128'"),
     (policy(hidden=[1.5]), "hidden must be whole numbers"),
     (policy(hidden=[-1]), "hidden must be whole numbers"),

@@ -218,3 +218,13 @@ def test_a_policy_file_keeps_frame_and_mirror_images(fields, tmp_path, rng):
     observation = torch.as_tensor(rng.normal(size=(50, 13)), dtype=torch.float32)
     assert again.spec == network.spec
     assert torch.equal(again(observation), network(observation))
+
+
+@pytest.mark.parametrize("name", ["stabilize", "weave"])
+def test_what_a_fine_frame_shows_at_rest_at_the_goal_is_the_same_in_every_episode(params, rng, name):
+    task = TASKS[name]()
+    frame = FRAMES[task.fine_frame]
+    for _ in range(50):
+        _, c = task.sample(rng, params)
+        rest = np.array([*(c[:2] if len(c) else np.zeros(2)), *np.zeros(6)])
+        np.testing.assert_allclose(frame.features(tuple(task.observe(rest, c)))[0], frame.at_rest, atol=1e-12)

@@ -47,6 +47,8 @@ class Frame:
     """Number of features."""
     features: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], Back]]
     """Observation, as a tuple of its entries -> features (size), and the way back for actions."""
+    at_rest: tuple[float, ...] | None = None
+    """Features (size) at rest at the goal, where no force is needed, if they are the same in every episode."""
 
 
 def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
@@ -193,8 +195,10 @@ _BALL_RADIUS = 0.1  # m, about
 FRAMES: dict[str, Frame] = {
     "radial": Frame(18, _radial),
     "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom),
-    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom),
-    "fine_rest": Frame(14, _rest),
+    "fine_slalom": Frame(
+        14 + 3 * _OBSTACLES_SEEN, _fine_slalom, (0.0,) * 8 + (-0.2, 0.0, 0.0) * _OBSTACLES_SEEN + (0.0,) * 6
+    ),
+    "fine_rest": Frame(14, _rest, (0.0,) * 14),
     "gate": Frame(13 + len(_SWITCHES), _gate),
 }
 """Every frame by the name that tasks and policy files give."""

@@ -60,6 +60,7 @@ class PolicyNetwork(torch.nn.Module):
 
     Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit. With a frame, o and the
     action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so it mirrors exactly.
+    A centred policy takes from the sum what it is at rest at the goal, and so it rests there exactly.
     """
 
     def __init__(self, spec: PolicySpec):
@@ -68,6 +69,8 @@ class PolicyNetwork(torch.nn.Module):
         self._frame = None if spec.frame is None else FRAMES[spec.frame]
         self._mirrors = [tuple(torch.tensor(signs, dtype=torch.float32) for signs in mirror) for mirror in spec.mirrors]
         inputs = spec.observations if self._frame is None else self._frame.size
+        at_rest = self._frame.at_rest if self._frame is not None and spec.centred else None
+        self._at_rest = None if at_rest is None else torch.nn.Buffer(torch.tensor(at_rest), persistent=False)
         self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd) if spec.linear else None
         widths = (inputs, *spec.hidden)
         layers: list[torch.nn.Module] = []
@@ -100,10 +103,14 @@ class PolicyNetwork(torch.nn.Module):
         return total / (1 + len(self._mirrors)) if self._mirrors else total
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
-        output = self.mlp(inputs)
-        if self.linear is not None:
-            output = output + self.linear(inputs)
+        output = self._output(inputs)
+        if self._at_rest is not None:
+            output = output - self._output(self._at_rest)
         return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
+
+    def _output(self, inputs: torch.Tensor) -> torch.Tensor:
+        output = self.mlp(inputs)
+        return output if self.linear is None else output + self.linear(inputs)
 
 
 class PolicyController(ActionController):

@@ -58,6 +58,8 @@ class PolicySpec:
     """Whether opposite observations get opposite actions, exactly: no biases. Needs an odd activation."""
     frame: str | None = None
     """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
+    centred: bool = False
+    """Whether no force is exerted where the robot rests at its goal, exactly. Needs a frame that tells how it rests."""
     mirrors: Mirrors = ()
     """Mirror images over which the network's output is averaged."""
     squash: Literal["tanh", "clip", "tanh_in_frame"] = "tanh"
@@ -81,7 +83,7 @@ class PolicySpec:
             known = get_args(get_type_hints(PolicySpec)[name])
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
-        for name in ("linear", "odd"):
+        for name in ("linear", "odd", "centred"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be true or false, not {getattr(self, name)!r}")
         if len(self.mirrors) > _MOST_MIRRORS:
@@ -91,6 +93,10 @@ class PolicySpec:
                 raise ValueError(f"mirrors must hold signs of {self.observations} observations and 2 actions")
         if self.odd and self.activation != "tanh":
             raise ValueError(f"odd needs the activation tanh, not {self.activation}")
+        if self.centred and (self.frame is None or FRAMES[self.frame].at_rest is None):
+            raise ValueError(
+                f"centred needs a frame in which rest at the goal looks the same always, not {self.frame!r}"
+            )
 
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":

@@ -8,9 +8,10 @@ from torch.optim.swa_utils import AveragedModel
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicySpec
 
-Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame"]
+Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
-the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart."""
+the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart. A
+centred actor does so too, and exerts no force where the robot rests at its goal."""
 
 
 def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
@@ -32,10 +33,11 @@ def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bo
         if task.frame is None:
             raise ValueError(f'{task.id} has no frame; give "none" or "mirrors" as its symmetry')
         fields["frame"] = task.frame
-    elif symmetry == "fine_frame":
+    elif symmetry in ("fine_frame", "centred"):
         if task.fine_frame is None:
             raise ValueError(f'{task.id} has no fine frame; give "frame", "mirrors" or "none" as its symmetry')
         fields["frame"] = task.fine_frame
+        fields["centred"] = symmetry == "centred"
     return PolicySpec.of(task, **fields)
 
 
