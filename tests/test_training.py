@@ -243,6 +243,16 @@ def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_t
     assert described["chosen_by"]["cost"] == 20.0
 
 
+def test_of_policies_that_never_succeed_the_one_with_the_least_mean_cost_is_kept(short_run, tmp_path, monkeypatch):
+    figures = iter(
+        (training.Score(10.0, 0.1, 0.1, 0.0, 0), training.Validation(800.0, 0.0, 0, mean))
+        for mean in (700.0, 80.0, 90.0)
+    )
+    monkeypatch.setattr(training, "score_and_validate", lambda *policy: next(figures))
+    short_run()
+    assert json.loads((tmp_path / "policy.json").read_text())["iteration"] == 1
+
+
 def test_a_run_may_ask_for_more_validation_episodes_and_says_so(tmp_path, typed):
     command = ["train", "shac", *SETTINGS, "--total-iterations", "1", "--evaluations", "1", "--test-episodes", "1"]
     assert typed(*command, "--validation-episodes", "3", "--out", tmp_path / "three")[0] == 0
@@ -279,6 +289,9 @@ def test_a_checkpoint_of_an_earlier_version_goes_on(short_run, tmp_path):
     torch.save(state | {"best": 1.3}, path)  # of the certified episodes, as it used to be
     short_run(resume=True)
     assert torch.load(path, weights_only=True)["best_validation"] == validated
+    torch.save(state | {"best_validation": validated[0]}, path)  # the cost alone, as it was next
+    short_run(resume=True)
+    assert torch.load(path, weights_only=True)["best_validation"][0] == validated[0]
     assert {row["validation_cost"] for row in evaluations(tmp_path)} == {"nan"}
 
 

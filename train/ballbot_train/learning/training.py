@@ -26,7 +26,7 @@ A run is a folder:
 | cost_ratio, regret_mean, regret_median, success, failures | on the certified episodes, the test set; see `Score` |
 | validation_cost, validation_success, validation_failures, validation_mean_cost | on the validation set; see `Validation` |
 
-The best policy is that of the least validation_cost.
+The best policy is that of the least validation_cost, and of the least validation_mean_cost among equals.
 """
 
 import io
@@ -169,7 +169,8 @@ class Validation:
     failures: int
     """Number of episodes that failed."""
     mean_cost: float
-    """Mean cost as it is, a failure's price included."""
+    """Mean cost as it is, a failure's price included. Of two policies of the same cost, of which none ever succeeds for
+    example, the better one has less of it."""
 
 
 _COLUMNS = (
@@ -290,13 +291,17 @@ def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any], test_episod
     return run.measure(test_episodes)
 
 
+_WORST = math.inf, math.inf
+"""Cost and mean cost that every policy goes below."""
+
+
 class _Run:
     """The folder of a run."""
 
     def __init__(self, learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool):
         self.learner, self.task, self.config, self.out = learner, task, dict(config), out
         self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
-        self.best, self.rows = math.inf, []
+        self.best, self.rows = _WORST, []
         self.robot = self.config.get("robot", PAPER)
         self.validation_episodes = self.config.get("validation_episodes", VALIDATION_EPISODES)
         if (out / _CONFIG).exists() and not resume:
@@ -322,9 +327,11 @@ class _Run:
             self.rows = [{name: row.get(name, math.nan) for name in _COLUMNS} for row in state["rows"]]
             self.cpu_seconds = float(state.get("cpu_seconds", math.nan))
             if "best_validation" in state:
-                self.best = float(state["best_validation"])
+                known = state["best_validation"]  # a number in earlier versions
+                self.best = (known, math.inf) if isinstance(known, float) else (float(known[0]), float(known[1]))
             else:  # of an earlier version, which chose the best policy on the certified episodes
-                self.best = validate(best, self.task, self.robot, self.validation_episodes).cost
+                validation = validate(best, self.task, self.robot, self.validation_episodes)
+                self.best = validation.cost, validation.mean_cost
         except MemoryError:
             raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
@@ -355,9 +362,9 @@ class _Run:
         self._write_rows()
         before = [row["iteration"] for row in self.rows[:-1]]
         if self._preparation and max(before, default=0) <= self._preparation < self.learner.iteration:
-            self.best = math.inf
-        if validation.cost < self.best:
-            self.best = validation.cost
+            self.best = _WORST
+        if (validation.cost, validation.mean_cost) < self.best:
+            self.best = validation.cost, validation.mean_cost
             self._save_policy(network)
         certified_figures = {f"certified/{name}": value for name, value in certified_score.items()}
         return certified_figures | {f"validation/{name}": value for name, value in asdict(validation).items()}
@@ -371,7 +378,7 @@ class _Run:
         """The evaluation whose policy is kept."""
         known = [row for row in self.rows if not math.isnan(row["validation_cost"])] or self.rows
         later = [row for row in known if row["iteration"] > self._preparation] if self._preparation else known
-        return min(later or known, key=lambda row: row["validation_cost"])
+        return min(later or known, key=lambda row: (row["validation_cost"], row["validation_mean_cost"]))
 
     @property
     def best_text(self) -> str:
@@ -426,7 +433,7 @@ class _Run:
         reached = self.learner.difficulty if isinstance(self.learner, Staged) else {}
         return {
             "training": self.config,
-            "chosen_by": {"episodes": f"{self.validation_episodes} fresh, for validation", "cost": self.best},
+            "chosen_by": {"episodes": f"{self.validation_episodes} fresh, for validation", "cost": self.best[0]},
             "iteration": self._chosen["iteration"],
             "training_seconds": round(self.seconds, 1),
             **({"curriculum_reached": reached} if reached else {}),
