@@ -186,7 +186,15 @@ def test_a_discount_that_is_no_discount_is_refused(setting):
 
 @pytest.mark.parametrize(
     ("name", "symmetry"),
-    [("turn", "mirrors"), ("turn", "odd"), ("weave", "odd"), ("stabilize", "frame"), ("orbit", "fine_frame")],
+    [
+        ("turn", "mirrors"),
+        ("turn", "odd"),
+        ("weave", "odd"),
+        ("stabilize", "frame"),
+        ("orbit", "fine_frame"),
+        ("turn", "centred"),
+        ("stabilize", "centred"),
+    ],
 )
 def test_a_symmetry_that_the_task_has_not_is_refused(name, symmetry):
     with pytest.raises(ValueError, match=r"Ballbot\w+-v0 (is not|has no)"):

@@ -220,11 +220,39 @@ def test_a_policy_file_keeps_frame_and_mirror_images(fields, tmp_path, rng):
     assert torch.equal(again(observation), network(observation))
 
 
-@pytest.mark.parametrize("name", ["stabilize", "weave"])
-def test_what_a_fine_frame_shows_at_rest_at_the_goal_is_the_same_in_every_episode(params, rng, name):
+def steady_motion(task, c, params, rng):
+    """A state and the force of the motion in which an episode shall end."""
+    if task.id == "BallbotOrbit-v0":
+        states, forces = steady_orbit(params, *c, rng.uniform(0, 6, 1))
+        return states[0], forces[0]
+    return np.array([*c[:2], *np.zeros(6)]), np.zeros(2)
+
+
+@pytest.mark.parametrize("name", ["orbit", "weave"])
+def test_a_frame_knows_the_steady_motion_of_the_episode(params, rng, name):
     task = TASKS[name]()
-    frame = FRAMES[task.fine_frame]
+    frame = FRAMES[task.frame]
     for _ in range(50):
-        _, c = task.sample(rng, params)
-        rest = np.array([*(c[:2] if len(c) else np.zeros(2)), *np.zeros(6)])
-        np.testing.assert_allclose(frame.features(tuple(task.observe(rest, c)))[0], frame.at_rest, atol=1e-12)
+        x, c = task.sample(rng, params)
+        ending, force = steady_motion(task, c, params, rng)
+        seen, back = frame.features(tuple(task.observe(ending, c)))
+        for features in (seen, frame.features(tuple(task.observe(x, c)))[0]):
+            steady, action = frame.steady(features)
+            np.testing.assert_allclose(steady, seen, atol=1e-3)
+            np.testing.assert_allclose(back(action), force / params.force_limit, atol=1e-3)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("name", ["orbit", "weave"])
+def test_centred_policies_keep_the_steady_motion_whatever_they_learnt(params, rng, name, linear):
+    task = TASKS[name]()
+    network = PolicyNetwork(spec_for(task, "centred", (8,), linear))
+    torch.nn.init.normal_(network.mlp[-1].weight)
+    _, c = task.sample(rng, params)
+    x, force = steady_motion(task, c, params, rng)
+    observations = torch.tensor(np.stack([task.observe(each, c) for each in (x, 1.1 * x + 0.1)]), dtype=torch.float32)
+    with torch.inference_mode():
+        kept, away = network(observations)
+        np.testing.assert_allclose(network(observations[0]), kept, atol=1e-5)
+    np.testing.assert_allclose(kept, force / params.force_limit, atol=5e-3)
+    assert (away - kept).abs().max() > 0.01

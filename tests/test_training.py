@@ -29,7 +29,6 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.train import Run, command_with, parse
 from ballbot_train.learning import training
-from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.demonstrations import DemoConfig
 from ballbot_train.learning.learners import LEARNERS, shac
 from ballbot_train.policy import SHIPPED, PolicyNetwork, PolicySpec
@@ -130,22 +129,6 @@ def test_odd_policies_are_odd():
     network = PolicyNetwork(PolicySpec.of(task, hidden=(8,), odd=True))
     observation = torch.randn(5, 8)
     assert torch.equal(network(-observation), -network(observation))
-
-
-@pytest.mark.parametrize("name", ["stabilize", "weave"])
-def test_centred_policies_exert_no_force_at_rest_at_the_goal(params, rng, name):
-    task = TASKS[name]()
-    network = PolicyNetwork(spec_for(task, "centred", (8,), linear=True))
-    torch.nn.init.normal_(network.mlp[-1].weight)
-    _, c = task.sample(rng, params)
-    rest = np.array([*(c[:2] if len(c) else np.zeros(2)), *np.zeros(6)])
-    away = rest + 0.1
-    with torch.inference_mode():
-        at_rest, pushed = network(
-            torch.tensor(np.stack([task.observe(x, c) for x in (rest, away)]), dtype=torch.float32)
-        )
-    np.testing.assert_allclose(at_rest, 0.0, atol=1e-6)
-    assert pushed.abs().max() > 1e-3
 
 
 def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed):

@@ -47,8 +47,8 @@ class Frame:
     """Number of features."""
     features: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], Back]]
     """Observation, as a tuple of its entries -> features (size), and the way back for actions."""
-    at_rest: tuple[float, ...] | None = None
-    """Features (size) at rest at the goal, where no force is needed, if they are the same in every episode."""
+    steady: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, Any]]] | None = None
+    """Features -> features (size), and action in the frame, of the steady motion in which the episode shall end."""
 
 
 def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
@@ -101,13 +101,29 @@ def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     return features, back
 
 
-def _steady_lean(pull: Any, radius: Any) -> Any:
-    """Sine of the lean on a circle of this radius, m, to 0.003, where the ball is pulled inwards by `pull` times 10 m/s².
+def _steady_orbit(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+    """`_radial`'s features on the steady orbit of the paper's robot, and the force inwards that keeps it there.
 
-    See `orbit.orbit_speed`, whose equation three substitutions solve, with J/h of the paper's robot.
+    See `orbit.steady_orbit`; to 0.001.
+    """
+    radius, speed, pull = features[10:13]
+    none = 0.0 * radius
+    meters = 3.0 * radius
+    lean = _steady_lean(pull, meters, substitutions=12)
+    turning = -lean * (5.0 * speed / meters) / 5.0  # of the body's axis, as observed divided by 5 rad/s
+    force = 10.0 * pull * (_BALL_MASS + _BODY_MASS * (1.0 - _COM_HEIGHT * lean / meters))
+    seen = (radius, -lean, none, none, speed, none, turning, none, none, none, radius, speed, pull)
+    fine = (none, none, none, _fine(_steady_lean(pull, meters) - lean, 0.05), none)
+    return (*seen, *fine), (-force / _FORCE_LIMIT, none)
+
+
+def _steady_lean(pull: Any, radius: Any, substitutions: int = 3) -> Any:
+    """Sine of the lean on a circle of this radius, m, where the ball is pulled inwards by `pull` times 10 m/s².
+
+    See `orbit.orbit_speed`, whose equation substitutions solve, three of them to 0.003, with J/h of the paper's robot.
     """
     slope = pull
-    for _ in range(3):
+    for _ in range(substitutions):
         slope = pull / (_GRAVITY + _INERTIA_BY_MOMENT * pull / radius / ops.sqrt(1.0 + slope * slope))
     return slope / ops.sqrt(1.0 + slope * slope)
 
@@ -142,6 +158,12 @@ def _slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
         return action[0], side * action[1]
 
     return tuple(features), back
+
+
+def _rest_behind_obstacles(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+    """`_slalom`'s features at rest at the goal, all obstacles passed. No force is needed there."""
+    none = 0.0 * features[0]
+    return (*[none] * 8, *[none - 0.2, none, none] * _OBSTACLES_SEEN), (none, none)
 
 
 def _fine_slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
@@ -186,6 +208,7 @@ def _fine(error: Any, tolerance: float) -> Any:
     return error / ops.sqrt(error * error + tolerance * tolerance)
 
 
+_BALL_MASS, _BODY_MASS, _COM_HEIGHT, _FORCE_LIMIT = 0.5, 15.0, 0.6, 350.0  # kg, kg, m, N, of the paper's robot
 _GRAVITY = 0.981  # 10 m/s²
 _INERTIA_BY_MOMENT = 0.743  # m
 _SWITCHES = tuple(3.4 + 0.1 * i for i in range(13))  # m/s
@@ -193,12 +216,10 @@ _OBSTACLES_SEEN = 4
 _BALL_RADIUS = 0.1  # m, about
 
 FRAMES: dict[str, Frame] = {
-    "radial": Frame(18, _radial),
-    "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom),
-    "fine_slalom": Frame(
-        14 + 3 * _OBSTACLES_SEEN, _fine_slalom, (0.0,) * 8 + (-0.2, 0.0, 0.0) * _OBSTACLES_SEEN + (0.0,) * 6
-    ),
-    "fine_rest": Frame(14, _rest, (0.0,) * 14),
+    "radial": Frame(18, _radial, _steady_orbit),
+    "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, _rest_behind_obstacles),
+    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom),
+    "fine_rest": Frame(14, _rest),
     "gate": Frame(13 + len(_SWITCHES), _gate),
 }
 """Every frame by the name that tasks and policy files give."""

@@ -6,7 +6,7 @@ This module imports torch; `policy_files` reads descriptions without it.
 
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,8 @@ class PolicyNetwork(torch.nn.Module):
 
     Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit. With a frame, o and the
     action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so it mirrors exactly.
-    A centred policy takes from the sum what it is at rest at the goal, and so it rests there exactly.
+    A centred policy takes from the sum what it is in the steady motion in which the episode shall end, and adds the action
+    that keeps it: so it rests at its goal, or orbits on the circle, and not beside it.
     """
 
     def __init__(self, spec: PolicySpec):
@@ -69,8 +70,7 @@ class PolicyNetwork(torch.nn.Module):
         self._frame = None if spec.frame is None else FRAMES[spec.frame]
         self._mirrors = [tuple(torch.tensor(signs, dtype=torch.float32) for signs in mirror) for mirror in spec.mirrors]
         inputs = spec.observations if self._frame is None else self._frame.size
-        at_rest = self._frame.at_rest if self._frame is not None and spec.centred else None
-        self._at_rest = None if at_rest is None else torch.nn.Buffer(torch.tensor(at_rest), persistent=False)
+        self._steady = self._frame.steady if self._frame is not None and spec.centred else None
         self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd) if spec.linear else None
         widths = (inputs, *spec.hidden)
         layers: list[torch.nn.Module] = []
@@ -91,24 +91,32 @@ class PolicyNetwork(torch.nn.Module):
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             features, back = self._frame.features(tuple(observation.tolist()))
-            forwards, sideways = self._sum(torch.tensor(features, dtype=observation.dtype)).tolist()
+            output = self._in_frame(features, lambda values: torch.tensor(values, dtype=observation.dtype))
+            forwards, sideways = output.tolist()
             return torch.tensor(back((forwards, sideways)), dtype=observation.dtype)
         if self._frame is not None:
             features, back = self._frame.features(observation.unbind(-1))
-            action = self._sum(torch.stack(features, -1))
+            action = self._in_frame(features, lambda values: torch.stack(values, -1))
             return torch.stack(back((action[..., 0], action[..., 1])), -1)
         total = self._sum(observation)
         for signs, action_signs in self._mirrors:
             total = total + action_signs * self._sum(signs * observation)
         return total / (1 + len(self._mirrors)) if self._mirrors else total
 
-    def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
-        output = self._output(inputs)
-        if self._at_rest is not None:
-            output = output - self._output(self._at_rest)
+    def _in_frame(self, features: tuple[Any, ...], stack: Callable[[Any], torch.Tensor]) -> torch.Tensor:
+        """Action in the frame (..., 2) before it is squashed; stack: makes tensors (..., n) of n values."""
+        output = self._sum(stack(features))
+        if self._steady is not None:
+            steady, action = self._steady(features)
+            needed = stack(action)
+            output = (
+                output
+                - self._sum(stack(steady))
+                + (needed.clamp(-0.999, 0.999).atanh() if self.spec.squash == "tanh" else needed)
+            )
         return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
 
-    def _output(self, inputs: torch.Tensor) -> torch.Tensor:
+    def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
         return output if self.linear is None else output + self.linear(inputs)
 

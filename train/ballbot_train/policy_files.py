@@ -59,7 +59,7 @@ class PolicySpec:
     frame: str | None = None
     """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
     centred: bool = False
-    """Whether no force is exerted where the robot rests at its goal, exactly. Needs a frame that tells how it rests."""
+    """Whether the action in the frame's steady motion is exactly the one that keeps it."""
     mirrors: Mirrors = ()
     """Mirror images over which the network's output is averaged."""
     squash: Literal["tanh", "clip", "tanh_in_frame"] = "tanh"
@@ -93,10 +93,10 @@ class PolicySpec:
                 raise ValueError(f"mirrors must hold signs of {self.observations} observations and 2 actions")
         if self.odd and self.activation != "tanh":
             raise ValueError(f"odd needs the activation tanh, not {self.activation}")
-        if self.centred and (self.frame is None or FRAMES[self.frame].at_rest is None):
-            raise ValueError(
-                f"centred needs a frame in which rest at the goal looks the same always, not {self.frame!r}"
-            )
+        if self.centred and (self.frame not in FRAMES or FRAMES[self.frame].steady is None):
+            raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")
+        if self.centred and self.squash == "tanh_in_frame":
+            raise ValueError("centred needs the squash tanh or clip, not tanh_in_frame")
 
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":

@@ -6,12 +6,13 @@ import torch
 from torch.optim.swa_utils import AveragedModel
 
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.policy import PolicySpec
 
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
 the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart. A
-centred actor does so too, and exerts no force where the robot rests at its goal."""
+centred actor sees and acts in the task's frame, and keeps the robot exactly in the steady motion in which an episode shall end."""
 
 
 def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
@@ -33,11 +34,16 @@ def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bo
         if task.frame is None:
             raise ValueError(f'{task.id} has no frame; give "none" or "mirrors" as its symmetry')
         fields["frame"] = task.frame
-    elif symmetry in ("fine_frame", "centred"):
+    elif symmetry == "fine_frame":
         if task.fine_frame is None:
             raise ValueError(f'{task.id} has no fine frame; give "frame", "mirrors" or "none" as its symmetry')
         fields["frame"] = task.fine_frame
-        fields["centred"] = symmetry == "centred"
+    elif symmetry == "centred":
+        if task.frame is None or FRAMES[task.frame].steady is None:
+            raise ValueError(
+                f'{task.id} has no frame with a steady motion; give "frame", "mirrors" or "none" as its symmetry'
+            )
+        fields |= {"frame": task.frame, "centred": True}
     return PolicySpec.of(task, **fields)
 
 
