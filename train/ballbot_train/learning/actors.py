@@ -12,7 +12,7 @@ from ballbot_train.policy import PolicySpec
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
 the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart. A
-centred actor sees and acts in the task's frame, and keeps the robot exactly in the steady motion in which an episode shall end."""
+centred actor acts in the task's frame, and keeps the robot exactly in the steady motion in which an episode shall end."""
 
 
 def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
