@@ -54,7 +54,7 @@ def some_starts(task, count=20):
     x = torch.zeros(8, count, dtype=torch.float64)
     x[0], x[1], x[5] = -torch.rand(count) - 1, -0.5, 3.0
     c = torch.full((len(task.constant_names), count), 3.0, dtype=torch.float64)
-    return curricula.Starts(x, c, torch.arange(count) % 5)
+    return curricula.Starts(x, c, torch.arange(count) % 5, 5 - torch.arange(count) % 5)
 
 
 def run(made, steps=30):
@@ -196,6 +196,20 @@ def test_episodes_that_begin_on_optima_do_not_make_the_task_harder():
     assert made.difficulty["goal_factor"] == reached
 
 
+def test_episodes_on_optima_begin_ever_earlier_as_they_succeed():
+    settings = Curriculum(starts_on_optima=1.0, starts_seconds=0.04, starts_step=0.02, episodes=4, success=0.75)
+    made = batch(curriculum=settings, num_envs=200)
+    given(made, some_starts(made.task))
+    of_four, everywhere = torch.ones(4, dtype=torch.bool), torch.ones(200, dtype=torch.bool)
+    for steps_left in (2, 3, 4, 5):
+        made._start_on_optima(made.step(torch.zeros(200, 2)), everywhere)
+        assert int((5 - made.state.steps).max()) == steps_left
+        made._count_starts(of_four, torch.tensor([True, True, False, False]))
+        assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * steps_left)
+        made._count_starts(of_four, torch.tensor([True, True, True, False]))
+        assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * (steps_left + 1))
+
+
 def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     task = make_task("turn", duration=8.0)
     starts = curricula.optimal_starts(task, default_params(), 1, 100)
@@ -222,6 +236,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
     easier = Curriculum(
         goal_factor=3.0, ramp="max_speed", ramp_start=3.0, starts_on_optima=0.5, shaping=1.0, episodes=2, success=0.0
     )
+    easier = replace(easier, starts_seconds=0.04)
     settings = replace(LEARNERS[name].settings("turn"), hidden=(8,), curriculum=easier, **TINY[name])
 
     def make(seed):
@@ -268,6 +283,8 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
             "BallbotStabilize-v0 has no field 'max_speed' for curriculum.ramp; it has",
         ),
         ("turn", {"ramp": "max_speed", "ramp_start": 1.0}, "curriculum.ramp_start 1 is out of range"),
+        ("turn", {"starts_seconds": 0.5}, "curriculum.starts_seconds needs curriculum.starts_on_optima above 0"),
+        ("weave", {"starts_seconds": 0.5, "starts_on_optima": 0.5}, "BallbotWeave-v0 does not end at its goal"),
     ],
 )
 def test_what_a_task_has_not_is_refused(name, settings, message):

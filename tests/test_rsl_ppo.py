@@ -193,7 +193,6 @@ def test_a_discount_that_is_no_discount_is_refused(setting):
         ("stabilize", "frame"),
         ("orbit", "fine_frame"),
         ("turn", "centred"),
-        ("stabilize", "centred"),
     ],
 )
 def test_a_symmetry_that_the_task_has_not_is_refused(name, symmetry):

@@ -225,13 +225,17 @@ def steady_motion(task, c, params, rng):
     if task.id == "BallbotOrbit-v0":
         states, forces = steady_orbit(params, *c, rng.uniform(0, 6, 1))
         return states[0], forces[0]
-    return np.array([*c[:2], *np.zeros(6)]), np.zeros(2)
+    goal = c[:2] if len(c) else np.zeros(2)
+    return np.array([*goal, *np.zeros(6)]), np.zeros(2)
 
 
-@pytest.mark.parametrize("name", ["orbit", "weave"])
-def test_a_frame_knows_the_steady_motion_of_the_episode(params, rng, name):
+@pytest.mark.parametrize(
+    ("name", "frame"),
+    [("orbit", "radial"), ("weave", "slalom"), ("weave", "fine_slalom"), ("stabilize", "fine_rest")],
+)
+def test_a_frame_knows_the_steady_motion_of_the_episode(params, rng, name, frame):
     task = TASKS[name]()
-    frame = FRAMES[task.frame]
+    frame = FRAMES[frame]
     for _ in range(50):
         x, c = task.sample(rng, params)
         ending, force = steady_motion(task, c, params, rng)
@@ -243,7 +247,7 @@ def test_a_frame_knows_the_steady_motion_of_the_episode(params, rng, name):
 
 
 @pytest.mark.parametrize("linear", [False, True])
-@pytest.mark.parametrize("name", ["orbit", "weave"])
+@pytest.mark.parametrize("name", ["orbit", "weave", "stabilize"])
 def test_centred_policies_keep_the_steady_motion_whatever_they_learnt(params, rng, name, linear):
     task = TASKS[name]()
     network = PolicyNetwork(spec_for(task, "centred", (8,), linear))

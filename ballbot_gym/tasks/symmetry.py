@@ -177,6 +177,18 @@ def _rest(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     return (*observation, *_fine_rest(observation)), lambda action: action
 
 
+def _rest_fine(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+    """`_rest`'s features at rest at the goal."""
+    none = 0.0 * features[0]
+    return (none,) * len(features), (none, none)
+
+
+def _rest_behind_obstacles_fine(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+    """`_fine_slalom`'s features at rest at the goal, all obstacles passed."""
+    seen, force = _rest_behind_obstacles(features)
+    return (*seen, *_fine_rest(seen)), force
+
+
 def _fine_rest(seen: tuple[Any, ...]) -> list[Any]:
     """Small errors of position, velocity and lean (`_fine`) at a goal where the robot rests."""
     x, y, gamma, theta, vx, vy, *_ = seen
@@ -218,8 +230,8 @@ _BALL_RADIUS = 0.1  # m, about
 FRAMES: dict[str, Frame] = {
     "radial": Frame(18, _radial, _steady_orbit),
     "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, _rest_behind_obstacles),
-    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom),
-    "fine_rest": Frame(14, _rest),
+    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, _rest_behind_obstacles_fine),
+    "fine_rest": Frame(14, _rest, _rest_fine),
     "gate": Frame(13 + len(_SWITCHES), _gate),
 }
 """Every frame by the name that tasks and policy files give."""

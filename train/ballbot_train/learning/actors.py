@@ -12,7 +12,7 @@ from ballbot_train.policy import PolicySpec
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
 the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart. A
-centred actor acts in the task's frame, and keeps the robot exactly in the steady motion in which an episode shall end."""
+centred actor acts in the finer of these frames, and keeps the robot exactly in the steady motion of the end of an episode."""
 
 
 def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
@@ -39,11 +39,12 @@ def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bo
             raise ValueError(f'{task.id} has no fine frame; give "frame", "mirrors" or "none" as its symmetry')
         fields["frame"] = task.fine_frame
     elif symmetry == "centred":
-        if task.frame is None or FRAMES[task.frame].steady is None:
+        frame = task.frame if task.fine_frame is None else task.fine_frame
+        if frame is None or FRAMES[frame].steady is None:
             raise ValueError(
                 f'{task.id} has no frame with a steady motion; give "frame", "mirrors" or "none" as its symmetry'
             )
-        fields |= {"frame": task.frame, "centred": True}
+        fields |= {"frame": frame, "centred": True}
     return PolicySpec.of(task, **fields)
 
 

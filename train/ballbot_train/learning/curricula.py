@@ -6,7 +6,9 @@ A curriculum changes training alone. What is evaluated is always the task itself
 - A field of the task that bounds what is drawn, as Turn's `max_speed`, begins at an easier value, and goes to the task's own
   by a step whenever enough training episodes succeed.
 - A share of the episodes begins in states along optima, with the time that is left there. These optima are those of training
-  episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them.
+  episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them. These
+  episodes can begin shortly before the end of their optimum at first, and ever earlier as enough of them succeed (Florensa et
+  al., "Reverse curriculum generation for reinforcement learning", 2017).
 - A share of the episodes is cut soon after its start, so that more of the samples are of starts.
 - Rewards are shaped by a potential, minus the distance to the goal. Shaping by a potential moves no optimum (Ng et al.,
   "Policy invariance under reward transformations", 1999).
@@ -64,6 +66,10 @@ class Curriculum:
     They are states of optima that the run finds first; of rsl_ppo with --demos, of the successful demonstrations."""
     optima: int = 64
     """Number of optima that the run finds for them, of about a second each."""
+    starts_seconds: float = 0.0
+    """How long before the end of their optimum these episodes begin at most, at the start of training, s; 0: anywhere."""
+    starts_step: float = 0.1
+    """How much longer that gets whenever enough of these episodes succeed, s."""
     short_episodes: float = 0.0
     """Share of the training episodes that are cut after `short_seconds`; 0: off. So more of the samples are of the starts,
     where most of a good policy's regret arises."""
@@ -82,6 +88,8 @@ class Curriculum:
             ("episodes", 1, 10**9),
             ("starts_on_optima", 0.0, 1.0),
             ("optima", 1, 10**6),
+            ("starts_seconds", 0.0, 1e6),
+            ("starts_step", 1e-9, 1e6),
             ("short_episodes", 0.0, 1.0),
             ("short_seconds", 1e-3, 1e6),
             ("shaping", 0.0, 1e6),
@@ -111,6 +119,10 @@ class Curriculum:
                 replace(task, **{self.ramp: self.ramp_start})
             except ValueError as error:
                 raise ValueError(f"curriculum.ramp_start {self.ramp_start:g} is out of range: {error}") from error
+        if self.starts_seconds and not self.starts_on_optima:
+            raise ValueError("curriculum.starts_seconds needs curriculum.starts_on_optima above 0")
+        if self.starts_seconds and not task.first_exit:
+            raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_seconds must be 0")
         if self.short_episodes and task.first_exit:
             raise ValueError(
                 f"{task.id} pays at its goal for the time that is left, so curriculum.short_episodes must be 0"
@@ -128,6 +140,8 @@ class Starts(NamedTuple):
     """(nc, n) constants of their episodes."""
     steps: torch.Tensor
     """(n,) int64, control steps that have passed of their episodes."""
+    left: torch.Tensor
+    """(n,) int64, control steps to the end of the optimum."""
 
 
 class CurriculumBatch(BallbotBatch):
@@ -170,7 +184,9 @@ class CurriculumBatch(BallbotBatch):
         self._own, self.gamma, self._pay, self._failure_price = task, gamma, pay, failure_price
         self._goal_factor = curriculum.goal_factor
         self._ramp = curriculum.ramp_start if curriculum.ramp else 0.0
+        self._reach = curriculum.starts_seconds
         self._ended = self._succeeded = 0
+        self._starts_ended = self._starts_succeeded = 0
         self._share = math.nan  # of the last `episodes` that ended
         self._from_task = torch.ones(num_envs, dtype=torch.bool)  # whose episode began as the task's own do
         self._demos, self._full = demos, task if full is None else full
@@ -187,6 +203,8 @@ class CurriculumBatch(BallbotBatch):
             reached["goal_factor"] = self._goal_factor
         if curriculum.ramp:
             reached[curriculum.ramp] = self._ramp
+        if curriculum.starts_seconds:
+            reached["starts_seconds"] = self._reach
         return reached | ({"success": self._share} if reached else {})
 
     @torch.no_grad()
@@ -209,6 +227,7 @@ class CurriculumBatch(BallbotBatch):
         ended = result.terminated | result.truncated
         self._count(ended & self._from_task, result.success)
         if self.curriculum.starts_on_optima:
+            self._count_starts(ended & ~self._from_task, result.success)
             result = self._start_on_optima(result, ended)
         if self.curriculum.short_episodes:
             self._shorten(ended)
@@ -220,6 +239,8 @@ class CurriculumBatch(BallbotBatch):
             "goal_factor": self._goal_factor,
             "ramp": self._ramp,
             "counts": [self._ended, self._succeeded],
+            "reach": self._reach,
+            "starts_counts": [self._starts_ended, self._starts_succeeded],
             "share": self._share,
             "from_task": self._from_task,
             "starts": None if self._starts is None else list(self._starts),
@@ -229,6 +250,7 @@ class CurriculumBatch(BallbotBatch):
         """Goes back to a state."""
         self._goal_factor, self._ramp, self._share = state["goal_factor"], state["ramp"], state["share"]
         self._ended, self._succeeded = state["counts"]
+        self._reach, (self._starts_ended, self._starts_succeeded) = state["reach"], state["starts_counts"]
         self._from_task = state["from_task"]
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
         self._set_difficulty()
@@ -246,6 +268,18 @@ class CurriculumBatch(BallbotBatch):
         self._ended = self._succeeded = 0
         if self._share >= self.curriculum.success:
             self._harden()
+
+    def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
+        """Counts the ended episodes that began on optima, and lets them begin earlier if enough of them succeeded."""
+        self._starts_ended += int(ended.sum())
+        self._starts_succeeded += int((ended & success).sum())
+        if self._starts_ended < self.curriculum.episodes:
+            return
+        enough = self._starts_succeeded >= self.curriculum.success * self._starts_ended
+        self._starts_ended = self._starts_succeeded = 0
+        if enough and 0 < self._reach < self._own.duration:
+            self._reach = min(self._reach + self.curriculum.starts_step, self._own.duration)
+            self._eligible = None
 
     def _harden(self) -> None:
         """Takes a step towards the task itself."""
@@ -277,8 +311,11 @@ class CurriculumBatch(BallbotBatch):
         if self._eligible is None:  # states outside of the goal, which may be wide
             inside = self.task.goal(self._starts.x.unbind(0), self._starts.c.unbind(0))
             reached = torch.stack([excess <= 0 for excess in inside]).all(0)
-            outside = (~reached).nonzero()[:, 0]
-            self._eligible = outside if len(outside) else torch.arange(len(reached))
+            near = torch.ones_like(reached)
+            if self._reach:
+                near = self._starts.left <= max(1, round(self._reach / self.task.control_dt))
+            outside = (near & ~reached).nonzero()[:, 0]
+            self._eligible = outside if len(outside) else near.nonzero()[:, 0]
         moved = ended & (torch.rand(self.num_envs) < self.curriculum.starts_on_optima)
         self._from_task = torch.where(ended, ~moved, self._from_task)
         if not moved.any():
@@ -337,10 +374,10 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) ->
             states = find_optimum(task, params, x, c).trajectory.x
         except PlanError:
             continue
-        found.append((states[:-1][:steps], c))
+        found.append((states, c))
     if not found:
         raise ValueError(f"{task.id}: no optimum was found on which episodes could begin")
-    return _starts(found)
+    return _starts(found, steps)
 
 
 def demonstrated_starts(path: str | Path, task: Task, steps: int) -> Starts:
@@ -351,15 +388,19 @@ def demonstrated_starts(path: str | Path, task: Task, steps: int) -> Starts:
     """
     from ballbot_train.learning.demonstrations import demonstrated_states
 
-    shown = [(states[:-1][:steps], c) for states, c in demonstrated_states(path, task)]
+    shown = list(demonstrated_states(path, task))
     if not shown:
         raise ValueError(f"{path}: no demonstration succeeds, so no episode can begin on one")
-    return _starts(shown)
+    return _starts(shown, steps)
 
 
-def _starts(found: list[tuple[np.ndarray, np.ndarray]]) -> Starts:
-    """Starts of pairs of states (n, 8), one per control step, and constants (nc,)."""
-    x = np.concatenate([states for states, _ in found])
-    c = np.concatenate([np.tile(c, (len(states), 1)) for states, c in found])
-    steps = np.concatenate([np.arange(len(states)) for states, _ in found])
-    return Starts(torch.from_numpy(x.T.copy()), torch.from_numpy(c.T.copy()), torch.from_numpy(steps))
+def _starts(found: list[tuple[np.ndarray, np.ndarray]], steps: int) -> Starts:
+    """Starts before control step `steps`, of pairs of states (n + 1, 8) at n control steps and in the end, and constants."""
+    counts = [min(len(states) - 1, steps) for states, _ in found]
+    x = np.concatenate([states[:n] for n, (states, _) in zip(counts, found, strict=True)])
+    c = np.concatenate([np.tile(c, (n, 1)) for n, (_, c) in zip(counts, found, strict=True)])
+    passed = np.concatenate([np.arange(n) for n in counts])
+    left = np.concatenate([len(states) - 1 - np.arange(n) for n, (states, _) in zip(counts, found, strict=True)])
+    return Starts(
+        torch.from_numpy(x.T.copy()), torch.from_numpy(c.T.copy()), torch.from_numpy(passed), torch.from_numpy(left)
+    )
