@@ -1,6 +1,7 @@
 """PPO and SAC, with and without demonstrations: they run, and go on from a state as if never stopped."""
 
 import io
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -380,6 +381,44 @@ def test_sac_sees_and_acts_in_the_frame_of_its_task(task):
     with torch.no_grad():
         expected = learner.network(batch.observe(batch.state))
     np.testing.assert_allclose(learner._env.venv._actions, expected, atol=1e-6)  # float32
+
+
+@pytest.mark.parametrize("task", ["stabilize", "orbit", "weave"])
+def test_sac_with_a_centred_actor_acts_as_its_policy_does_and_keeps_the_steady_motion(task):
+    made = make_task(task)
+    learner = LEARNERS["sac"].make(made, default_params(), replace(TINY["sac"], symmetry="centred"), 0, None)
+    run(learner)
+    spec, batch = learner.network.spec, learner._env.batch
+    assert spec.centred
+    seen = learner._env._seen(batch.observe(batch.state).numpy())
+    action, _ = learner._model.predict(seen, deterministic=True)
+    learner._env.step_async(action)
+    with torch.no_grad():
+        expected = learner.network(batch.observe(batch.state))
+    np.testing.assert_allclose(learner._env.venv._actions, expected, atol=1e-6)  # float32
+    if task == "stabilize":
+        with torch.no_grad():
+            assert learner.network(torch.zeros(8)).tolist() == [0.0, 0.0]
+
+
+def test_targets_of_sac_can_add_up_the_rewards_of_several_steps():
+    learner = run(make("sac", n_steps=3), 2)
+    replay, gamma = learner._replay, learner.config.gamma
+    drawn = replay.sample(200)
+    steps = replay.observations[: replay.pos]
+    several = 0
+    for seen, reward, discount in zip(*(part.numpy() for part in (drawn[0], drawn[4], drawn[5])), strict=True):
+        begun, env = (int(found[0]) for found in np.nonzero((steps == seen).all(-1)))
+        count = round(math.log(float(discount[0])) / math.log(gamma))
+        summed = sum(gamma**k * float(replay.rewards[begun + k, env]) for k in range(count))
+        assert float(reward[0]) == pytest.approx(summed, rel=1e-5)
+        several += count == 3
+    assert several > 100
+
+
+def test_several_steps_are_refused_beside_demonstrations(demos):
+    with pytest.raises(ValueError, match="sac with demonstrations needs n_steps 1, not 3"):
+        make("sac", demos, n_steps=3)
 
 
 @pytest.mark.parametrize("demonstrated", [False, True])

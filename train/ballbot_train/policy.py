@@ -108,17 +108,19 @@ class PolicyNetwork(torch.nn.Module):
         output = self._sum(stack(features))
         if self._steady is not None:
             steady, action = self._steady(features)
-            needed = stack(action)
-            output = (
-                output
-                - self._sum(stack(steady))
-                + (needed.clamp(-0.999, 0.999).atanh() if self.spec.squash == "tanh" else needed)
-            )
+            output = output - self._sum(stack(steady)) + unsquashed(stack(action), self.spec.squash)
         return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
         return output if self.linear is None else output + self.linear(inputs)
+
+
+def unsquashed(action: torch.Tensor, squash: str) -> torch.Tensor:
+    """What a network has to give for an action (..., 2) in the world or a frame, before it is squashed."""
+    if squash == "clip":
+        return action
+    return (action / (REACH if squash == "tanh_in_frame" else 1)).clamp(-0.999, 0.999).atanh()
 
 
 class PolicyController(ActionController):

@@ -95,8 +95,6 @@ class PolicySpec:
             raise ValueError(f"odd needs the activation tanh, not {self.activation}")
         if self.centred and (self.frame not in FRAMES or FRAMES[self.frame].steady is None):
             raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")
-        if self.centred and self.squash == "tanh_in_frame":
-            raise ValueError("centred needs the squash tanh or clip, not tanh_in_frame")
 
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":

@@ -187,7 +187,7 @@ class CurriculumBatch(BallbotBatch):
         self._reach = curriculum.starts_seconds
         self._ended = self._succeeded = 0
         self._starts_ended = self._starts_succeeded = 0
-        self._share = math.nan  # of the last `episodes` that ended
+        self._share = self._starts_share = math.nan  # of the last `episodes` that ended
         self._from_task = torch.ones(num_envs, dtype=torch.bool)  # whose episode began as the task's own do
         self._demos, self._full = demos, task if full is None else full
         self._starts: Starts | None = None
@@ -204,7 +204,7 @@ class CurriculumBatch(BallbotBatch):
         if curriculum.ramp:
             reached[curriculum.ramp] = self._ramp
         if curriculum.starts_seconds:
-            reached["starts_seconds"] = self._reach
+            reached["starts_seconds"], reached["starts_success"] = self._reach, self._starts_share
         return reached | ({"success": self._share} if reached else {})
 
     @torch.no_grad()
@@ -241,6 +241,7 @@ class CurriculumBatch(BallbotBatch):
             "counts": [self._ended, self._succeeded],
             "reach": self._reach,
             "starts_counts": [self._starts_ended, self._starts_succeeded],
+            "starts_share": self._starts_share,
             "share": self._share,
             "from_task": self._from_task,
             "starts": None if self._starts is None else list(self._starts),
@@ -251,6 +252,7 @@ class CurriculumBatch(BallbotBatch):
         self._goal_factor, self._ramp, self._share = state["goal_factor"], state["ramp"], state["share"]
         self._ended, self._succeeded = state["counts"]
         self._reach, (self._starts_ended, self._starts_succeeded) = state["reach"], state["starts_counts"]
+        self._starts_share = state["starts_share"]
         self._from_task = state["from_task"]
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
         self._set_difficulty()
@@ -275,9 +277,9 @@ class CurriculumBatch(BallbotBatch):
         self._starts_succeeded += int((ended & success).sum())
         if self._starts_ended < self.curriculum.episodes:
             return
-        enough = self._starts_succeeded >= self.curriculum.success * self._starts_ended
+        self._starts_share = self._starts_succeeded / self._starts_ended
         self._starts_ended = self._starts_succeeded = 0
-        if enough and 0 < self._reach < self._own.duration:
+        if self._starts_share >= self.curriculum.success and 0 < self._reach < self._own.duration:
             self._reach = min(self._reach + self.curriculum.starts_step, self._own.duration)
             self._eligible = None
 

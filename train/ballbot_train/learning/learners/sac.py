@@ -14,16 +14,16 @@ import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples
+from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_gym.tasks.symmetry import FRAMES, Frame
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value
@@ -31,7 +31,7 @@ from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
-from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy import PolicyNetwork, unsquashed
 from ballbot_train.policy_files import Mirrors
 
 
@@ -49,9 +49,11 @@ class SacConfig(ModelFreeConfig):
     imitation_weight: float = 300.0
     gradient_steps: int = 4
     """Gradient steps after each control step of all envs."""
-    symmetry: Literal["none", "mirrors", "frame", "fine_frame"] = "none"
+    symmetry: Literal["none", "mirrors", "frame", "fine_frame", "centred"] = "none"
     """Whether actor and critics learn from the task's mirror images as well, over which the policy is averaged; or see the
-    task's frame, or its fine frame, and act in it."""
+    task's frame, or its fine frame, and act in it; with an actor that is exact in the steady motion of the end (centred)."""
+    n_steps: int = 1
+    """Control steps whose rewards a target of the critics adds up before it takes a value; 1 with demonstrations."""
     layer_norm: bool = False
     """Whether the critics' hidden layers are normalized, as Ball et al. do, unless they see products."""
     num_critics: int = 2
@@ -97,7 +99,7 @@ TUNED: dict[str, SacConfig] = {
 """Settings by name of task; every other task takes the defaults."""
 
 
-class SymmetricReplay(ReplayBuffer):
+class SymmetricReplay(NStepReplayBuffer):
     """A replay buffer that draws half of its samples from demonstrations, if there are any, and shows mirror images."""
 
     def __init__(self, *args: Any, demos: Demos | None, reward_scale: float, mirrors: Mirrors = (), **kwargs: Any):
@@ -126,10 +128,13 @@ class SymmetricReplay(ReplayBuffer):
             samples = ReplayBufferSamples(*(torch.cat([a, b[chosen]]) for a, b in both))
         if not self._signs:
             return samples
-        observations, actions, next_observations, dones, rewards, *_ = samples
         image = torch.randint(len(self._signs[0]), (batch_size,))
         seen, acted = (signs[image] for signs in self._signs)
-        return ReplayBufferSamples(seen * observations, acted * actions, seen * next_observations, dones, rewards)
+        return samples._replace(
+            observations=seen * samples.observations,
+            actions=acted * samples.actions,
+            next_observations=seen * samples.next_observations,
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the buffer, without the demonstrations."""
@@ -177,13 +182,54 @@ class Critics(ContinuousCritic):
             self.add_module(f"qf{index}", critic)
 
 
-class CriticPolicy(SACPolicy):
-    """SB3's policy with critics of another network."""
+class CentredActor(Actor):
+    """SB3's actor in a frame, whose mean action keeps the frame's steady motion exactly; see `PolicyNetwork`."""
 
-    def __init__(self, *args: Any, network: "CriticNetwork", **kwargs: Any):
-        """Args: network: makes one critic's network; the others are SB3's."""
-        self._network = network
+    def __init__(self, *args: Any, frame: Frame, **kwargs: Any):
+        """Args: frame: that the envs show; the others are SB3's."""
         super().__init__(*args, **kwargs)
+        self._frame = frame
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        _, log_std, more = super().get_action_dist_params(obs)
+        return self.mean_action().raw(cast(torch.Tensor, obs)), log_std, more
+
+    def mean_action(self) -> "CentredMean":
+        """The mean of its actions, with the same layers."""
+        return CentredMean(torch.nn.Sequential(*self.latent_pi, self.mu), self._frame)
+
+
+class CentredMean(torch.nn.Module):
+    """The mean action of a centred actor."""
+
+    def __init__(self, mlp: torch.nn.Module, frame: Frame):
+        super().__init__()
+        self.mlp, self._frame = mlp, frame
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.raw(features))
+
+    def raw(self, features: torch.Tensor) -> torch.Tensor:
+        """(n, 2) of features (n, size), before it is squashed."""
+        assert self._frame.steady is not None
+        steady, action = self._frame.steady(features.unbind(-1))
+        kept = self.mlp(torch.stack(steady, -1))
+        return self.mlp(features) - kept + unsquashed(torch.stack(action, -1), "tanh_in_frame")
+
+
+class OwnPolicy(SACPolicy):
+    """SB3's policy with critics of another network, and an actor that may be centred."""
+
+    def __init__(self, *args: Any, network: "CriticNetwork", centre: Frame | None, **kwargs: Any):
+        """Args: network: makes one critic's network; centre: the frame of a centred actor; the others are SB3's."""
+        self._network, self._centre = network, centre
+        super().__init__(*args, **kwargs)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        if self._centre is None:
+            return super().make_actor(features_extractor)
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return CentredActor(**kwargs, frame=self._centre).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
@@ -195,12 +241,13 @@ CriticNetwork = Callable[[int, list[int], type[torch.nn.Module]], torch.nn.Modul
 
 
 def _critic_network(config: SacConfig, value: float) -> CriticNetwork:
-    """What makes critics that see products and expect `value` everywhere at the start, or whose layers are normalized."""
+    """What makes critics: they see products and expect `value` everywhere at the start, or their layers may be normalized."""
 
     def network(inputs: int, hidden: list[int], activation: type[torch.nn.Module]) -> torch.nn.Module:
         if config.products:
             return QuadraticCritic(CriticInputs(inputs), hidden, activation, value)
-        return torch.nn.Sequential(*create_mlp(inputs, 1, hidden, activation, post_linear_modules=[torch.nn.LayerNorm]))
+        after: Any = [torch.nn.LayerNorm] if config.layer_norm else None
+        return torch.nn.Sequential(*create_mlp(inputs, 1, hidden, activation, post_linear_modules=after))
 
     return network
 
@@ -218,6 +265,8 @@ class Sac(ModelFree):
             raise ValueError(
                 "curriculum.shaping cannot be used with sac's demonstrations, because their rewards are not shaped"
             )
+        if demos is not None and config.n_steps != 1:
+            raise ValueError(f"sac with demonstrations needs n_steps 1, not {config.n_steps}")
         if demos is not None and not config.pay:
             demos = demos.without_pay(task, config.failure_price)
         self._spec = spec_for(task, config.symmetry, config.hidden)
@@ -228,8 +277,10 @@ class Sac(ModelFree):
         self.config = config
         rate = config.learning_rate
         value = self._value_of_living(config.gamma)
+        own = config.products or config.layer_norm or self._spec.centred
+        networks = {"network": _critic_network(config, value), "centre": frame if self._spec.centred else None}
         model = SAC(
-            CriticPolicy if config.products or config.layer_norm else "MlpPolicy",
+            OwnPolicy if own else "MlpPolicy",
             self._env,
             learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
             buffer_size=config.rl_iterations * config.num_steps * config.num_envs,
@@ -243,6 +294,8 @@ class Sac(ModelFree):
                 "demos": demos,
                 "reward_scale": config.reward_scale,
                 "mirrors": self._spec.mirrors,
+                "n_steps": config.n_steps,
+                "gamma": config.gamma,
             },
             ent_coef=f"auto_{config.ent_coef}",
             target_entropy=config.target_entropy,
@@ -250,7 +303,7 @@ class Sac(ModelFree):
                 "net_arch": list(config.hidden),
                 "n_critics": config.num_critics,
                 "activation_fn": torch.nn.SiLU,
-                **({"network": _critic_network(config, value)} if config.products or config.layer_norm else {}),
+                **(networks if own else {}),
             },
             seed=seed,
             device="cpu",
@@ -274,15 +327,17 @@ class Sac(ModelFree):
             )
         self._set_model(
             model,
-            torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
+            actor.mean_action()
+            if isinstance(actor, CentredActor)
+            else torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
             (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
         )
 
     @property
     def network(self) -> PolicyNetwork:
         squash = "tanh" if self._spec.frame is None else "tanh_in_frame"
-        symmetry = {"frame": self._spec.frame, "mirrors": self._spec.mirrors}
-        return as_policy(self._kept.children(), self._task, activation="silu", squash=squash, **symmetry)
+        symmetry = {"frame": self._spec.frame, "centred": self._spec.centred, "mirrors": self._spec.mirrors}
+        return as_policy(self._kept.modules(), self._task, activation="silu", squash=squash, **symmetry)
 
     def state_dict(self) -> dict[str, Any]:
         own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}
