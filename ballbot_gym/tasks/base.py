@@ -72,6 +72,8 @@ class Task(ABC):
     """Its mirror images; with no change they form a group."""
     frame: ClassVar[str | None] = None
     """Name in `symmetry.FRAMES` of a frame in which the task looks the same wherever it takes place, or None."""
+    routed_frame: ClassVar[str | None] = None
+    """Name in `symmetry.FRAMES` of a frame in which a route decides on which side obstacles are passed, or None."""
     fine_frame: ClassVar[str | None] = None
     """Name of the same frame with features that tell small errors apart, where `frame` has none; or None."""
     constant_draws: ClassVar[int] = 0
@@ -193,11 +195,16 @@ class Task(ABC):
         """What optimizers keep ≥ 0. Every task has the tilt limit; obstacles add theirs."""
         return (dynamics.cos_tilt(x) - math.cos(self.max_tilt),)
 
-    def one_way_margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
+    def one_way_margins(self, x: Vector, c: Vector, sides: tuple[Any, ...] = ()) -> tuple[Any, ...]:
         """The margins, with all ways closed but one where they leave several.
 
         For learners that follow gradients, because no gradient leads from one side of an obstacle to the other. Episodes
         neither end nor cost anything by these.
+
+        Args:
+            x: (..., 8) states.
+            c: (..., nc) constants.
+            sides: on which side each obstacle is to be passed, as a policy with routes decides; default, the task's choice.
         """
         return self.margins(x, c)
 

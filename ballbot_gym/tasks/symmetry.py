@@ -47,6 +47,11 @@ class Frame:
     """Number of features."""
     features: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], Back]]
     """Observation, as a tuple of its entries -> features (size), and the way back for actions."""
+    sides: int = 0
+    """Number of entries behind the observation's that `features` takes: 1 or −1 for every obstacle that is passed on its left
+    or on its right, as `ballbot_train.routes` decides."""
+    layout: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
+    """Observation -> what a route sees of an episode. It hardly changes while the episode goes on."""
     steady: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, Any]]] | None = None
     """Features -> features (size), and action in the frame, of the steady motion in which the episode shall end."""
 
@@ -139,25 +144,61 @@ def _slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     Obstacles that the ball has passed leave the list, and the next take their places. The side of the last one decides
     behind it too, so that nothing flips where the robot comes to rest.
     """
+    obstacles, side, features, back = _ahead(observation)
+    for dx, dy, radius in obstacles:
+        passed = _passed(dx, radius)
+        way = dy - ops.where(dy + observation[1] < 0, -0.2, 0.2) * (radius + _BALL_RADIUS)
+        features += [ops.where(passed, -0.2, dx), ops.where(passed, 0.0, side * way), ops.where(passed, 0.0, radius)]
+    return tuple(features), back
+
+
+def _routed_slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
+    """As `_slalom`, but each obstacle is told by the way past it on the side that a route decides, and not on the nearer one.
+
+    Its radius counts as negative where it is to be passed on its right, as seen in the frame.
+    """
+    *seen, s0, s1, s2, s3, s4 = observation
+    obstacles, side, features, back = _ahead(tuple(seen), (s0, s1, s2, s3, s4))
+    for dx, dy, radius, left in obstacles:
+        passed = _passed(dx, radius)
+        way = dy + left * 0.2 * (radius + _BALL_RADIUS)
+        features += [ops.where(passed, -0.2, dx), ops.where(passed, 0.0, side * way)]
+        features.append(ops.where(passed, 0.0, side * left * radius))
+    return tuple(features), back
+
+
+def slalom_layout(observation: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Where Weave's obstacles lie as seen from the goal, the first of them on the left: 5 times x, y and radius as observed.
+
+    It stays the same throughout an episode, but for rounding.
+    """
+    x, y, *_ = observation
+    numbers = observation[8:]
+    side = ops.where(numbers[1] + y < 0, -1.0, 1.0)
+    triples = zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True)
+    return tuple(value for dx, dy, radius in triples for value in (dx + x, side * (dy + y), radius))
+
+
+def _ahead(
+    observation: tuple[Any, ...], sides: tuple[Any, ...] = ()
+) -> tuple[list[tuple[Any, ...]], Any, list[Any], Back]:
+    """The next obstacles, with their sides if given, the sign of y in the frame, the frame's first 8 features, and `Back`."""
     x, y, gamma, theta, vx, vy, gamma_dot, theta_dot, *numbers = observation
-    obstacles = list(zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True))
+    columns = [numbers[::3], numbers[1::3], numbers[2::3]] + ([sides] if sides else [])
+    obstacles = list(zip(*columns, strict=True))
     for _ in obstacles[1:]:
-        passed = _passed(*obstacles[0])
+        passed = _passed(obstacles[0][0], obstacles[0][2])
         obstacles = [
             tuple(ops.where(passed, after, before) for before, after in zip(*pair, strict=True))
             for pair in zip(obstacles, [*obstacles[1:], obstacles[-1]], strict=True)
         ]
     side = ops.where(obstacles[0][1] + y < 0, -1.0, 1.0)
-    features = [x, side * y, gamma, side * theta, vx, side * vy, gamma_dot, side * theta_dot]
-    for dx, dy, radius in obstacles[:_OBSTACLES_SEEN]:
-        passed = _passed(dx, dy, radius)
-        way = dy - ops.where(dy + y < 0, -0.2, 0.2) * (radius + _BALL_RADIUS)
-        features += [ops.where(passed, -0.2, dx), ops.where(passed, 0.0, side * way), ops.where(passed, 0.0, radius)]
 
     def back(action: tuple[Any, Any]) -> tuple[Any, Any]:
         return action[0], side * action[1]
 
-    return tuple(features), back
+    features = [x, side * y, gamma, side * theta, vx, side * vy, gamma_dot, side * theta_dot]
+    return obstacles[:_OBSTACLES_SEEN], side, features, back
 
 
 def _rest_behind_obstacles(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
@@ -196,7 +237,7 @@ def _fine_rest(seen: tuple[Any, ...]) -> list[Any]:
     return [_fine(*error) for error in errors]
 
 
-def _passed(dx: Any, dy: Any, radius: Any) -> Any:
+def _passed(dx: Any, radius: Any) -> Any:
     """Whether the ball is beyond an obstacle, given as observed."""
     return 5.0 * dx < -(radius + _BALL_RADIUS)
 
@@ -228,10 +269,11 @@ _OBSTACLES_SEEN = 4
 _BALL_RADIUS = 0.1  # m, about
 
 FRAMES: dict[str, Frame] = {
-    "radial": Frame(18, _radial, _steady_orbit),
-    "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, _rest_behind_obstacles),
-    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, _rest_behind_obstacles_fine),
-    "fine_rest": Frame(14, _rest, _rest_fine),
+    "radial": Frame(18, _radial, steady=_steady_orbit),
+    "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, steady=_rest_behind_obstacles),
+    "routed_slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _routed_slalom, sides=5, layout=slalom_layout),
+    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, steady=_rest_behind_obstacles_fine),
+    "fine_rest": Frame(14, _rest, steady=_rest_fine),
     "gate": Frame(13 + len(_SWITCHES), _gate),
 }
 """Every frame by the name that tasks and policy files give."""

@@ -64,11 +64,42 @@ def predict(
     responses = model.responses[passed]
     kernel = responses @ responses.T + _REGULARIZATION * np.eye(len(passed))
     free = goal_y + model.free @ (np.asarray(x0)[_ACROSS] - [goal_y, 0, 0, 0])
-    sides = np.array(list(itertools.product((-1, 1), repeat=len(passed))))
+    sides = choices(len(passed))
     wanted = obstacles[:, 1] + sides * obstacles[:, 2]
-    prices = _prices(kernel, sides, sides * (wanted - free[passed]))
+    prices = _prices(kernel * sides[:, :, None] * sides[:, None, :], sides * (wanted - free[passed]))
     costs = np.einsum("ni,ij,nj->n", sides * prices, kernel, sides * prices)
     return Prediction(sides, costs, free + (sides * prices) @ responses @ model.responses.T)
+
+
+def choices(obstacles: int) -> np.ndarray:
+    """(2^n, n) every choice of sides of n obstacles, −1 or 1, in the order of `Prediction`."""
+    return np.array(list(itertools.product((-1, 1), repeat=obstacles)))
+
+
+def predict_costs(
+    task: Task, params: BallbotParams, across: np.ndarray, obstacles: np.ndarray, passed: np.ndarray
+) -> np.ndarray:
+    """What every choice of sides costs more than the motion without obstacles, of many slaloms at once.
+
+    Args:
+        task: the slalom.
+        params: the robot.
+        across: (B, 4) y relative to the goal, θ, ẏ and θ̇ at the start.
+        obstacles: (B, n, 2) y relative to the goal, and how near the ball's centre may come, m.
+        passed: (B, n) control steps at which the robot passes them.
+
+    Returns:
+        (B, 2^n), in the order of `choices`.
+    """
+    model, sides = _model(task, params), choices(passed.shape[1])
+    responses = model.responses[passed]
+    kernels = np.einsum("bik,bjk->bij", responses, responses) + _REGULARIZATION * np.eye(passed.shape[1])
+    free = np.einsum("bnk,bk->bn", model.free[passed], across)
+    least = sides * (obstacles[:, None, :, 0] + sides * obstacles[:, None, :, 1] - free[:, None])
+    matrices = kernels[:, None] * sides[:, :, None] * sides[:, None, :]
+    shape = (-1, passed.shape[1])
+    prices = _prices(matrices.reshape(*shape, passed.shape[1]), least.reshape(shape)).reshape(least.shape)
+    return np.einsum("bsi,bsij,bsj->bs", prices, matrices, prices)
 
 
 @dataclass(frozen=True)
@@ -100,9 +131,10 @@ def _model(task: Task, params: BallbotParams) -> _Model:
     return _Model(np.array([power[0] for power in powers]), responses / np.sqrt(price[0, 0]))
 
 
-def _prices(kernel: np.ndarray, sides: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """(n, m) multipliers λ ≥ 0 of the programs: minimize λᵀMλ/2 − hᵀλ with M = kernel with the sides' signs, h = `least`."""
-    matrices = kernel * sides[:, :, None] * sides[:, None, :]
+def _prices(matrices: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """(n, m) multipliers λ ≥ 0 of n programs: minimize λᵀMλ/2 − hᵀλ with M = `matrices`, kernels with the sides' signs, and
+    h = `least`.
+    """
     prices, open_ = np.zeros(least.shape), np.ones(len(least), bool)
     scale = 1e-9 * np.abs(least).max(initial=1.0)
     for active in itertools.product((False, True), repeat=least.shape[1]):

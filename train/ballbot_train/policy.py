@@ -30,6 +30,7 @@ from ballbot_train.policy_files import (
     read_description,
     shipped_policies,
 )
+from ballbot_train.routes import Routes
 
 try:
     import safetensors
@@ -61,7 +62,8 @@ class PolicyNetwork(torch.nn.Module):
     Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit. With a frame, o and the
     action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so it mirrors exactly.
     A centred policy takes from the sum what it is in the steady motion in which the episode shall end, and adds the action
-    that keeps it: so it rests at its goal, or orbits on the circle, and not beside it.
+    that keeps it: so it rests at its goal, or orbits on the circle, and not beside it. With routes, a network of its own
+    decides on which sides obstacles are passed.
     """
 
     def __init__(self, spec: PolicySpec):
@@ -69,6 +71,7 @@ class PolicyNetwork(torch.nn.Module):
         self.spec = spec
         self._frame = None if spec.frame is None else FRAMES[spec.frame]
         self._mirrors = [tuple(torch.tensor(signs, dtype=torch.float32) for signs in mirror) for mirror in spec.mirrors]
+        self.routes = Routes(spec.frame, spec.routes) if spec.frame is not None and spec.routes else None
         inputs = spec.observations if self._frame is None else self._frame.size
         self._steady = self._frame.steady if self._frame is not None and spec.centred else None
         self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd) if spec.linear else None
@@ -88,6 +91,8 @@ class PolicyNetwork(torch.nn.Module):
 
     def raw(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 2) before it is squashed; with "tanh_in_frame" before it is clipped, which alone is left to do then."""
+        if self.routes is not None:
+            observation = self.routes.behind(observation)
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             features, back = self._frame.features(tuple(observation.tolist()))

@@ -58,6 +58,8 @@ class PolicySpec:
     """Whether opposite observations get opposite actions, exactly: no biases. Needs an odd activation."""
     frame: str | None = None
     """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
+    routes: tuple[int, ...] = ()
+    """Units of the hidden layers of the network that decides on which sides obstacles are passed, for a frame with sides."""
     centred: bool = False
     """Whether the action in the frame's steady motion is exactly the one that keeps it."""
     mirrors: Mirrors = ()
@@ -75,10 +77,12 @@ class PolicySpec:
             raise ValueError(f"robot must be one of {', '.join(ROBOTS)}, not {self.robot!r:.200}")
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
-        if not isinstance(self.hidden, tuple) or len(self.hidden) > _MOST_LAYERS:
-            raise ValueError(f"hidden must be the units of at most {_MOST_LAYERS} layers, not {self.hidden!r:.200}")
-        for units in self.hidden:
-            _check_count("hidden", units)
+        for name in ("hidden", "routes"):
+            layers = getattr(self, name)
+            if not isinstance(layers, tuple) or len(layers) > _MOST_LAYERS:
+                raise ValueError(f"{name} must be the units of at most {_MOST_LAYERS} layers, not {layers!r:.200}")
+            for units in layers:
+                _check_count(name, units)
         for name in ("activation", "squash"):
             known = get_args(get_type_hints(PolicySpec)[name])
             if getattr(self, name) not in known:
@@ -93,6 +97,10 @@ class PolicySpec:
                 raise ValueError(f"mirrors must hold signs of {self.observations} observations and 2 actions")
         if self.odd and self.activation != "tanh":
             raise ValueError(f"odd needs the activation tanh, not {self.activation}")
+        if bool(self.routes) != (self.frame in FRAMES and FRAMES[self.frame].sides > 0):
+            raise ValueError(
+                f"routes must be given for a frame with sides, and for no other, not for {self.frame!r:.200}"
+            )
         if self.centred and (self.frame not in FRAMES or FRAMES[self.frame].steady is None):
             raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")
 
@@ -103,13 +111,15 @@ class PolicySpec:
         Raises:
             KeyError, TypeError, ValueError: it describes none.
         """
-        hidden = described["hidden"]
-        if not isinstance(hidden, list | tuple):
-            raise ValueError(f"hidden must be a list of whole numbers, not {hidden!r:.200}")
+        layers = {"hidden": described["hidden"], "routes": described.get("routes", ())}
+        for name, units in layers.items():
+            if not isinstance(units, list | tuple):
+                raise ValueError(f"{name} must be a list of whole numbers, not {units!r:.200}")
         mirrors = tuple((tuple(signs), tuple(action)) for signs, action in described.get("mirrors", ()))
         if described.get("frame") not in (None, *FRAMES):
             raise ValueError(f"no frame {described['frame']!r}; known: {', '.join(FRAMES)}")
-        return cls(**(dict(described) | {"hidden": tuple(hidden), "mirrors": mirrors}))
+        shapes = {name: tuple(units) for name, units in layers.items()}
+        return cls(**(dict(described) | shapes | {"mirrors": mirrors}))
 
     @classmethod
     def of(cls, task: Task, **fields: Any) -> "PolicySpec":

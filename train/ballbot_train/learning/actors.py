@@ -9,10 +9,14 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.policy import PolicySpec
 
-Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
+Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "routes", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
 the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart. A
+policy with routes decides first on which sides it passes obstacles, and acts in the frame of these (shac and dagger). A
 centred actor acts in the finer of these frames, and keeps the robot exactly in the steady motion of the end of an episode."""
+
+
+_ROUTES = (128, 128)  # units of the layers that decide on sides
 
 
 def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
@@ -38,6 +42,10 @@ def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bo
         if task.fine_frame is None:
             raise ValueError(f'{task.id} has no fine frame; give "frame", "mirrors" or "none" as its symmetry')
         fields["frame"] = task.fine_frame
+    elif symmetry == "routes":
+        if task.routed_frame is None:
+            raise ValueError(f'{task.id} has no routes; give "frame", "mirrors" or "none" as its symmetry')
+        fields |= {"frame": task.routed_frame, "routes": _ROUTES}
     elif symmetry == "centred":
         frame = task.frame if task.fine_frame is None else task.fine_frame
         if frame is None or FRAMES[frame].steady is None:

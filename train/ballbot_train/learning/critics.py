@@ -12,6 +12,7 @@ import torch
 
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_train.routes import Routes
 
 _LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
 
@@ -19,8 +20,16 @@ _LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
 class CriticInputs:
     """An observation as a critic sees it: in the task's frame if one is named, and with the products of its entries."""
 
-    def __init__(self, observations: int, products: bool = True, frame: str | None = None):
-        """Args: observations: their number; products: of all pairs, squares included; frame: name in `FRAMES`, or None."""
+    def __init__(
+        self, observations: int, products: bool = True, frame: str | None = None, routes: Routes | None = None
+    ):
+        """Args:
+        observations: their number.
+        products: of all pairs, squares included.
+        frame: name in `FRAMES`, or None.
+        routes: of the actor, for a frame with sides.
+        """
+        self._routes = routes
         self._frame = None if frame is None else FRAMES[frame]
         entries = observations if self._frame is None else self._frame.size
         self._pairs = torch.triu_indices(entries, entries) if products else None
@@ -29,6 +38,8 @@ class CriticInputs:
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """(B, observations) to (B, size)."""
+        if self._routes is not None:
+            observation = self._routes.behind(observation)
         if self._frame is not None:
             observation = torch.stack(self._frame.features(observation.unbind(-1))[0], -1)
         if self._pairs is None:

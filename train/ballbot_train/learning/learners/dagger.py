@@ -42,6 +42,7 @@ from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
+from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
 
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3])  # standard deviations of a tube, in a state's SI units
@@ -207,7 +208,9 @@ class Dagger:
         return self._fit.network
 
     def iterate(self) -> dict[str, float]:
-        config, figures = self.config, {}
+        config, figures, routes = self.config, {}, self.network.routes
+        if routes is not None and self.iteration == 0:
+            fit_routes(routes, self._task, self._params, self._seed)
         rng = np.random.default_rng([self._seed, self.iteration])
         if self.iteration < config.gathering_iterations or not len(self._samples):
             figures = self._gather(rng)

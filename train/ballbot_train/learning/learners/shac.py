@@ -27,7 +27,9 @@ from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, spec_for
 from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
+from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
+from ballbot_train.routes import Routes
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,8 @@ class ShacConfig:
     margin_penalty: float = 0.0
     """Penalty per second and squared shortfall of the clearance; 0: none. It grows linearly from 0.15 on."""
     one_way: bool = False
-    """Whether the penalty is that of the task's `one_way_margins`: of Weave's, a policy that started on the nearer sides
-    does not leave them. From scratch no way past the first obstacle was found with it."""
+    """Whether the penalty is that of the task's `one_way_margins`: of Weave's, a policy that started on the nearer sides, or
+    on those of its routes, does not leave them. From scratch no way past the first obstacle was found with it."""
     grip_clearance: float = 0.05
     """Reserve of `dynamics.limits` below which its penalty starts; a robot with unlimited friction has none."""
     grip_penalty: float = 3000.0
@@ -128,9 +130,16 @@ class Critic(torch.nn.Module):
     Where the policy sees the task's frame, the critic does too.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, hidden: tuple[int, ...], frame: str | None = None):
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        hidden: tuple[int, ...],
+        frame: str | None = None,
+        routes: Routes | None = None,
+    ):
         super().__init__()
-        self._inputs = CriticInputs(len(task.observation_scale), products=False, frame=frame)
+        self._inputs = CriticInputs(len(task.observation_scale), products=False, frame=frame, routes=routes)
         layers: list[torch.nn.Module] = []
         size = self._inputs.size
         for width in hidden:
@@ -158,14 +167,14 @@ class Shac:
     def __init__(self, task: Task, params: BallbotParams, config: ShacConfig, seed: int = 0):
         torch.manual_seed(seed)  # for the networks' first weights
         self._random = torch.Generator().manual_seed(seed)
-        self.config, self.iteration, self._finetuning = config, 0, False
+        self.config, self.iteration, self._finetuning, self._seed = config, 0, False, seed
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
         self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
         start_as_lqr(self._network, task, params)
         frame = self._network.spec.frame
-        self.critic = Critic(task, params, config.hidden, frame)
-        self.target = Critic(task, params, config.hidden, frame)
+        self.critic = Critic(task, params, config.hidden, frame, self._network.routes)
+        self.target = Critic(task, params, config.hidden, frame, self._network.routes)
         self.target.load_state_dict(self.critic.state_dict())
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), config.learning_rate, betas=(0.7, 0.95))
@@ -193,6 +202,8 @@ class Shac:
 
     def iterate(self) -> dict[str, float]:
         config = self.config
+        if self._network.routes is not None and self.iteration == 0 and not self._finetuning:
+            fit_routes(self._network.routes, self.task, self._batch.params, self._seed)
         rate = self._annealed(config.finetune_learning_rate if self._finetuning else config.learning_rate)
         self._policy_optimizer.param_groups[0]["lr"] = rate
         self._critic_optimizer.param_groups[0]["lr"] = self._annealed(config.learning_rate)
@@ -278,7 +289,9 @@ class Shac:
         cost = cost + config.failure_penalty * result.failure
         shaped = cost
         if config.margin_penalty:
-            for margin in task.one_way_margins(x, c) if config.one_way else task.margins(x, c):
+            routes = self._network.routes
+            sides = () if routes is None else routes(observation).detach().unbind(-1)
+            for margin in task.one_way_margins(x, c, sides) if config.one_way else task.margins(x, c):
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * task.control_dt * squared
