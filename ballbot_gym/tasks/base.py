@@ -183,6 +183,16 @@ class Task(ABC):
         """
         return None
 
+    def routed_path(self, x: np.ndarray, c: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
+        """A guessed path (steps+1, 2) on chosen sides of the obstacles, of tasks with a `routed_frame`.
+
+        Args:
+            x: (8,) initial state.
+            c: (nc,) constants.
+            sides: of every obstacle of the observation, repeated ones included: 1 to pass on its left, −1 on its right.
+        """
+        raise NotImplementedError(f"{self.id} has no routes")
+
     def without_obstacles(self, c: np.ndarray) -> np.ndarray:
         """(nc,) constants of the same episode with those obstacles out of its way."""
         return c

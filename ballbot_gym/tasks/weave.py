@@ -221,6 +221,10 @@ class Weave(Task):
         paths.sort(key=lambda path: np.hypot(*np.diff(path, axis=0).T).sum())
         return paths
 
+    def routed_path(self, x: np.ndarray, c: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
+        goal, obstacles = split_constants(c)
+        return self.side_path(x, goal, obstacles, sides[: len(obstacles)])
+
     def passed_obstacles(self, c: np.ndarray) -> np.ndarray:
         _, obstacles = split_constants(c)
         return obstacles + [0.0, 0.0, self.ball_radius]

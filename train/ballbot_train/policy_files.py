@@ -118,8 +118,8 @@ class PolicySpec:
         mirrors = tuple((tuple(signs), tuple(action)) for signs, action in described.get("mirrors", ()))
         if described.get("frame") not in (None, *FRAMES):
             raise ValueError(f"no frame {described['frame']!r}; known: {', '.join(FRAMES)}")
-        shapes = {name: tuple(units) for name, units in layers.items()}
-        return cls(**(dict(described) | shapes | {"mirrors": mirrors}))
+        fields: dict[str, Any] = {**described, "mirrors": mirrors}
+        return cls(**fields | {name: tuple(units) for name, units in layers.items()})
 
     @classmethod
     def of(cls, task: Task, **fields: Any) -> "PolicySpec":

@@ -344,7 +344,9 @@ class Dagger:
             PlanError: there is none.
         """
         config = self.config
-        find = functools.partial(find_optimum, self._task, self._params, x, c, guesses=config.max_guesses)
+        find = functools.partial(
+            find_optimum, self._task, self._params, x, c, guesses=config.max_guesses, paths=self._routed(x, c)
+        )
         if not config.backoff_price:
             return find(config.backoff), config.backoff
         found, kept = find(), Backoff()
@@ -362,6 +364,14 @@ class Dagger:
             if low == 1.0:
                 break
         return found, kept
+
+    def _routed(self, x: np.ndarray, c: np.ndarray) -> list[np.ndarray] | None:
+        """The path on the sides that the learner's routes choose, or None where it has none."""
+        if self.network.routes is None:
+            return None
+        with torch.no_grad():
+            sides = self.network.routes(torch.as_tensor(np.asarray(self._task.observe(x, c)), dtype=torch.float32))
+        return [self._task.routed_path(x, c, tuple(map(int, sides.tolist())))]
 
     def _track(
         self,

@@ -169,6 +169,7 @@ class Shac:
         self._random = torch.Generator().manual_seed(seed)
         self.config, self.iteration, self._finetuning, self._seed = config, 0, False, seed
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
+        self._own = task
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
         self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
         start_as_lqr(self._network, task, params)
@@ -203,7 +204,7 @@ class Shac:
     def iterate(self) -> dict[str, float]:
         config = self.config
         if self._network.routes is not None and self.iteration == 0 and not self._finetuning:
-            fit_routes(self._network.routes, self.task, self._batch.params, self._seed)
+            fit_routes(self._network.routes, self._own, self._batch.params, self._seed)
         rate = self._annealed(config.finetune_learning_rate if self._finetuning else config.learning_rate)
         self._policy_optimizer.param_groups[0]["lr"] = rate
         self._critic_optimizer.param_groups[0]["lr"] = self._annealed(config.learning_rate)
