@@ -118,8 +118,9 @@ class PolicySpec:
         mirrors = tuple((tuple(signs), tuple(action)) for signs, action in described.get("mirrors", ()))
         if described.get("frame") not in (None, *FRAMES):
             raise ValueError(f"no frame {described['frame']!r}; known: {', '.join(FRAMES)}")
-        fields: dict[str, Any] = {**described, "mirrors": mirrors}
-        return cls(**fields | {name: tuple(units) for name, units in layers.items()})
+        shapes = {name: tuple(units) for name, units in layers.items()}
+        fields: dict[str, Any] = {**described, **shapes, "mirrors": mirrors}
+        return cls(**fields)
 
     @classmethod
     def of(cls, task: Task, **fields: Any) -> "PolicySpec":
