@@ -91,14 +91,15 @@ class PolicyNetwork(torch.nn.Module):
 
     def raw(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 2) before it is squashed; with "tanh_in_frame" before it is clipped, which alone is left to do then."""
-        if self.routes is not None:
-            observation = self.routes.behind(observation)
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
-            features, back = self._frame.features(tuple(observation.tolist()))
+            seen = tuple(observation.tolist())
+            features, back = self._frame.features(seen if self.routes is None else seen + self.routes.alone(seen))
             output = self._in_frame(features, lambda values: torch.tensor(values, dtype=observation.dtype))
             forwards, sideways = output.tolist()
             return torch.tensor(back((forwards, sideways)), dtype=observation.dtype)
+        if self.routes is not None:
+            observation = self.routes.behind(observation)
         if self._frame is not None:
             features, back = self._frame.features(observation.unbind(-1))
             action = self._in_frame(features, lambda values: torch.stack(values, -1))

@@ -5,6 +5,7 @@ no optimum of a slalom is searched for this.
 """
 
 import itertools
+import math
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from ballbot_baselines import sides
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.console import console
 from ballbot_train.evaluation import fresh
 from ballbot_train.routes import Routes
@@ -67,53 +69,42 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
         Observations (episodes, no) at the start, and regrets (episodes, 2^n) in the order of the outputs of `Routes`. Where a
         repeated obstacle is passed on another side than before, there is no such choice, and the regret is 100.
     """
+    assert task.routed_frame is not None
     x, c = fresh.draw(task, range(episodes), seed, "training")
-    observations = np.asarray(task.observe(x, c))
-    obstacles = c[:, 2:].reshape(episodes, -1, 3)
-    numbers = obstacles.shape[1]
-    new = np.concatenate([np.ones((episodes, 1), bool), (np.diff(obstacles, axis=1) != 0).any(-1)], 1)
-    counts = new.sum(1)
-    distances = np.linspace(c[:, 0].min(), c[:, 0].max(), _DISTANCES)
-    motions = [_without_obstacles(task, params, x[0], c[0], distance) for distance in distances]
-    nearest = np.abs(c[:, :1] - distances).argmin(1)
+    goals = np.array([task.reference(*episode, params).x[-1, :2] for episode in zip(x, c, strict=True)])
+    distances = goals[:, 0] - x[:, 0]
+    known = np.argsort(distances)[np.linspace(0, episodes - 1, _DISTANCES).astype(int)]
+    motions = [find_optimum(task, params, x[i], task.without_obstacles(c[i]), guesses=1) for i in known]
+    nearest = np.abs(distances[:, None] - distances[known]).argmin(1)
+    across = x[:, [1, 3, 5, 7]] - np.pad(goals[:, 1:], ((0, 0), (0, 3)))
+    obstacles = [_passed(task, each) for each in c]
+    numbers = FRAMES[task.routed_frame].sides
     regrets = np.full((episodes, 2**numbers), 100.0)
     farther = np.array(list(itertools.product((1, -1), repeat=numbers)))
+    counts = np.array([len(each) for each in obstacles])
     for count in np.unique(counts):
-        rows = np.flatnonzero(counts == count)
-        own = obstacles[rows, :count]
-        paths = np.array([path for path, _ in motions])[nearest[rows]]
-        scale = c[rows, 0] / distances[nearest[rows]]
-        passed = np.abs(scale[:, None, None] * paths[:, :, None] - own[:, None, :, 0]).argmin(1)
-        y_goal = c[rows, 1]
-        reach = np.array([task.passed_obstacles(each)[:, 2] for each in c[rows]])
-        across = np.column_stack([x[rows, 1] - y_goal, x[rows, 3], x[rows, 5], x[rows, 7]])
-        seen = np.stack([own[..., 1] - y_goal[:, None], reach], -1)
-        costs = np.concatenate(
-            [
-                sides.predict_costs(task, params, *(part[k : k + 500] for part in (across, seen, passed)))
-                for k in range(0, len(rows), 500)
-            ]
-        )
-        base = np.array([cost for _, cost in motions])[nearest[rows]] * scale**2
-        relative = (costs - costs.min(1, keepdims=True)) / (base + costs.min(1))[:, None]
-        # from sides in the world to farther sides: the nearer one is on the left of an obstacle that lies below the line
-        nearer = np.where(seen[..., 0] < 0, 1, -1)
-        table = {tuple(side): k for k, side in enumerate(sides.choices(count).tolist())}
-        for column, choice in enumerate(farther):
-            if (choice[count:] != choice[count - 1]).any():
-                continue
-            picked = [table[tuple(side)] for side in (choice[:count] * nearer).tolist()]
-            regrets[rows, column] = relative[np.arange(len(rows)), picked]
-    return observations, regrets
+        choices = farther[(farther[:, count:] == farther[:, count - 1 : count]).all(1)]
+        columns = np.flatnonzero((farther[:, count:] == farther[:, count - 1 : count]).all(1))
+        row_of = {tuple(side): row for row, side in enumerate(sides.choices(count).tolist())}
+        of_count = np.flatnonzero(counts == count)
+        for rows in np.array_split(of_count, math.ceil(len(of_count) / _BATCH)):
+            own = np.array([obstacles[i] for i in rows])
+            own[..., 1] -= goals[rows, None, 1]
+            stretch = distances[rows] / distances[known][nearest[rows]]
+            along = stretch[:, None] * np.array([motions[k].trajectory.x[:, 0] for k in nearest[rows]])
+            passed = np.abs(along[:, :, None] - own[:, None, :, 0]).argmin(1)
+            costs = sides.predict_costs(task, params, across[rows], own[..., 1:], passed)
+            base = stretch**2 * np.array([motions[k].cost for k in nearest[rows]])
+            relative = (costs - costs.min(1, keepdims=True)) / (base + costs.min(1))[:, None]
+            nearer = np.where(own[..., 1] < 0, 1, -1)  # the left of an obstacle below the goal's line
+            for column, choice in zip(columns, choices, strict=True):
+                picked = [row_of[tuple(side)] for side in (choice[:count] * nearer).tolist()]
+                regrets[rows, column] = relative[np.arange(len(rows)), picked]
+    return np.asarray(task.observe(x, c)), regrets
 
 
-def _without_obstacles(
-    task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, distance: float
-) -> tuple[np.ndarray, float]:
-    """Positions along the way (steps + 1,) m, and the cost, of the optimum to a goal so far away, without obstacles."""
-    free = task.without_obstacles(c)
-    free[0] = distance
-    start = x.copy()
-    start[1] = free[1]
-    found = find_optimum(task, params, start, free, guesses=1)
-    return found.trajectory.x[:, 0], found.cost
+def _passed(task: Task, c: np.ndarray) -> np.ndarray:
+    """(n, 3) x, y and the distance to keep of the obstacles of an episode, m."""
+    obstacles = task.passed_obstacles(c)
+    assert obstacles is not None
+    return obstacles
