@@ -122,6 +122,10 @@ def test_every_function_of_every_task_is_what_python_computes(engine, tmp_path, 
         ("weave", {"activation": "silu", "mirrors": True}),
         ("weave", {"frame": "slalom"}),
         ("orbit", {"frame": "radial", "squash": "tanh_in_frame"}),
+        ("orbit", {"frame": "radial", "squash": "tanh_in_frame", "centred": True}),
+        ("orbit", {"frame": "radial", "squash": "clip", "centred": True}),
+        ("weave", {"frame": "fine_slalom", "centred": True}),
+        ("weave", {"frame": "routed_slalom", "routes": (8,)}),
     ],
 )
 def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(name, fields, tmp_path, rng):

@@ -124,9 +124,9 @@ def test_a_policy_with_routes_is_saved_whole_and_acts_alike_alone_and_in_a_batch
         np.testing.assert_allclose(controller.predict(seen)[0], action, atol=1e-6)
 
 
-def test_a_spec_with_routes_needs_a_frame_with_sides():
+def test_a_spec_with_routes_needs_a_frame_with_a_route():
     for fields in ({"frame": "slalom", "routes": (8,)}, {"frame": "routed_slalom"}):
-        with pytest.raises(ValueError, match="routes must be given for a frame with sides"):
+        with pytest.raises(ValueError, match="routes must be given for a frame with a route"):
             PolicySpec.of(TASK, **fields)
     with pytest.raises(ValueError, match="has no routes"):
         spec_for(make_task("stabilize"), "routes", (8,))

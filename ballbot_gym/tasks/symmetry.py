@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ballbot_gym import ops
+from ballbot_gym.ops import squared
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,19 @@ Back = Callable[[tuple[Any, Any]], tuple[Any, Any]]
 
 
 @dataclass(frozen=True)
+class Route:
+    """What a network needs that decides on which sides obstacles are passed."""
+
+    obstacles: int
+    """Number of obstacles n of an observation, repeated ones included."""
+    layout: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+    """Observation -> where the obstacles lie (3 n). It hardly changes while an episode goes on."""
+    sides: Callable[[tuple[Any, ...], tuple[Any, ...]], tuple[Any, ...]]
+    """Observation, and 1 or −1 for every obstacle that is passed on its nearer or farther side -> 1 or −1 for every obstacle
+    that is passed on its left or on its right."""
+
+
+@dataclass(frozen=True)
 class Frame:
     """A frame of reference that moves with the robot."""
 
@@ -47,11 +61,8 @@ class Frame:
     """Number of features."""
     features: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], Back]]
     """Observation, as a tuple of its entries -> features (size), and the way back for actions."""
-    sides: int = 0
-    """Number of entries behind the observation's that `features` takes: 1 or −1 for every obstacle that is passed on its left
-    or on its right, as `ballbot_train.routes` decides."""
-    layout: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
-    """Observation -> what a route sees of an episode. It hardly changes while the episode goes on."""
+    route: Route | None = None
+    """Where a route decides on which sides obstacles are passed. `features` then takes these sides behind the observation."""
     steady: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, Any]]] | None = None
     """Features -> features (size), and action in the frame, of the steady motion in which the episode shall end."""
 
@@ -167,7 +178,7 @@ def _routed_slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]
     return tuple(features), back
 
 
-def slalom_layout(observation: tuple[Any, ...]) -> tuple[Any, ...]:
+def _slalom_layout(observation: tuple[Any, ...]) -> tuple[Any, ...]:
     """Where Weave's obstacles lie as seen from the goal, the first of them on the left: 5 times x, y and radius as observed.
 
     It stays the same throughout an episode, but for rounding.
@@ -177,6 +188,22 @@ def slalom_layout(observation: tuple[Any, ...]) -> tuple[Any, ...]:
     side = ops.where(numbers[1] + y < 0, -1.0, 1.0)
     triples = zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True)
     return tuple(value for dx, dy, radius in triples for value in (dx + x, side * (dy + y), radius))
+
+
+def _slalom_sides(observation: tuple[Any, ...], farther: tuple[Any, ...]) -> tuple[Any, ...]:
+    """See `Route.sides`. The nearer side is that of the goal's line."""
+    layout = _slalom_layout(observation)
+    mirrored = ops.where(observation[9] + observation[1] < 0, -1.0, 1.0)
+    sides: list[Any] = []
+    before: tuple[Any, ...] | None = None
+    for (x, y, radius), way in zip(zip(layout[::3], layout[1::3], layout[2::3], strict=True), farther, strict=True):
+        side = mirrored * way * ops.where(y < 0, 1.0, -1.0)
+        if before is not None:  # unused numbers repeat the last obstacle, and so its side
+            off = squared(x - before[0], y - before[1], radius - before[2])
+            side = ops.where(off < 1e-9, sides[-1], side)
+        sides.append(side)
+        before = (x, y, radius)
+    return tuple(sides)
 
 
 def _ahead(
@@ -271,7 +298,7 @@ _BALL_RADIUS = 0.1  # m, about
 FRAMES: dict[str, Frame] = {
     "radial": Frame(18, _radial, steady=_steady_orbit),
     "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, steady=_rest_behind_obstacles),
-    "routed_slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _routed_slalom, sides=5, layout=slalom_layout),
+    "routed_slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _routed_slalom, route=Route(5, _slalom_layout, _slalom_sides)),
     "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, steady=_rest_behind_obstacles_fine),
     "fine_rest": Frame(14, _rest, steady=_rest_fine),
     "gate": Frame(13 + len(_SWITCHES), _gate),

@@ -59,7 +59,7 @@ class PolicySpec:
     frame: str | None = None
     """Name in `ballbot_gym.tasks.symmetry.FRAMES` of the frame in which the network sees and acts, or None."""
     routes: tuple[int, ...] = ()
-    """Units of the hidden layers of the network that decides on which sides obstacles are passed, for a frame with sides."""
+    """Units of the hidden layers of the network that decides on which sides obstacles are passed; for frames with a route."""
     centred: bool = False
     """Whether the action in the frame's steady motion is exactly the one that keeps it."""
     mirrors: Mirrors = ()
@@ -97,9 +97,9 @@ class PolicySpec:
                 raise ValueError(f"mirrors must hold signs of {self.observations} observations and 2 actions")
         if self.odd and self.activation != "tanh":
             raise ValueError(f"odd needs the activation tanh, not {self.activation}")
-        if bool(self.routes) != (self.frame in FRAMES and FRAMES[self.frame].sides > 0):
+        if bool(self.routes) != (self.frame in FRAMES and FRAMES[self.frame].route is not None):
             raise ValueError(
-                f"routes must be given for a frame with sides, and for no other, not for {self.frame!r:.200}"
+                f"routes must be given for a frame with a route, and for no other, not for {self.frame!r:.200}"
             )
         if self.centred and (self.frame not in FRAMES or FRAMES[self.frame].steady is None):
             raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")

@@ -27,7 +27,7 @@ class CriticInputs:
         observations: their number.
         products: of all pairs, squares included.
         frame: name in `FRAMES`, or None.
-        routes: of the actor, for a frame with sides.
+        routes: of the actor, for a frame with a route.
         """
         self._routes = routes
         self._frame = None if frame is None else FRAMES[frame]

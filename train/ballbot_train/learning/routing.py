@@ -4,7 +4,6 @@
 no optimum of a slalom is searched for this.
 """
 
-import itertools
 import math
 
 import numpy as np
@@ -17,7 +16,7 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.console import console
 from ballbot_train.evaluation import fresh
-from ballbot_train.routes import Routes
+from ballbot_train.routes import Routes, farther_choices
 
 EPISODES = 60_000
 _DISTANCES = 7  # for which the motion without obstacles is found
@@ -78,12 +77,12 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
     nearest = np.abs(distances[:, None] - distances[known]).argmin(1)
     across = x[:, [1, 3, 5, 7]] - np.pad(goals[:, 1:], ((0, 0), (0, 3)))
     obstacles = [_passed(task, each) for each in c]
-    numbers = FRAMES[task.routed_frame].sides
-    regrets = np.full((episodes, 2**numbers), 100.0)
-    farther = np.array(list(itertools.product((1, -1), repeat=numbers)))
+    route = FRAMES[task.routed_frame].route
+    assert route is not None
+    farther = np.array(farther_choices(route.obstacles), int)
+    regrets = np.full((episodes, len(farther)), 100.0)
     counts = np.array([len(each) for each in obstacles])
     for count in np.unique(counts):
-        choices = farther[(farther[:, count:] == farther[:, count - 1 : count]).all(1)]
         columns = np.flatnonzero((farther[:, count:] == farther[:, count - 1 : count]).all(1))
         row_of = {tuple(side): row for row, side in enumerate(sides.choices(count).tolist())}
         of_count = np.flatnonzero(counts == count)
@@ -97,8 +96,8 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
             base = stretch**2 * np.array([motions[k].cost for k in nearest[rows]])
             relative = (costs - costs.min(1, keepdims=True)) / (base + costs.min(1))[:, None]
             nearer = np.where(own[..., 1] < 0, 1, -1)  # the left of an obstacle below the goal's line
-            for column, choice in zip(columns, choices, strict=True):
-                picked = [row_of[tuple(side)] for side in (choice[:count] * nearer).tolist()]
+            for column in columns:
+                picked = [row_of[tuple(side)] for side in (farther[column, :count] * nearer).tolist()]
                 regrets[rows, column] = relative[np.arange(len(rows)), picked]
     return np.asarray(task.observe(x, c)), regrets
 

@@ -170,6 +170,8 @@ def _policy_data(path: Path, task: Task) -> dict[str, Any]:
         "squash": spec.squash,
         "mirrors": spec.mirrors,
         "frame": spec.frame,
+        "centred": spec.centred,
+        "routes": [_layer(weights, f"routes.mlp.{2 * i}") for i in range(len(spec.routes) + 1)] if spec.routes else [],
     }
 
 
@@ -236,8 +238,18 @@ def _task_script(name: str, task: Task, frame: str | None) -> tuple[str, str]:
         "goal": (task.goal, of_state),
     }
     if frame is not None:
-        seen = {"o": len(task.observation_scale)}
+        route, steady = FRAMES[frame].route, FRAMES[frame].steady
+        alone = {"o": len(task.observation_scale)}
+        seen = alone if route is None else {"o": alone["o"] + route.obstacles}
         features = FRAMES[frame].features
+        if route is not None:
+            functions["layout"] = (lambda o: route.layout(tuple(casadi.vertsplit(o))), alone)
+            functions["sides"] = (
+                lambda o, farther: route.sides(tuple(casadi.vertsplit(o)), tuple(casadi.vertsplit(farther))),
+                {**alone, "farther": route.obstacles},
+            )
+        if steady is not None:  # the features of the steady motion, and then the action
+            functions["steady"] = (lambda f: sum(steady(tuple(casadi.vertsplit(f))), ()), {"f": FRAMES[frame].size})
         functions["features"] = (lambda o: features(tuple(casadi.vertsplit(o)))[0], seen)
         functions["back"] = (
             lambda o, a: features(tuple(casadi.vertsplit(o)))[1]((a[0], a[1])),

@@ -22,6 +22,7 @@ class Policy {
     });
     this.layers = data.layers.map(layer);
     this.linear = data.linear === null ? null : layer(data.linear);
+    this.routes = data.routes.map(layer);
   }
 
   reset() {}
@@ -33,7 +34,10 @@ class Policy {
   }
 
   raw(observation) {
-    if (this.model.features) return this.model.back(observation, this.sum(this.model.features(observation)));
+    if (this.model.features) {
+      const seen = this.routes.length ? [...observation, ...this.sides(observation)] : observation;
+      return this.model.back(seen, this.inFrame(this.model.features(seen)));
+    }
     const total = this.sum(observation);
     for (const [signs, action] of this.data.mirrors) {
       const mirrored = this.sum(observation.map((value, i) => signs[i] * value));
@@ -42,16 +46,42 @@ class Policy {
     return total.map((value) => value / (1 + this.data.mirrors.length));
   }
 
-  sum(inputs) {
-    const activate = ACTIVATIONS[this.data.activation];
-    let values = inputs;
-    this.layers.forEach((layer, i) => {
-      values = affine(layer, values);
-      if (i < this.layers.length - 1) values = values.map(activate);
-    });
-    if (this.linear !== null) values = affine(this.linear, inputs).map((value, i) => value + values[i]);
-    return this.data.squash === "tanh_in_frame" ? values.map((value) => DATA.reach * Math.tanh(value)) : values;
+  /** The action in the frame; of a centred policy it is exact in the frame's steady motion. */
+  inFrame(features) {
+    let output = this.sum(features);
+    if (this.data.centred) {
+      const steady = this.model.steady(features);
+      const kept = this.sum(steady.slice(0, features.length));
+      const needed = steady.slice(features.length).map((action) => unsquashed(action, this.data.squash));
+      output = output.map((value, i) => value - kept[i] + needed[i]);
+    }
+    return this.data.squash === "tanh_in_frame" ? output.map((value) => DATA.reach * Math.tanh(value)) : output;
   }
+
+  /** On which side each obstacle is passed. The outputs belong to the choices of farther sides, the first to none. */
+  sides(observation) {
+    const outputs = network(this.routes, Math.tanh, this.model.layout(observation));
+    const best = outputs.indexOf(Math.max(...outputs));
+    const obstacles = Math.log2(outputs.length);
+    const farther = Array.from({ length: obstacles }, (_, i) => ((best >> (obstacles - 1 - i)) & 1 ? -1 : 1));
+    return this.model.sides(observation, farther);
+  }
+
+  sum(inputs) {
+    const values = network(this.layers, ACTIVATIONS[this.data.activation], inputs);
+    return this.linear === null ? values : affine(this.linear, inputs).map((value, i) => value + values[i]);
+  }
+}
+
+/** Layers with an activation between them. */
+function network(layers, activate, inputs) {
+  return layers.reduce((values, layer, i) => affine(layer, i === 0 ? values : values.map(activate)), inputs);
+}
+
+/** What a network has to give for an action, before it is squashed. */
+function unsquashed(action, squash) {
+  if (squash === "clip") return action;
+  return Math.atanh(Math.min(Math.max(action / (squash === "tanh_in_frame" ? DATA.reach : 1), -0.999), 0.999));
 }
 
 /** W v + b, with W in rows. */
