@@ -139,12 +139,21 @@ def test_a_fine_frame_shows_small_errors_of_rest(params, rng, name):
         assert abs(fine(off)[i]) == pytest.approx(0.5**0.5)
 
 
+def test_the_fine_gate_shows_leans_and_their_rates_in_units_of_the_tolerances():
+    task = TASKS["turn"]()
+    for state, tolerance in ((2, 0.17), (3, 0.17), (6, 1.0), (7, 1.0)):
+        at_gate = np.array([1.0, 0, 0, 0, 3, 0, 0, 0])
+        at_gate[state] = tolerance
+        fine = np.array(FRAMES[task.fine_frame].features(tuple(task.observe(at_gate, np.array([3.0]))))[0][-4:])
+        np.testing.assert_allclose(fine, 0.5**0.5 * (np.array([2, 3, 6, 7]) == state), atol=1e-6)
+
+
 def test_a_fine_frame_shows_what_the_task_or_its_frame_shows(params, rng):
-    for task in (TASKS["stabilize"](), TASKS["weave"]()):
+    for task, added in ((TASKS["stabilize"](), 6), (TASKS["weave"](), 6), (TASKS["turn"](), 4)):
         seen = tuple(task.observe(*task.sample(rng, params)))
         shown = seen if task.frame is None else FRAMES[task.frame].features(seen)[0]
         fine = FRAMES[task.fine_frame].features(seen)[0]
-        assert fine[:-6] == tuple(shown)
+        assert fine[:-added] == tuple(shown)
         assert len(fine) == FRAMES[task.fine_frame].size
 
 

@@ -283,6 +283,14 @@ def _gate(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     return (*observation, *steps, *fine), lambda action: action
 
 
+def _fine_gate(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
+    """As `_gate`, and then leans and lean rates in units of the gate's tolerances too."""
+    features, back = _gate(observation)
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot, _ = observation
+    errors = ((gamma, 0.17), (theta, 0.17), (gamma_dot, 1.0 / 5), (theta_dot, 1.0 / 5))
+    return (*features, *(_fine(*error) for error in errors)), back
+
+
 def _fine(error: Any, tolerance: float) -> Any:
     """An error in which what is small beside the tolerance shows, and what is large is ±1."""
     return error / ops.sqrt(error * error + tolerance * tolerance)
@@ -302,5 +310,6 @@ FRAMES: dict[str, Frame] = {
     "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, steady=_rest_behind_obstacles_fine),
     "fine_rest": Frame(14, _rest, steady=_rest_fine),
     "gate": Frame(13 + len(_SWITCHES), _gate),
+    "fine_gate": Frame(17 + len(_SWITCHES), _fine_gate),
 }
 """Every frame by the name that tasks and policy files give."""

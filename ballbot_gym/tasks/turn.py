@@ -88,6 +88,7 @@ class Turn(Task):
 
     id = "BallbotTurn-v0"
     frame = "gate"
+    fine_frame = "fine_gate"
     observation_scale = (5.0, 5.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 5.0)
     constant_names = ("speed",)
     constant_draws = 1
