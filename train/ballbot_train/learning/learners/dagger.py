@@ -163,10 +163,11 @@ TUNED: dict[str, DaggerConfig] = {
         backoff=Backoff(force=0.06, grip=EXECUTED.grip),  # plans at the force limit leave no force for corrections
     ),
     "weave": DaggerConfig(
-        total_iterations=180,
-        gathering_iterations=140,
-        evaluations=9,
+        total_iterations=250,
+        gathering_iterations=200,
+        evaluations=10,
         episodes_per_iteration=6,
+        candidate_episodes=512,
         max_guesses=3,
         tracked_rollouts_per_plan=4,
         max_rollout_seconds=3.0,
@@ -174,7 +175,7 @@ TUNED: dict[str, DaggerConfig] = {
         label_seconds=5.0,
         gradient_steps=300,
         hidden=(256, 256),
-        symmetry="frame",
+        symmetry="routes",
         backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip),
     ),
 }

@@ -97,7 +97,7 @@ TUNED: dict[str, PpoConfig] = {
     ),
     "orbit": replace(
         _BULK,
-        symmetry="frame",
+        symmetry="centred",
         rl_iterations=600,
         gamma=0.99,
         relative_advantages=1.0,
