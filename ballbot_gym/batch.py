@@ -115,6 +115,33 @@ class BatchStep(NamedTuple):
     where friction is unlimited. It carries no gradient."""
 
 
+class StepInfo(NamedTuple):
+    """What an info says of B environments, in NumPy arrays: of the step, or of the start of an episode."""
+
+    x: np.ndarray
+    """(8, B) states."""
+    cost: np.ndarray
+    """(B,) float64, of the step."""
+    reward_parts: np.ndarray
+    """(3, B) float64, `env.REWARD_PARTS`; their sum is the reward."""
+    tilt: np.ndarray
+    """(B,) rad."""
+    force: np.ndarray
+    """(2, B) N."""
+    success: np.ndarray
+    """(B,) bool."""
+    failure: np.ndarray
+    """(B,) bool."""
+    violated: np.ndarray
+    """(B,) int64, as of `BatchStep`, where `failure` holds."""
+    clipped: np.ndarray
+    """(B,) bool."""
+    c: np.ndarray
+    """(nc, B) constants."""
+    grip: np.ndarray
+    """(4, B), as of `BatchStep`; (0, B) where friction is unlimited."""
+
+
 class BatchEpisodes(NamedTuple):
     """One episode of each of B environments."""
 

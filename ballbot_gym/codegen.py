@@ -70,7 +70,7 @@ _TRUTH = {casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, *_LOGIC}
 
 
 def source(task: Task, params: BallbotParams, double: bool) -> str:
-    """The C code of a task and a robot, with the functions `step`, `start` and `observe`; see `native` for what they do.
+    """The C code of a task and a robot, with the functions `step`, `help`, `start` and `observe` of native.c.
 
     Args:
         task: the task.
@@ -99,6 +99,8 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
         "SEEN": len(task.observation_scale),
         "GRIP": 4 if params.grips else 0,
         "FLAGS": len(FLAGS),
+        "SURVIVAL_REWARD": float(task.survival_reward * task.control_dt),  # per step
+        "FIRST_EXIT": int(task.first_exit),
         "CONSTANT_DRAWS": task.constant_draws,
         "DRAWS": task.constant_draws + task.state_draws,
     }

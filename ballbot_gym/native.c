@@ -2,6 +2,9 @@
 
    Row i of a pointer p, one number per robot, is at p + i * sp: rows are those of a whole batch, or of a block of LANES robots. */
 
+#include <sched.h>
+#include <string.h>
+
 /* states, constants, actions and numbers of steps taken -> next states, forces, grip, rewards and costs, flags, violated limit */
 static void advance(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict a, int64_t sa,
                     const real *restrict t, int64_t st, real *restrict end, int64_t send, real *restrict force, int64_t sforce,
@@ -35,48 +38,10 @@ static void rows_copy(int rows, int64_t count, const real *from, int64_t sfrom, 
             to[i * sto + k] = from[i * sfrom + k];
 }
 
-/* One control step of the robots first to last - 1 of a batch of B, and what they see then. first is a multiple of LANES. */
-void step(int64_t B, int64_t first, int64_t last, const real *x, const real *c, const real *action, const int64_t *steps,
-          real *end, real *seen, real *tilt, real *force, real *grip, double *pay, uint8_t *flags, int64_t *violated) {
-    for (int64_t n = first; n < last; n += LANES) {
-        const int64_t count = last - n < LANES ? last - n : LANES;
-        real taken[LANES], paid[2 * LANES], marks[FLAGS * LANES], limit[LANES];
-        for (int k = 0; k < LANES; ++k)
-            taken[k] = (real)(k < count ? steps[n + k] : 0);
-        if (count == LANES) {
-            advance(x + n, B, c + n, B, action + n, B, taken, LANES,
-                    end + n, B, force + n, B, grip + n, B, paid, LANES, marks, LANES, limit, LANES);
-            look(end + n, B, c + n, B, seen + n, B, tilt + n, B);
-        } else {
-            real in[(10 + CONSTANTS) * LANES] = {0}, out[(11 + GRIP + SEEN) * LANES];
-            real *const cs = in + 8 * LANES, *const as = cs + CONSTANTS * LANES;
-            real *const fs = out + 8 * LANES, *const gs = fs + 2 * LANES, *const ss = gs + GRIP * LANES;
-            real *const ts = ss + SEEN * LANES;
-            rows_copy(8, count, x + n, B, in, LANES);
-            rows_copy(CONSTANTS, count, c + n, B, cs, LANES);
-            rows_copy(2, count, action + n, B, as, LANES);
-            advance(in, LANES, cs, LANES, as, LANES, taken, LANES,
-                    out, LANES, fs, LANES, gs, LANES, paid, LANES, marks, LANES, limit, LANES);
-            look(out, LANES, cs, LANES, ss, LANES, ts, LANES);
-            rows_copy(8, count, out, LANES, end + n, B);
-            rows_copy(2, count, fs, LANES, force + n, B);
-            rows_copy(GRIP, count, gs, LANES, grip + n, B);
-            rows_copy(SEEN, count, ss, LANES, seen + n, B);
-            rows_copy(1, count, ts, LANES, tilt + n, B);
-        }
-        for (int i = 0; i < 2; ++i)
-            for (int64_t k = 0; k < count; ++k)
-                pay[i * B + n + k] = paid[i * LANES + k];
-        for (int i = 0; i < FLAGS; ++i)
-            for (int64_t k = 0; k < count; ++k)
-                flags[i * B + n + k] = (uint8_t)(marks[i * LANES + k] != 0);
-        for (int64_t k = 0; k < count; ++k)
-            violated[n + k] = (int64_t)limit[k];
-    }
-}
+/* Functions that others here call are static, lest the linker takes another library's of the same name. */
 
 /* Starts episodes in the count robots that which lists: states, and constants unless they are given. */
-void start(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
+static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
            real *x, real *c) {
     for (int64_t m = 0; m < count; m += LANES) {
         real z[AT_LEAST_1(DRAWS) * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, xs[8 * LANES];
@@ -102,7 +67,7 @@ void start(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, 
 }
 
 /* What the count robots that which lists see, and their tilts. */
-void observe(int64_t B, int64_t count, const int64_t *which, const real *x, const real *c, real *seen, real *tilt) {
+static void look_at(int64_t B, int64_t count, const int64_t *which, const real *x, const real *c, real *seen, real *tilt) {
     for (int64_t m = 0; m < count; m += LANES) {
         real xs[8 * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, ss[SEEN * LANES], ts[LANES];
         for (int k = 0; k < LANES && m + k < count; ++k) {
@@ -118,4 +83,150 @@ void observe(int64_t B, int64_t count, const int64_t *which, const real *x, cons
             tilt[which[m + k]] = ts[k];
         }
     }
+}
+
+/* Robots that a thread takes at once. */
+enum { CHUNK = 32 * LANES };
+
+/* Rows of what is told of a robot: state, tilt, force, the floor's grip. */
+enum { TILT = 8, FORCE = 9, GRIPPED = 11, TOLD = 11 + GRIP };
+
+/* Rows of flags, after those of codegen.FLAGS; and of pay. */
+enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
+enum { REWARD, COST, SURVIVE, RUNNING, GOAL };
+
+/* What a step reads and writes, in the order of native._Memory. The memory is that of rows of B numbers. */
+typedef struct {
+    int64_t taken, done; /* robots that threads have taken, and finished */
+    int64_t B;
+    const real *x, *c, *action;
+    const int64_t *steps, *episode, *seed;
+    const uint8_t *idle;  /* whose action is ignored, and whose next episode begins; null where there are none */
+    real *told, *seen;    /* TOLD and SEEN rows */
+    double *pay;          /* 5 rows */
+    uint8_t *flags;       /* 6 rows */
+    int64_t *violated, *new_steps;
+    int64_t *new_episode; /* these two are null where no episodes begin, */
+    real *new_c;
+    real *end_told;       /* and these four where ended episodes stay as they are. TOLD rows, */
+    double *end_pay;      /* COST to GOAL, */
+    uint8_t *end_flags;   /* SUCCESS to CLIPPED, */
+    float *end_seen;      /* and a row for each robot, of which those that end are written. */
+} Memory;
+
+/* One control step of robots n to n + count - 1, at most LANES, and what they see then; no episode begins. */
+static void step_block(const Memory *m, int64_t n, int64_t count) {
+    const int64_t B = m->B;
+    real *const told = m->told + n;
+    real taken[LANES], paid[2 * LANES], marks[FLAGS * LANES], limit[LANES];
+    for (int k = 0; k < LANES; ++k)
+        taken[k] = (real)(k < count ? m->steps[n + k] : 0);
+    if (count == LANES) {
+        advance(m->x + n, B, m->c + n, B, m->action + n, B, taken, LANES, told, B, told + FORCE * B, B,
+                told + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
+        look(told, B, m->c + n, B, m->seen + n, B, told + TILT * B, B);
+    } else {
+        real in[(10 + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
+        real *const cs = in + 8 * LANES, *const as = cs + CONSTANTS * LANES, *const ss = out + TOLD * LANES;
+        rows_copy(8, count, m->x + n, B, in, LANES);
+        rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
+        rows_copy(2, count, m->action + n, B, as, LANES);
+        advance(in, LANES, cs, LANES, as, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
+                out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
+        look(out, LANES, cs, LANES, ss, LANES, out + TILT * LANES, LANES);
+        rows_copy(TOLD, count, out, LANES, told, B);
+        rows_copy(SEEN, count, ss, LANES, m->seen + n, B);
+    }
+    for (int64_t k = 0; k < count; ++k) {
+        const double reward = paid[k], cost = paid[LANES + k];
+        /* the cost has a failure's price too, and the reward has not */
+        const double running = limit[k] >= 0 ? reward - SURVIVAL_REWARD : -cost;
+        const double goal = FIRST_EXIT && marks[SUCCESS * LANES + k] != 0 ? reward - SURVIVAL_REWARD - running : 0;
+        double *const pay = m->pay + n + k;
+        pay[REWARD * B] = reward;
+        pay[COST * B] = cost;
+        pay[SURVIVE * B] = SURVIVAL_REWARD;
+        pay[RUNNING * B] = running;
+        pay[GOAL * B] = goal;
+        m->violated[n + k] = (int64_t)limit[k];
+        m->new_steps[n + k] = m->steps[n + k] + 1;
+    }
+    for (int i = 0; i < FLAGS; ++i)
+        for (int64_t k = 0; k < count; ++k)
+            m->flags[i * B + n + k] = (uint8_t)(marks[i * LANES + k] != 0);
+    for (int64_t k = 0; k < count; ++k)
+        m->flags[DONE * B + n + k] = m->flags[TERMINATED * B + n + k] | m->flags[TRUNCATED * B + n + k];
+}
+
+/* Robot n of rows of numbers becomes 0. */
+#define CLEAR(rows, pointer) for (int i = 0; i < (rows); ++i) (pointer)[i * B + n] = 0
+
+/* The step of the robots first to last - 1, and the starts of their next episodes. */
+static void step_chunk(const Memory *m, int64_t first, int64_t last) {
+    const int64_t B = m->B, size = last - first;
+    int64_t begun[CHUNK], count = 0;
+    for (int64_t n = first; n < last; n += LANES)
+        step_block(m, n, last - n < LANES ? last - n : LANES);
+    if (!m->new_episode)
+        return;
+    rows_copy(CONSTANTS, size, m->c + first, B, m->new_c + first, B);
+    memcpy(m->new_episode + first, m->episode + first, size * sizeof *m->episode);
+    if (m->end_told) {
+        rows_copy(TOLD, size, m->told + first, B, m->end_told + first, B);
+        for (int i = COST; i <= GOAL; ++i)
+            memcpy(m->end_pay + (i - COST) * B + first, m->pay + i * B + first, size * sizeof *m->pay);
+        for (int i = SUCCESS; i <= CLIPPED; ++i)
+            memcpy(m->end_flags + (i - SUCCESS) * B + first, m->flags + i * B + first, size);
+    }
+    for (int64_t n = first; n < last; ++n) {
+        if (m->idle && m->idle[n]) {
+            CLEAR(GOAL + 1, m->pay);
+            CLEAR(DONE + 1, m->flags);
+            m->violated[n] = -1;
+        } else if (m->end_told && m->flags[DONE * B + n]) {
+            for (int i = 0; i < SEEN; ++i)
+                m->end_seen[n * SEEN + i] = (float)m->seen[i * B + n];
+            CLEAR(4, m->pay + COST * B);
+            CLEAR(3, m->flags + SUCCESS * B);
+        } else {
+            continue;
+        }
+        CLEAR(TOLD - FORCE, m->told + FORCE * B);
+        m->new_steps[n] = 0;
+        m->new_episode[n] += 1;
+        begun[count++] = n;
+    }
+    begin(B, count, begun, m->seed, m->new_episode, 0, m->told, m->new_c);
+    look_at(B, count, begun, m->told, m->new_c, m->seen, m->told + TILT * B);
+}
+
+/* Takes chunks of the batch and does their steps, until none is left. */
+static void take_chunks(Memory *m) {
+    for (;;) {
+        const int64_t first = __atomic_fetch_add(&m->taken, CHUNK, __ATOMIC_RELAXED);
+        if (first >= m->B)
+            return;
+        const int64_t last = first + CHUNK < m->B ? first + CHUNK : m->B;
+        step_chunk(m, first, last);
+        __atomic_fetch_add(&m->done, last - first, __ATOMIC_RELEASE);
+    }
+}
+
+/* One control step of a batch. */
+void step(Memory *m) {
+    take_chunks(m);
+    while (__atomic_load_n(&m->done, __ATOMIC_ACQUIRE) < m->B) /* other threads finish their last chunks */
+        sched_yield();
+}
+
+/* Helps with a step that another thread does, or does nothing if that is over. */
+void help(Memory *m) { take_chunks(m); }
+
+void start(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
+           real *x, real *c) {
+    begin(B, count, which, seed, episode, given, x, c);
+}
+
+void observe(int64_t B, int64_t count, const int64_t *which, const real *x, const real *c, real *seen, real *tilt) {
+    look_at(B, count, which, x, c, seen, tilt);
 }

@@ -6,25 +6,24 @@ bit-identical wherever an env stands in whatever batch.
 """
 
 import ctypes
-import itertools
-import math
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.batch import BatchState, BatchStep, check_num_envs, seeds_of
+from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_num_envs, seeds_of
 from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
 
-_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
+_COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
 """Number of envs from which threads share the work. Waking them takes as long as a thousand steps."""
 
@@ -41,6 +40,7 @@ class _Code(NamedTuple):
     """The functions of a library; `codegen` has them."""
 
     step: Callable[..., None]
+    help: Callable[..., None]
     start: Callable[..., None]
     observe: Callable[..., None]
 
@@ -80,6 +80,8 @@ class BallbotNative:
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
+        self._told = 11 + (4 if params.grips else 0)
+        self._seen_rows = len(task.observation_scale)
 
     @property
     def state(self) -> State:
@@ -146,48 +148,59 @@ class BallbotNative:
 
         `final_observation` has the rows of ended episodes alone.
         """
+        return self.step_with_infos(actions, waiting, restart)[0]
+
+    def step_with_infos(
+        self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
+    ) -> tuple[BatchStep, StepInfo, StepInfo]:
+        """The same, with what infos say of the envs now, and of the step even where its end began a new episode.
+
+        Without restart, both are the same.
+        """
         old = self.state
         if old is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
-        x, seen, tilt, force, grip, pay, flags, violated = self._advance(old, actions)
-        new = old._replace(x=x, steps=old.steps + 1)
-        terminated, truncated, success, failure, clipped = flags
-        reward, cost = pay
-        final_x, final_tilt = x, tilt
-        idle = None if waiting is None else np.flatnonzero(waiting)
-        if idle is not None:
-            pay[:, idle] = 0.0
-            flags[:, idle] = False
-            violated[idle], force[:, idle], grip[:, idle] = -1, 0.0, 0.0
-        ended = (terminated | truncated).nonzero()[0]
-        final_seen = np.ascontiguousarray(seen.take(ended, 1).T, np.float32)
-        begin = ended if restart else idle
-        if begin is not None and begin.size:
-            if restart:
-                new, tilt = new._replace(x=x.copy()), tilt.copy()
-            new = new._replace(c=new.c.copy(), episode=new.episode.copy())
-            new.episode[begin] += 1
-            self._start(begin, new)
-            self._look(begin, new, seen, tilt)
-        self._state = new
+        size, new = self.num_envs, np.empty
+        told, seen = new((self._told, size), self.dtype), new((self._seen_rows, size), self.dtype)
+        pay, flags = new((5, size)), new((len(codegen.FLAGS) + 1, size), np.bool_)
+        violated, steps, episode, c = new(size, np.int64), new(size, np.int64), old.episode, old.c
+        end_told, end_pay, end_flags, end_seen = told, pay[1:], flags[2:5], None
+        made = ()
+        if restart or waiting is not None:
+            episode, c = new(size, np.int64), new(old.c.shape, self.dtype)
+            made = (episode, c)
+        if restart:
+            end_told, end_pay = new((self._told, size), self.dtype), new((4, size))
+            end_flags, end_seen = new((3, size), np.bool_), new((size, self._seen_rows), np.float32)
+            made = (*made, end_told, end_pay, end_flags, end_seen)
+        idle = () if waiting is None else (waiting,)
+        read = _pointers(old.x, old.c, actions.T, old.steps, old.episode, old.seed, *idle)
+        if not idle:
+            read.append(0)
+        self._run(_Memory(0, 0, size, *read, *_pointers(told, seen, pay, flags, violated, steps, *made)))
+        self._state = old._replace(x=told[:8], c=c, steps=steps, episode=episode)
+        observation = seen.astype(np.float32, copy=False).T
+        terminated, truncated, _, _, _, done = flags
+        now = _info(told, pay[1:], flags[2:5], violated, c)
+        end = _info(end_told, end_pay, end_flags, violated, old.c) if restart else now
         fields: Any = {
-            "observation": seen.astype(np.float32, copy=False).T,
-            "reward": reward,
-            "cost": cost,
+            "observation": observation,
+            "reward": pay[0],
+            "cost": end.cost,
             "terminated": terminated,
             "truncated": truncated,
-            "final_observation": final_seen,
-            "final_x": final_x,
-            "success": success,
-            "failure": failure,
+            "final_observation": (observation if end_seen is None else end_seen)[done],
+            "final_x": end.x,
+            "success": end.success,
+            "failure": end.failure,
             "violated": violated,
-            "force": force,
-            "clipped": clipped,
-            "final_tilt": final_tilt,
-            "tilt": tilt,
-            "grip": grip,
+            "force": end.force,
+            "clipped": end.clipped,
+            "final_tilt": end.tilt,
+            "tilt": now.tilt,
+            "grip": end.grip,
         }
-        return BatchStep(**fields)
+        return BatchStep(**fields), now, end
 
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""
@@ -215,37 +228,40 @@ class BallbotNative:
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and (B,) their tilts."""
-        seen = np.empty((len(self.task.observation_scale), self.num_envs), self.dtype)
+        seen = np.empty((self._seen_rows, self.num_envs), self.dtype)
         tilt = np.empty(self.num_envs, self.dtype)
         self._look(self._all, state, seen, tilt)
         return seen, tilt
 
-    def _advance(self, state: State, actions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """One control step of every env, with nothing started anew.
+    def _run(self, memory: "_Memory") -> None:
+        """A step, by several threads where that is faster."""
+        if self.num_envs >= _PARALLEL_FROM:
+            for jobs in _helpers(self.threads - 1):
+                if jobs.empty():  # else a helper is late, and need not be told twice
+                    jobs.put((self._code.help, memory))
+        self._code.step(memory)
 
-        Returns:
-            States (8, B), observations (no, B), tilts (B,), forces (2, B), grip (4 or 0, B); rewards and costs (2, B) in
-            float64, `codegen.FLAGS` (5, B), and violated (B,) as of `BatchStep`.
-        """
-        size, dtype = self.num_envs, self.dtype
-        rows = (8, len(self.task.observation_scale), 1, 2, 4 if self.params.grips else 0)
-        made = [np.empty((count, size), dtype) for count in rows]
-        made += [np.empty((2, size)), np.empty((len(codegen.FLAGS), size), np.bool_), np.empty(size, np.int64)]
-        pointers = _pointers(state.x, state.c, actions.T, state.steps, *made)
-        made[2] = made[2][0]
-        if size < _PARALLEL_FROM or self.threads == 1:
-            self._code.step(size, 0, size, *pointers)
-        else:
-            blocks = math.ceil(size / codegen.LANES)
-            bounds = [min(size, blocks * i // self.threads * codegen.LANES) for i in range(self.threads + 1)]
-            others = [
-                _pool().submit(self._code.step, size, first, last, *pointers)
-                for first, last in itertools.pairwise(bounds[1:])
-            ]
-            self._code.step(size, 0, bounds[1], *pointers)
-            for other in others:
-                other.result()
-        return tuple(made)
+
+class _Memory(ctypes.Structure):
+    """What a step reads and writes; native.c says what each is."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("taken", "done", "size")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in (
+                "x", "c", "action", "steps", "episode", "seed", "idle",
+                "told", "seen", "pay", "flags", "violated", "new_steps",
+                "new_episode", "new_c", "end_told", "end_pay", "end_flags", "end_seen",
+            )
+        ),
+    )  # fmt: skip
+
+
+def _info(told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray, c: np.ndarray) -> StepInfo:
+    """Rows that native.c has written, as an info names them."""
+    success, failure, clipped = flags
+    return StepInfo(told[:8], pay[0], pay[1:], told[8], told[9:11], success, failure, violated, clipped, c, told[11:])
 
 
 def _pointers(*arrays: np.ndarray) -> list[int]:
@@ -300,12 +316,14 @@ def _code(task: Task, params: BallbotParams, double: bool) -> _Code:
     except Exception as error:  # whatever code of users raises that meets CasADi's symbols
         raise NativeUnavailableError(f"{task.id} cannot be traced: {type(error).__name__}: {error}") from error
     try:
-        library = ctypes.CDLL(str(machine_code.library(type(task).__name__.lower(), source, _FLAGS)))
+        library = ctypes.CDLL(str(machine_code.library(type(task).__name__.lower(), source, _COMPILER_FLAGS)))
     except (OSError, machine_code.NoMachineCodeError) as error:
         raise NativeUnavailableError(str(error) or "there is no C compiler that works") from error
     count, pointer = ctypes.c_int64, ctypes.c_void_p
+    memory = ctypes.POINTER(_Memory)
     signatures = {
-        "step": [count] * 3 + [pointer] * 12,
+        "step": [memory],
+        "help": [memory],
         "start": [count] * 2 + [pointer] * 3 + [ctypes.c_int] + [pointer] * 2,
         "observe": [count] * 2 + [pointer] * 5,
     }
@@ -316,9 +334,19 @@ def _code(task: Task, params: BallbotParams, double: bool) -> _Code:
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="ballbot")
+def _helpers(count: int) -> tuple["SimpleQueue[Any]", ...]:
+    """The queues of so many threads, which call functions with an argument."""
+    queues = tuple(SimpleQueue() for _ in range(count))
+    for jobs in queues:
+        Thread(target=_help, args=(jobs,), name="ballbot", daemon=True).start()
+    return queues
+
+
+def _help(jobs: "SimpleQueue[Any]") -> None:
+    while True:
+        function, argument = jobs.get()
+        function(argument)
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child does not have the threads
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a child does not have the threads

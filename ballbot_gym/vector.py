@@ -38,7 +38,7 @@ except ImportError as error:
         'gymnasium.make_vec(..., vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, tilt_of
+from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, tilt_of
 from ballbot_gym.loop import BallbotLoop
 
 if TYPE_CHECKING:
@@ -217,19 +217,15 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             observation = self.batch.observe(state)
             tilt: Any = tilt_of(state.x.unbind(0)) if isinstance(self.batch, BallbotBatch) else self.batch.tilt(state)
         self._ended = self._ended & ~mask
-        size = self.num_envs
-        infos = self._info(
-            *self._x_and_c(),
-            np.zeros(size),
-            np.zeros((3, size)),
-            self._array(tilt).astype(self._dtype, copy=False),
-            np.zeros((size, 2), self._dtype),
-            np.zeros(size, bool),
-            np.full(size, -1),
-            np.zeros(size, bool),
-            mask,
-            np.zeros((size, 4), self._dtype) if self.params.grips else None,
+        size, (x_now, c_now) = self.num_envs, self._x_and_c()
+        tilt = self._array(tilt).astype(self._dtype, copy=False)
+        force, grip = np.zeros((2, size), self._dtype), np.zeros((4 * self.params.grips, size), self._dtype)
+        success, failure, clipped = np.zeros((3, size), bool)
+        none = np.full(size, -1)
+        now = StepInfo(
+            x_now, np.zeros(size), np.zeros((3, size)), tilt, force, success, failure, none, clipped, c_now, grip
         )
+        infos = self._info(now, mask)
         return self._array(observation, np.float32), infos
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -258,40 +254,18 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 'options={"reset_mask": mask}'
             )
         restart = self.autoreset_mode is AutoresetMode.SAME_STEP
-        constants = self._x_and_c()[1] if restart else None
-        result = self._advance(actions, waiting, restart)
-        reward, cost, terminated, truncated = result.reward, result.cost, result.terminated, result.truncated
-        success, violated, force, clipped = result.success, result.violated, result.force.T, result.clipped
-        grip = result.grip.T if self.params.grips else None
-        done = terminated | truncated
-        ended = done.nonzero()[0]
-        parts = np.empty((3, self.num_envs))
-        parts[0], parts[2] = self._survive, 0.0
-        np.negative(cost, out=parts[1])
+        result, now, end = self._advance(actions, waiting, restart)
+        done = result.terminated | result.truncated
         infos: dict[str, Any] = {}
-        if waiting is not None:
-            parts[:, waiting] = 0.0
-        if ended.size:
-            failed = np.flatnonzero(violated >= 0)
-            parts[1, failed] = reward[failed] - self._survive  # the cost has a failure's price too
-            if self.task.first_exit:
-                parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * success[ended]
-        if constants is None:
+        if not restart:
             self._ended = done
-        elif ended.size:
-            end = (cost, parts, result.final_tilt, force, success, violated, clipped)
-            infos["final_info"] = self._info(result.final_x, constants, *end, done, grip)
-            infos["final_obs"] = _some_rows(result.final_observation, ended, self.num_envs)
+        elif np.count_nonzero(done):
+            infos["final_info"] = self._info(end, done)
+            infos["final_obs"] = _some_rows(result.final_observation, done)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
-            cost, parts, force, grip = (_without(part, ended) for part in (cost, parts, force.T, result.grip))
-            force, grip = force.T, grip.T if self.params.grips else None
-            clipped, success, violated = clipped & ~done, success & ~done, violated.copy()
-            violated[ended] = -1
-        infos |= self._info(
-            *self._x_and_c(), cost, parts, result.tilt, force, success, violated, clipped, self._everywhere, grip
-        )
-        return result.observation, reward, terminated, truncated, infos
+        infos |= self._info(now, self._everywhere)
+        return result.observation, result.reward, result.terminated, result.truncated, infos
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every env: of this object, or "episode_params", the robot of the running episode."""
@@ -380,16 +354,53 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """The array as the batch takes it."""
         return torch.from_numpy(array).to(self.batch.device) if isinstance(self.batch, BallbotBatch) else array
 
-    def _advance(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> Any:
-        """`_advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone."""
-        if not isinstance(self.batch, BallbotBatch):
-            return self.batch.step(actions, waiting, restart)
-        with torch.no_grad():
-            result = _advance(self.batch, self._to_batch(actions), waiting, restart)
-        arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
-        result = result._replace(**arrays)
-        ended: Any = result.terminated | result.truncated
-        return result._replace(final_observation=result.final_observation[ended])
+    def _advance(
+        self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
+    ) -> tuple[Any, StepInfo, StepInfo]:
+        """`_advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone.
+
+        Returns:
+            The step, and what infos say of the envs now, and of the step even where its end began a new episode.
+        """
+        if not isinstance(self.batch, BallbotBatch | BallbotLoop):
+            return self.batch.step_with_infos(actions, waiting, restart)
+        constants = self._x_and_c()[1]
+        if isinstance(self.batch, BallbotLoop):
+            result: Any = self.batch.step(actions, waiting, restart)
+        else:
+            with torch.no_grad():
+                result = _advance(self.batch, self._to_batch(actions), waiting, restart)
+            arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
+            result = result._replace(**arrays)
+            ended: Any = result.terminated | result.truncated
+            result = result._replace(final_observation=result.final_observation[ended])
+        return result, *self._step_infos(result, constants, waiting, restart)
+
+    def _step_infos(
+        self, result: Any, constants: np.ndarray, waiting: np.ndarray | None, restart: bool
+    ) -> tuple[StepInfo, StepInfo]:
+        """What infos say of the envs now, and of a step, before which they had those constants (nc, B)."""
+        reward, cost, success, violated = result.reward, result.cost, result.success, result.violated
+        ended = (result.terminated | result.truncated).nonzero()[0]
+        parts = np.empty((3, self.num_envs))
+        parts[0], parts[2] = self._survive, 0.0
+        np.negative(cost, out=parts[1])
+        if waiting is not None:
+            parts[:, waiting] = 0.0
+        if ended.size:
+            failed = np.flatnonzero(violated >= 0)
+            parts[1, failed] = reward[failed] - self._survive  # the cost has a failure's price too
+            if self.task.first_exit:
+                parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * success[ended]
+        x, c = self._x_and_c()
+        flags = success, violated >= 0, violated, result.clipped
+        now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip)
+        if not (restart and ended.size):
+            return now, now
+        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants)
+        # Where an episode ended, the info of now is that of the next episode's start, as after `reset`.
+        cleared = ("cost", "reward_parts", "force", "success", "failure", "clipped", "grip")
+        return now._replace(**{name: _without(getattr(now, name), ended) for name in cleared}), end
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
         """(8, B) states and (nc, B) constants."""
@@ -405,38 +416,25 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         array = part if isinstance(part, np.ndarray) else part.cpu().numpy()
         return array if dtype is None else array.astype(dtype, copy=False)
 
-    def _info(
-        self,
-        x: np.ndarray,
-        c: np.ndarray,
-        cost: np.ndarray,
-        reward_parts: np.ndarray,
-        tilt: np.ndarray,
-        force: np.ndarray,
-        success: np.ndarray,
-        violated: np.ndarray,
-        clipped: np.ndarray,
-        mask: np.ndarray,
-        grip: np.ndarray | None = None,
-    ) -> dict[str, Any]:
+    def _info(self, told: StepInfo, mask: np.ndarray) -> dict[str, Any]:
         """An info with the keys of `BallbotEnv`'s, in the same order, each with Gymnasium's mask (B,) of valid entries.
 
         Arrays that share the batch's memory are read-only.
         """
-        x, c = x.T, c.T
+        x, c, names = told.x.T, told.c.T, self._no_names
         x.flags.writeable = c.flags.writeable = False
-        failure, names = violated >= 0, self._no_names
-        failed = failure.nonzero()[0]
-        if failed.size:
+        if np.count_nonzero(told.failure):
+            failed = told.failure.nonzero()[0]
             names = names.copy()
-            names[failed] = self._limit_names[violated[failed]]
-        survive, running, goal = reward_parts
-        values = (x, cost, survive, running, goal, tilt, success, failure, names, force, clipped, c)
+            names[failed] = self._limit_names[told.violated[failed]]
+        values = (
+            x, told.cost, *told.reward_parts, told.tilt, told.success, told.failure, names, told.force.T, told.clipped, c
+        )  # fmt: skip
         infos = {}
         for (name, mask_name), value in zip(_INFO_KEYS, values, strict=True):
             infos[name], infos[mask_name] = value, mask
-        if grip is not None:
-            infos["grip"], infos["_grip"] = grip, mask
+        if self.params.grips:
+            infos["grip"], infos["_grip"] = told.grip.T, mask
         return infos
 
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
@@ -622,12 +620,12 @@ def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """A copy of (B,) or (n, B) numbers with 0 in some columns."""
     copied = rows.copy(order="K")
     for row in np.atleast_2d(copied):  # one after the other, which NumPy does three times as fast
-        row[indices] = 0.0
+        row[indices] = 0
     return copied
 
 
-def _some_rows(rows: np.ndarray, indices: np.ndarray, size: int) -> np.ndarray:
-    """Gymnasium's layout of `final_obs`: (size,) objects, rows where an index is given, else None."""
-    objects = np.empty(size, dtype=object)  # full of None
-    objects[indices] = np.fromiter(rows, dtype=object, count=len(rows))
+def _some_rows(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Gymnasium's layout of `final_obs`: (B,) objects, rows where the mask (B,) holds, else None."""
+    objects = np.empty(len(mask), dtype=object)  # full of None
+    objects[mask] = np.fromiter(rows, dtype=object, count=len(rows))
     return objects
