@@ -152,10 +152,11 @@ class BallbotNative:
 
     def step_with_infos(
         self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
-    ) -> tuple[BatchStep, StepInfo, StepInfo]:
-        """The same, with what infos say of the envs now, and of the step even where its end began a new episode.
+    ) -> tuple[BatchStep, StepInfo, StepInfo, np.ndarray]:
+        """The same, with what infos say, and the indices of the envs whose episode ended.
 
-        Without restart, both are the same.
+        The first info is of the envs now, the second of the step even where its end began a new episode. Without restart
+        they are the same.
         """
         old = self.state
         if old is None:
@@ -181,6 +182,7 @@ class BallbotNative:
         self._state = old._replace(x=told[:8], c=c, steps=steps, episode=episode)
         observation = seen.astype(np.float32, copy=False).T
         terminated, truncated, _, _, _, done = flags
+        ended = done.nonzero()[0]
         now = _info(told, pay[1:], flags[2:5], violated, c)
         end = _info(end_told, end_pay, end_flags, violated, old.c) if restart else now
         fields: Any = {
@@ -189,7 +191,7 @@ class BallbotNative:
             "cost": end.cost,
             "terminated": terminated,
             "truncated": truncated,
-            "final_observation": (observation if end_seen is None else end_seen)[done],
+            "final_observation": (observation if end_seen is None else end_seen).take(ended, 0),
             "final_x": end.x,
             "success": end.success,
             "failure": end.failure,
@@ -200,7 +202,7 @@ class BallbotNative:
             "tilt": now.tilt,
             "grip": end.grip,
         }
-        return BatchStep(**fields), now, end
+        return BatchStep(**fields), now, end, ended
 
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""

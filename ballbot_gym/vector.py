@@ -254,14 +254,14 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 'options={"reset_mask": mask}'
             )
         restart = self.autoreset_mode is AutoresetMode.SAME_STEP
-        result, now, end = self._advance(actions, waiting, restart)
+        result, now, end, ended = self._advance(actions, waiting, restart)
         done = result.terminated | result.truncated
         infos: dict[str, Any] = {}
         if not restart:
             self._ended = done
-        elif np.count_nonzero(done):
+        elif ended.size:
             infos["final_info"] = self._info(end, done)
-            infos["final_obs"] = _some_rows(result.final_observation, done)
+            infos["final_obs"] = _some_rows(result.final_observation, ended, self.num_envs)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
         infos |= self._info(now, self._everywhere)
@@ -356,11 +356,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
 
     def _advance(
         self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
-    ) -> tuple[Any, StepInfo, StepInfo]:
+    ) -> tuple[Any, StepInfo, StepInfo, np.ndarray]:
         """`_advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone.
 
         Returns:
-            The step, and what infos say of the envs now, and of the step even where its end began a new episode.
+            As `BallbotNative.step_with_infos`.
         """
         if not isinstance(self.batch, BallbotBatch | BallbotLoop):
             return self.batch.step_with_infos(actions, waiting, restart)
@@ -372,16 +372,16 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 result = _advance(self.batch, self._to_batch(actions), waiting, restart)
             arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
             result = result._replace(**arrays)
-            ended: Any = result.terminated | result.truncated
+        ended = (result.terminated | result.truncated).nonzero()[0]
+        if isinstance(self.batch, BallbotBatch):
             result = result._replace(final_observation=result.final_observation[ended])
-        return result, *self._step_infos(result, constants, waiting, restart)
+        return result, *self._step_infos(result, constants, ended, waiting, restart), ended
 
     def _step_infos(
-        self, result: Any, constants: np.ndarray, waiting: np.ndarray | None, restart: bool
+        self, result: Any, constants: np.ndarray, ended: np.ndarray, waiting: np.ndarray | None, restart: bool
     ) -> tuple[StepInfo, StepInfo]:
         """What infos say of the envs now, and of a step, before which they had those constants (nc, B)."""
         reward, cost, success, violated = result.reward, result.cost, result.success, result.violated
-        ended = (result.terminated | result.truncated).nonzero()[0]
         parts = np.empty((3, self.num_envs))
         parts[0], parts[2] = self._survive, 0.0
         np.negative(cost, out=parts[1])
@@ -624,8 +624,8 @@ def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
     return copied
 
 
-def _some_rows(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Gymnasium's layout of `final_obs`: (B,) objects, rows where the mask (B,) holds, else None."""
-    objects = np.empty(len(mask), dtype=object)  # full of None
-    objects[mask] = np.fromiter(rows, dtype=object, count=len(rows))
+def _some_rows(rows: np.ndarray, indices: np.ndarray, size: int) -> np.ndarray:
+    """Gymnasium's layout of `final_obs`: (size,) objects, rows where an index is given, else None."""
+    objects = np.empty(size, dtype=object)  # full of None
+    objects[indices] = np.fromiter(rows, dtype=object, count=len(rows))
     return objects
