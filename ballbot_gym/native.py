@@ -7,6 +7,7 @@ bit-identical wherever an env stands in whatever batch.
 
 import ctypes
 import os
+import sys
 from collections.abc import Callable, Sequence
 from functools import cache
 from queue import SimpleQueue
@@ -80,6 +81,7 @@ class BallbotNative:
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
+        self._recycled = _Recycled()
         self._told = 11 + (4 if params.grips else 0)
         self._seen_rows = len(task.observation_scale)
 
@@ -109,11 +111,12 @@ class BallbotNative:
         self._state = state
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_code": None}
+        return {**self.__dict__, "_code": None, "_recycled": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._code = _checked_code(self.task, self.params, self.dtype is np.float64)
+        self._recycled = _Recycled()
 
     def initial_state(
         self,
@@ -161,17 +164,17 @@ class BallbotNative:
         old = self.state
         if old is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
-        size, new = self.num_envs, np.empty
+        size, new = self.num_envs, self._recycled.empty
         told, seen = new((self._told, size), self.dtype), new((self._seen_rows, size), self.dtype)
-        pay, flags = new((5, size)), new((len(codegen.FLAGS) + 1, size), np.bool_)
-        violated, steps, episode, c = new(size, np.int64), new(size, np.int64), old.episode, old.c
+        pay, flags = new((5, size), np.float64), new((len(codegen.FLAGS) + 1, size), np.bool_)
+        violated, steps, episode, c = new((size,), np.int64), new((size,), np.int64), old.episode, old.c
         end_told, end_pay, end_flags, end_seen = told, pay[1:], flags[2:5], None
         made = ()
         if restart or waiting is not None:
-            episode, c = new(size, np.int64), new(old.c.shape, self.dtype)
+            episode, c = new((size,), np.int64), new(old.c.shape, self.dtype)
             made = (episode, c)
         if restart:
-            end_told, end_pay = new((self._told, size), self.dtype), new((4, size))
+            end_told, end_pay = new((self._told, size), self.dtype), new((4, size), np.float64)
             end_flags, end_seen = new((3, size), np.bool_), new((size, self._seen_rows), np.float32)
             made = (*made, end_told, end_pay, end_flags, end_seen)
         idle = () if waiting is None else (waiting,)
@@ -242,6 +245,36 @@ class BallbotNative:
                 if jobs.empty():  # else a helper is late, and need not be told twice
                     jobs.put((self._code.help, memory))
         self._code.step(memory)
+
+
+class _Recycled:
+    """Arrays whose memory is that of earlier ones to which nobody refers any more.
+
+    Memory that goes back to the system comes again as pages that the system clears, which takes longer than a step of large
+    batches. Views refer to the array whose memory they show.
+    """
+
+    _MOST = 12
+    """Arrays of one shape that are kept: of two steps, and some that users hold."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple, list[np.ndarray]] = {}
+
+    def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        """As `np.empty`."""
+        kept = self._kept.setdefault((shape, dtype), [])
+        for array in kept:
+            if sys.getrefcount(array) == _KEPT_ONLY:
+                return array
+        made = np.empty(shape, dtype)
+        kept.append(made)
+        if len(kept) > self._MOST:
+            del kept[0]
+        return made
+
+
+_KEPT_ONLY = 3
+"""References to an array that is only kept: of the list, of the loop and of the call that counts them."""
 
 
 class _Memory(ctypes.Structure):

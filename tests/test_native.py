@@ -96,6 +96,35 @@ def test_threads_change_nothing(monkeypatch):
         np.testing.assert_array_equal(a, b)
 
 
+def arrays_in(value):
+    """All arrays of numbers in what a step returns."""
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        yield from (row for row in value if isinstance(row, np.ndarray))
+    elif isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, (tuple, dict)):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from arrays_in(part)
+
+
+@needs_compiler
+def test_what_a_step_returned_never_changes_later_though_memory_is_used_again():
+    """Some arrays are kept, and of others only a row; all others are dropped at once."""
+    env = BallbotVectorEnv(19, "weave", robot="rolling", engine="native", max_episode_steps=9)
+    rng, kept, addresses = np.random.default_rng(0), [], set()
+    env.reset(seed=0)
+    for action in actions_of(19, 200):
+        result = env.step(action)
+        addresses.add(result[0].ctypes.data)
+        chosen = [array for array in arrays_in(result) if rng.random() < 0.05]
+        chosen += [array[3:5] for array in arrays_in(result) if rng.random() < 0.05]
+        kept += [(array, array.copy()) for array in chosen]
+    for array, copied in kept:
+        np.testing.assert_array_equal(array, copied)
+    assert len(kept) > 500
+    assert len(addresses) < 100  # each step would have its own if memory were not used again
+
+
 @needs_compiler
 def test_copies_and_pickles_go_on_alike_and_apart():
     env, actions = BallbotVectorEnv(5, "weave", engine="native", max_episode_steps=8), actions_of(5)
@@ -247,7 +276,7 @@ def test_every_operation_that_is_known_as_c_does_what_casadis_does(tmp_path, mon
     )
     whole = "void whole(double *a, double *b, double *y) { every(a, LANES, b, LANES, y, LANES); }\n"
     monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
-    library = ctypes.CDLL(str(machine_code.library("every", head + block + whole, native._FLAGS)))
+    library = ctypes.CDLL(str(machine_code.library("every", head + block + whole, native._COMPILER_FLAGS)))
     rng = np.random.default_rng(0)
     given = rng.normal(size=(2, codegen.LANES))
     given[1, :3], given[0, 3], given[1, 4] = given[0, :3], 0.0, 0.0
