@@ -27,6 +27,8 @@ from ballbot_gym.simulator import BulletSimulator
 _CONTROL_DT = 0.02  # s
 _EPISODE = 40  # control steps after which the raw loop resets, about as long as random forces leave the robot upright
 
+_TURNS, _TURN = 41, 1000  # turns in which raw loop and env are compared, and the steps of each
+
 
 @dataclass
 class Row:
@@ -112,6 +114,10 @@ def _guarded(measure: Callable[..., Row], args: tuple, seconds: float) -> Row:
 
 def raw_bullet(seconds: float) -> Row:
     """What PyBullet itself needs for a control step: torques in, 20 substeps of 1 ms, joint states out."""
+    return _timed(Row("raw PyBullet loop", "ballbot.urdf", 1), _raw_step(), seconds)
+
+
+def _raw_step() -> Callable[[], None]:
     simulator = BulletSimulator(default_params(), _CONTROL_DT)
     bullet, client = simulator._bullet, simulator._client
     robot, joints = simulator._robot, simulator._joints
@@ -129,11 +135,11 @@ def raw_bullet(seconds: float) -> Row:
         bullet.stepSimulation(physicsClientId=client)
         bullet.getJointStates(robot, joints, physicsClientId=client)
 
-    return _timed(Row("raw PyBullet loop", "ballbot.urdf", 1), step, seconds)
+    return step
 
 
 def single(physics: str, seconds: float) -> Row:
-    """One BallbotEnv."""
+    """One BallbotEnv; with Bullet also its share of the raw loop's speed, in turns with that loop."""
     env = BallbotEnv("stabilize", physics=physics)
     env.reset(seed=0)
     actions = iter(_forever(np.random.default_rng(0).uniform(-1, 1, (1000, 2)).astype(np.float32)))
@@ -144,7 +150,20 @@ def single(physics: str, seconds: float) -> Row:
             env.reset()
 
     _timed(Row("", "", 1), step, 1.0)  # meanwhile machine code is made, if it is not in the cache
-    return _timed(Row(f"BallbotEnv, {physics}", env.task.id, 1), step, seconds)
+    row = _timed(Row(f"BallbotEnv, {physics}", env.task.id, 1), step, seconds)
+    if physics == "bullet":
+        raw = _raw_step()
+        shares = [_seconds(raw, _TURN) / _seconds(step, _TURN) for _ in range(_TURNS)]
+        row.note = f"{np.median(shares):.1%} of the raw loop, median of {_TURNS} turns"
+    return row
+
+
+def _seconds(step: Callable[[], object], count: int) -> float:
+    """How long so many steps take."""
+    start = time.perf_counter()
+    for _ in range(count):
+        step()
+    return time.perf_counter() - start
 
 
 def batched(task: str, count: int, device: str, mode: str, soak: int = 0, *, seconds: float) -> Row:
