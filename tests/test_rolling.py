@@ -372,7 +372,7 @@ def test_nmpc_keeps_the_friction_cone(rolling):
 
 def test_every_knot_of_collocation_keeps_the_cone(rolling):
     problem = between_states("grip", np.zeros(8), np.zeros(8))
-    s, w = casadi.SX.sym("s", 11), casadi.SX.sym("w", 10)
+    s, w = casadi.SX.sym("s", 11), casadi.SX.sym("w", 8)
     rows = [
         (ocp.inequalities(s, w, casadi.SX(0, 1)).shape[0], ocp.final_inequalities(s, casadi.SX(0, 1)).shape[0])
         for ocp in (hermite_simpson(problem, robot) for robot in (default_params(), rolling))

@@ -7,8 +7,9 @@
                 limits(x_n, u_n) ≥ 0 at every knot, where the robot's friction is limited (`dynamics.limits`)
                 bounds on x_0, x_N, leans, forces, step h and free variables q;   x_N = x_0 if periodic
 
-This module writes the problem as a staged `Ocp`, and `ocp.OcpSolver` solves it. The input of a stage is the next knot. The
-step h and the free variables q are states that do not change.
+This module writes the problem as a staged `Ocp`, and `ocp.OcpSolver` solves it. The input of a stage is the next knot without
+its position, which follows: nothing else depends on where the ball is. The step h and the free variables q are states that do
+not change.
 """
 
 import time
@@ -91,12 +92,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where things stand in the staged state s = [x, u/limit, h, q, x_start]; inputs are the next [x, u/limit]."""
+    """Where things stand in the staged state s = [x, u/limit, h, q, x_start]; inputs are the next [x, u/limit] from
+    the leans on.
+    """
 
     free: int
     periodic: bool
     x: ClassVar[slice] = slice(0, 8)
     a: ClassVar[slice] = slice(8, 10)
+    inputs: ClassVar[slice] = slice(2, 10)
     h: ClassVar[int] = 10
 
     @property
@@ -113,15 +117,17 @@ class _Layout:
 
 
 def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
-    """The staged problem whose equality constraints are the Hermite–Simpson defects."""
+    """The staged problem whose dynamics and equality constraints are Hermite–Simpson's."""
     at, limit = _Layout(len(problem.free), problem.periodic), params.force_limit
 
-    def defect(s: casadi.SX, w: casadi.SX) -> casadi.SX:
-        x0, u0, h, x1, u1 = s[at.x], limit * s[at.a], s[at.h], w[at.x], limit * w[at.a]
+    def interval(s: casadi.SX, w: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
+        """The next [x, u/limit], and the defects of its components from the leans on."""
+        x0, u0, h, x1, u1 = s[at.x], limit * s[at.a], s[at.h], casadi.vertcat(0, 0, w[:6]), limit * w[6:]
         f0, f1 = dynamics.derivative(params, x0, u0), dynamics.derivative(params, x1, u1)
         middle = 0.5 * (x0 + x1) + h / 8 * (f0 - f1)
         f_middle = dynamics.derivative(params, middle, 0.5 * (u0 + u1))
-        return x1 - x0 - h / 6 * (f0 + 4 * f_middle + f1)
+        reached = x0 + h / 6 * (f0 + 4 * f_middle + f1)
+        return casadi.vertcat(reached[:2], w), w[:6] - reached[2:]
 
     def path(function: Callable | None, s: casadi.SX) -> casadi.SX:
         return casadi.SX(0, 1) if function is None else casadi.vertcat(*function(s[at.x], limit * s[at.a], s[at.q]))
@@ -137,11 +143,11 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
     return Ocp(
         name="hermite-simpson",
         states=at.size,
-        inputs=10,
+        inputs=8,
         params=0,
-        next=lambda s, w, p: casadi.vertcat(w, s[at.h :]),
+        next=lambda s, w, p: casadi.vertcat(interval(s, w)[0], s[at.h :]),
         cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
-        equalities=lambda s, w, p: casadi.vertcat(defect(s, w), path(problem.equalities, s)),
+        equalities=lambda s, w, p: casadi.vertcat(interval(s, w)[1], path(problem.equalities, s)),
         inequalities=lambda s, w, p: inequalities(s),
         final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_final_path,
         final_inequalities=lambda s, p: inequalities(s),
@@ -173,7 +179,7 @@ def solve(
     knots = np.column_stack([guess.x, guess.u / params.force_limit])
     start = guess.x[0] if problem.periodic else ()
     constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
-    states, inputs = np.hstack([knots, constant]), knots[1:]
+    states, inputs = np.hstack([knots, constant]), knots[1:, at.inputs]
     optimizer = OcpSolver(ocp, n, solver, tolerance, max_iterations)
     started = time.perf_counter()
     if not _is_motion(guess):

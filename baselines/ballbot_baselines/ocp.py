@@ -215,6 +215,8 @@ class OcpSolver:
             }
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
+        pattern = self._jac_g.sparsity_out(1)
+        self._jac_at = np.array(pattern.row()), np.array(pattern.colind())
         spent.setup += time.perf_counter() - began
 
     def solve(
@@ -288,7 +290,8 @@ class OcpSolver:
         upper = _interleave(bounds.state_upper, bounds.input_upper)
         z = np.clip(_interleave(states, inputs), lower, upper)
         g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
-        matrix, equal = jacobian.sparse(), self._g_upper == 0
+        matrix = scipy.sparse.csc_array((np.array(jacobian.nonzeros()), *self._jac_at), jacobian.shape)
+        equal = self._g_upper == 0
         matrix.data *= np.repeat(lower < upper, np.diff(matrix.indptr))
         step = _least_norm(matrix.tocsr()[equal], -np.array(g).ravel()[equal])
         if np.isfinite(step).all():
