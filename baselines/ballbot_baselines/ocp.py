@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import casadi
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 
 from ballbot_baselines.nlp import Stage, StagedNlp
 
@@ -215,8 +214,7 @@ class OcpSolver:
             }
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
-        pattern = self._jac_g.sparsity_out(1)
-        self._jac_at = np.array(pattern.row()), np.array(pattern.colind())
+        self._jac_at = tuple(map(np.array, self._jac_g.sparsity_out(1).get_triplet()))  # rows and columns
         spent.setup += time.perf_counter() - began
 
     def solve(
@@ -290,10 +288,16 @@ class OcpSolver:
         upper = _interleave(bounds.state_upper, bounds.input_upper)
         z = np.clip(_interleave(states, inputs), lower, upper)
         g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
-        matrix = scipy.sparse.csc_array((np.array(jacobian.nonzeros()), *self._jac_at), jacobian.shape)
+        rows, columns = self._jac_at
         equal = self._g_upper == 0
-        matrix.data *= np.repeat(lower < upper, np.diff(matrix.indptr))
-        step = _least_norm(matrix.tocsr()[equal], -np.array(g).ravel()[equal])
+        kept = equal[rows] & (lower < upper)[columns]
+        step = _least_norm(
+            np.array(jacobian.nonzeros())[kept],
+            (np.cumsum(equal) - 1)[rows[kept]],
+            columns[kept],
+            -np.array(g).ravel()[equal],
+            len(z),
+        )
         if np.isfinite(step).all():
             z = np.clip(z + step, lower, upper)
         return self._divide(z)
@@ -315,15 +319,29 @@ def _equality(equalities: int, constraints: int) -> list[bool]:
     return [True] * equalities + [False] * (constraints - equalities)
 
 
-def _least_norm(matrix: scipy.sparse.csr_array, right: np.ndarray) -> np.ndarray:
-    """The shortest v with matrix v = right, up to `_DAMPING`. Rows stand stage by stage, so matrix·matrixᵀ is banded."""
-    normal = (matrix @ matrix.T).tocoo()
-    below = normal.row >= normal.col
-    row, col, values = normal.row[below], normal.col[below], normal.data[below]
-    band = np.zeros((1 + np.max(row - col, initial=0), len(right)))
-    band[row - col, col] = values
-    band[0] += _DAMPING
-    return matrix.T @ scipy.linalg.solveh_banded(band, right, lower=True)
+def _least_norm(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, right: np.ndarray, size: int) -> np.ndarray:
+    """The shortest v (size,) with M v = right, up to `_DAMPING`.
+
+    Args:
+        values: nonzeros of M, column by column and downwards.
+        rows: that they stand in. They stand stage by stage, so M·Mᵀ is banded.
+        columns: that they stand in.
+        right: a number for each row.
+        size: number of columns.
+    """
+    places, products = [np.arange(len(right))], [np.full(len(right), _DAMPING)]
+    for ahead in range(len(values)):  # M·Mᵀ sums the products of two nonzeros of one column
+        first = np.flatnonzero(columns[ahead:] == columns[: len(columns) - ahead])
+        if not first.size:
+            break
+        second = first + ahead
+        places.append((rows[second] - rows[first]) * len(right) + rows[first])
+        products.append(values[second] * values[first])
+    filled = np.bincount(np.concatenate(places), np.concatenate(products))
+    band = np.zeros((-(-len(filled) // len(right)), len(right)))
+    band.flat[: len(filled)] = filled
+    solved = scipy.linalg.solveh_banded(band, right, lower=True)
+    return np.bincount(columns, values * solved[rows], size)
 
 
 def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
