@@ -81,9 +81,8 @@ class BallbotNative:
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
-        self._recycled = _Recycled()
-        self._told = 11 + (4 if params.grips else 0)
         self._seen_rows = len(task.observation_scale)
+        self._spares = self._written()
 
     @property
     def state(self) -> State:
@@ -111,12 +110,12 @@ class BallbotNative:
         self._state = state
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_code": None, "_recycled": None}
+        return {**self.__dict__, "_code": None, "_spares": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._code = _checked_code(self.task, self.params, self.dtype is np.float64)
-        self._recycled = _Recycled()
+        self._spares = self._written()
 
     def initial_state(
         self,
@@ -164,24 +163,15 @@ class BallbotNative:
         old = self.state
         if old is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
-        size, new = self.num_envs, self._recycled.empty
-        told, seen = new((self._told, size), self.dtype), new((self._seen_rows, size), self.dtype)
-        pay, flags = new((5, size), np.float64), new((len(codegen.FLAGS) + 1, size), np.bool_)
-        violated, steps, episode, c = new((size,), np.int64), new((size,), np.int64), old.episode, old.c
-        end_told, end_pay, end_flags, end_seen = told, pay[1:], flags[2:5], None
-        made = ()
-        if restart or waiting is not None:
-            episode, c = new((size,), np.int64), new(old.c.shape, self.dtype)
-            made = (episode, c)
-        if restart:
-            end_told, end_pay = new((self._told, size), self.dtype), new((4, size), np.float64)
-            end_flags, end_seen = new((3, size), np.bool_), new((size, self._seen_rows), np.float32)
-            made = (*made, end_told, end_pay, end_flags, end_seen)
-        idle = () if waiting is None else (waiting,)
-        read = _pointers(old.x, old.c, actions.T, old.steps, old.episode, old.seed, *idle)
-        if not idle:
-            read.append(0)
-        self._run(_Memory(0, 0, size, *read, *_pointers(told, seen, pay, flags, violated, steps, *made)))
+        begins = restart or waiting is not None
+        spares = self._spares[: 12 if restart else 8 if begins else 6]
+        made, addresses = zip(*(spare.take() for spare in spares), strict=True)
+        told, seen, pay, flags, violated, steps = made[:6]
+        episode, c = made[6:8] if begins else (old.episode, old.c)
+        end_told, end_pay, end_flags, end_seen = made[8:] if restart else (told, pay[1:], flags[2:5], None)
+        read = _pointers(old.x, old.c, actions.T, old.steps, old.episode, old.seed)
+        idle = 0 if waiting is None else _pointer(waiting)
+        self._run(_Memory(0, 0, self.num_envs, *read, idle, *addresses))
         self._state = old._replace(x=told[:8], c=c, steps=steps, episode=episode)
         observation = seen.astype(np.float32, copy=False).T
         terminated, truncated, _, _, _, done = flags
@@ -238,6 +228,25 @@ class BallbotNative:
         self._look(self._all, state, seen, tilt)
         return seen, tilt
 
+    def _written(self) -> list["_Spare"]:
+        """What a step writes, in the order of `_Memory`: 6 arrays always, 2 where episodes begin, 4 where they ended."""
+        size, rows, real = self.num_envs, 11 + (4 if self.params.grips else 0), self.dtype
+        kinds: list[tuple[tuple[int, ...], Any]] = [
+            ((rows, size), real),
+            ((self._seen_rows, size), real),
+            ((5, size), np.float64),
+            ((len(codegen.FLAGS) + 1, size), np.bool_),
+            ((size,), np.int64),
+            ((size,), np.int64),
+            ((size,), np.int64),
+            ((len(self.task.constant_names), size), real),
+            ((rows, size), real),
+            ((4, size), np.float64),
+            ((3, size), np.bool_),
+            ((size, self._seen_rows), np.float32),
+        ]
+        return [_Spare(*kind) for kind in kinds]
+
     def _run(self, memory: "_Memory") -> None:
         """A step, by several threads where that is faster."""
         if self.num_envs >= _PARALLEL_FROM:
@@ -247,34 +256,42 @@ class BallbotNative:
         self._code.step(memory)
 
 
-class _Recycled:
-    """Arrays whose memory is that of earlier ones to which nobody refers any more.
+class _Spare:
+    """Arrays of one kind whose memory is that of earlier ones to which nobody refers any more.
 
     Memory that goes back to the system comes again as pages that the system clears, which takes longer than a step of large
     batches. Views refer to the array whose memory they show.
     """
 
-    _MOST = 12
-    """Arrays of one shape that are kept: of two steps, and some that users hold."""
+    _MOST = 4
+    """Arrays that are kept: of two steps, and two that users may hold for a while."""
 
-    def __init__(self) -> None:
-        self._kept: dict[tuple, list[np.ndarray]] = {}
+    def __init__(self, shape: tuple[int, ...], dtype: Any):
+        """Args: as of `np.empty`."""
+        self._shape, self._dtype = shape, dtype
+        self._kept: list[tuple[np.ndarray, int]] = []
 
-    def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """As `np.empty`."""
-        kept = self._kept.setdefault((shape, dtype), [])
-        for array in kept:
+    def take(self) -> tuple[np.ndarray, int]:
+        """An array whose numbers are undefined, and where its memory begins."""
+        for array, address in self._kept:
             if sys.getrefcount(array) == _KEPT_ONLY:
-                return array
-        made = np.empty(shape, dtype)
-        kept.append(made)
-        if len(kept) > self._MOST:
-            del kept[0]
-        return made
+                return array, address
+        array = np.empty(self._shape, self._dtype)
+        self._kept.append((array, _pointer(array)))
+        if len(self._kept) > self._MOST:
+            del self._kept[0]
+        return self._kept[-1]
 
 
-_KEPT_ONLY = 3
-"""References to an array that is only kept: of the list, of the loop and of the call that counts them."""
+def _references(kept: list[tuple[np.ndarray, int]]) -> int:
+    """To the first array, as `_Spare.take` counts them; how many a local variable adds depends on the Python."""
+    for array, _ in kept:
+        return sys.getrefcount(array)
+    return 0
+
+
+_KEPT_ONLY = _references([(np.empty(1), 0)])
+"""References to an array that is only kept."""
 
 
 class _Memory(ctypes.Structure):
