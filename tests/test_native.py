@@ -86,10 +86,11 @@ def test_an_env_is_the_same_bit_for_bit_wherever_it_stands(task, dtype):
 
 @needs_compiler
 def test_threads_change_nothing(monkeypatch):
+    """In a batch of several pieces, of which the last is not whole."""
     monkeypatch.setattr(native, "_PARALLEL_FROM", 64)
-    actions, results = actions_of(150), []
+    actions, results = actions_of(2500, 30), []
     for threads in (1, 3):
-        env = BallbotVectorEnv(150, "weave", engine="native", max_episode_steps=20)
+        env = BallbotVectorEnv(2500, "weave", engine="native", max_episode_steps=20)
         env.batch.threads = threads
         results.append(play(env, actions, 0))
     for a, b in zip(*results, strict=True):
