@@ -42,7 +42,7 @@ static void rows_copy(int rows, int64_t count, const real *from, int64_t sfrom, 
 
 /* Starts episodes in the count robots that which lists: states, and constants unless they are given. */
 static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
-           real *x, real *c) {
+                  real *x, real *c) {
     for (int64_t m = 0; m < count; m += LANES) {
         real z[AT_LEAST_1(DRAWS) * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, xs[8 * LANES];
         for (int k = 0; k < LANES && m + k < count; ++k) {

@@ -26,7 +26,7 @@ from ballbot_gym.tasks import Task
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
-"""Number of envs from which threads share the work. Waking them takes as long as a thousand steps."""
+"""Number of envs from which threads share the work: 2,048 take as long on two as on one, and 4,096 a seventh less."""
 
 
 class NativeUnavailableError(RuntimeError):
