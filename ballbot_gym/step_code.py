@@ -12,6 +12,7 @@ import logging
 import os
 import struct
 import threading
+import time
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -28,6 +29,7 @@ _ROBOT = ("moving_mass", "first_moment", "pivot_inertia", "axial_inertia", "grav
 """What the equations of motion take of a robot."""
 
 _TRIALS = 64
+_YIELD = 1e-4  # s, at every reset until the code is there
 _MOVED = struct.Struct("9d")  # whether all is finite, and a state
 _HELD = struct.Struct("10d")  # a state and a force
 _JUDGED = struct.Struct("5d")  # whether all is finite, cost rate, tilt, violated limit, goal reached
@@ -152,6 +154,9 @@ def _code(
             if machine_code.compiler() is not None:
                 with contextlib.suppress(RuntimeError):  # there can be no more threads
                     threading.Thread(target=_make, args=(key, compute, counts, in_place), name="ballbot-code").start()
+        if key in _begun and key not in _codes:
+            # A loop of steps hardly leaves the interpreter to other threads, which then need seconds for what takes 13 ms.
+            time.sleep(_YIELD)
         return _codes.get(key)
     except TypeError:  # a task that has no hash
         return None
