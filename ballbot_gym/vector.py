@@ -165,7 +165,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space = observation_space(self.task, self.params)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._limit_names = np.array(limit_names(self.task, self.params), dtype=object)
+        self._limit_names = np.array([*limit_names(self.task, self.params), ""], dtype=object)  # the last has index −1
         self._no_names = np.full(self.num_envs, "", dtype=object)
         self._everywhere = np.ones(self.num_envs, np.bool_)
         self._no_names.flags.writeable = self._everywhere.flags.writeable = False
@@ -260,7 +260,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if not restart:
             self._ended = done
         elif ended.size:
-            infos["final_info"] = self._info(end, done)
+            infos["final_info"] = self._info(end, done, ended)
             infos["final_obs"] = _some_rows(result.final_observation, ended, self.num_envs)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
@@ -416,17 +416,17 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         array = part if isinstance(part, np.ndarray) else part.cpu().numpy()
         return array if dtype is None else array.astype(dtype, copy=False)
 
-    def _info(self, told: StepInfo, mask: np.ndarray) -> dict[str, Any]:
+    def _info(self, told: StepInfo, mask: np.ndarray, which: np.ndarray | None = None) -> dict[str, Any]:
         """An info with the keys of `BallbotEnv`'s, in the same order, each with Gymnasium's mask (B,) of valid entries.
 
-        Arrays that share the batch's memory are read-only.
+        Arrays that share the batch's memory are read-only. Where the mask holds for few envs, `which` are their indices.
         """
         x, c, names = told.x.T, told.c.T, self._no_names
         x.flags.writeable = c.flags.writeable = False
         if np.count_nonzero(told.failure):
-            failed = told.failure.nonzero()[0]
-            names = names.copy()
-            names[failed] = self._limit_names[told.violated[failed]]
+            named = told.failure.nonzero()[0] if which is None else which
+            names = names.copy() if which is None else np.empty(self.num_envs, dtype=object)
+            names[named] = self._limit_names[told.violated[named]]
         values = (
             x, told.cost, *told.reward_parts, told.tilt, told.success, told.failure, names, told.force.T, told.clipped, c
         )  # fmt: skip
