@@ -348,7 +348,7 @@ def test_products_change_nothing_about_what_an_actor_sees(name):
     assert make(name, products=True).network.spec == make(name, products=False).network.spec
 
 
-@pytest.mark.parametrize(("task", "symmetry"), [("stabilize", "odd"), ("weave", "mirrors"), ("orbit", "frame")])
+@pytest.mark.parametrize(("task", "symmetry"), [("stabilize", "odd"), ("weave", "mirrors"), ("orbit", "centred")])
 def test_the_actor_of_ppo_has_the_symmetry_of_its_task(task, symmetry):
     settings = replace(TINY["ppo"], symmetry=symmetry, rl_iterations=1)
     assert LEARNERS["ppo"].settings(task).symmetry == symmetry
