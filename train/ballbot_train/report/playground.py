@@ -33,7 +33,7 @@ LARGEST = 1_500_000
 """Bytes that the page may have."""
 
 _ASSETS = Path(__file__).parent / "assets"
-_LEARNERS = {"stabilize": "sac", "turn": "dagger", "orbit": "dagger", "weave": "shac"}
+_LEARNERS = {"stabilize": "sac", "turn": "dagger", "orbit": "dagger", "weave": "dagger"}
 """The shipped policy of each task that the page shows: the one with the least regret."""
 
 
