@@ -8,9 +8,13 @@ episode, so it does not waver.
 import functools
 import itertools
 
-import torch
-
+from ballbot_gym.lazy import missing
 from ballbot_gym.tasks.symmetry import FRAMES
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 
 class Routes(torch.nn.Module):
