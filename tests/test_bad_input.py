@@ -778,6 +778,7 @@ TYPED = [
     ("train shac --total-iterations -5", "total_iterations must be 1 to"),
     ("train shac --learning-rate nan", "learning_rate must be finite and positive"),
     ("train shac --demos x", "shac uses no demonstrations"),
+    ("train ppo --task weave --symmetry routes", "invalid choice"),
     ("train shac --start none.json", "none.json is not a policy"),
     ("train bc", "bc learns from demonstrations: give --demos"),
     ("train bc --demos none", 'is no dataset of "ballbot demos"'),

@@ -113,8 +113,7 @@ class PolicyNetwork(torch.nn.Module):
         """Action in the frame (..., 2) before it is squashed; stack: makes tensors (..., n) of n values."""
         output = self._sum(stack(features))
         if self._steady is not None:
-            steady, action = self._steady(features)
-            output = output - self._sum(stack(steady)) + unsquashed(stack(action), self.spec.squash)
+            output = centred(output, features, self._sum, self._steady, self.spec.squash, stack)
         return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
@@ -122,7 +121,29 @@ class PolicyNetwork(torch.nn.Module):
         return output if self.linear is None else output + self.linear(inputs)
 
 
-def unsquashed(action: torch.Tensor, squash: str) -> torch.Tensor:
+def centred(
+    output: torch.Tensor,
+    features: tuple[Any, ...],
+    network: Callable[[torch.Tensor], torch.Tensor],
+    steady: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, Any]]],
+    squash: str,
+    stack: Callable[[Any], torch.Tensor],
+) -> torch.Tensor:
+    """A network's output (..., 2), less what it is in the frame's steady motion, and what keeps that motion instead.
+
+    Args:
+        output: of the network for these features, before it is squashed.
+        features: of the frame.
+        network: from features (..., size) to outputs (..., 2).
+        steady: as of `Frame`.
+        squash: as of `PolicySpec`.
+        stack: makes tensors (..., n) of n values.
+    """
+    kept, action = steady(features)
+    return output - network(stack(kept)) + _unsquashed(stack(action), squash)
+
+
+def _unsquashed(action: torch.Tensor, squash: str) -> torch.Tensor:
     """What a network has to give for an action (..., 2) in the world or a frame, before it is squashed."""
     if squash == "clip":
         return action

@@ -9,17 +9,19 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.policy import PolicySpec
 
-Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "routes", "centred"]
+Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
 the task's mirror images, or it sees and acts in the task's frame, or in its fine frame, which tells small errors apart. A
-policy with routes decides first on which sides it passes obstacles, and acts in the frame of these (shac and dagger). A
 centred actor acts in the finer of these frames, and keeps the robot exactly in the steady motion of the end of an episode."""
 
+RoutedSymmetry = Literal[Symmetry, "routes"]
+"""The same for learners that teach routes: the policy decides first on which sides it passes obstacles, and acts in the frame
+of these."""
 
 _ROUTES = (128, 128)  # units of the layers that decide on sides
 
 
-def spec_for(task: Task, symmetry: Symmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
+def spec_for(task: Task, symmetry: RoutedSymmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
     """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
 
     Raises:

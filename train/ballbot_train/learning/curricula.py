@@ -144,6 +144,21 @@ class Starts(NamedTuple):
     """(n,) int64, control steps to the end of the optimum."""
 
 
+@dataclass
+class _Tally:
+    """Episodes that ended."""
+
+    ended: int = 0
+    """Since they were last looked at."""
+    succeeded: int = 0
+    """Of these."""
+    share: float = math.nan
+    """Of successes, when they were last looked at."""
+
+    def state(self) -> list[float]:
+        return [self.ended, self.succeeded, self.share]
+
+
 class CurriculumBatch(BallbotBatch):
     """A batch whose episodes and rewards are those of a curriculum, for training.
 
@@ -185,9 +200,10 @@ class CurriculumBatch(BallbotBatch):
         self._goal_factor = curriculum.goal_factor
         self._ramp = curriculum.ramp_start if curriculum.ramp else 0.0
         self._reach = curriculum.starts_seconds
-        self._ended = self._succeeded = 0
-        self._starts_ended = self._starts_succeeded = 0
-        self._share = self._starts_share = math.nan  # of the last `episodes` that ended
+        self._own_episodes, self._on_optima = (
+            _Tally(),
+            _Tally(),
+        )  # that ended: the task's own, and those begun on optima
         self._from_task = torch.ones(num_envs, dtype=torch.bool)  # whose episode began as the task's own do
         self._demos, self._full = demos, task if full is None else full
         self._starts: Starts | None = None
@@ -204,8 +220,8 @@ class CurriculumBatch(BallbotBatch):
         if curriculum.ramp:
             reached[curriculum.ramp] = self._ramp
         if curriculum.starts_seconds:
-            reached["starts_seconds"], reached["starts_success"] = self._reach, self._starts_share
-        return reached | ({"success": self._share} if reached else {})
+            reached["starts_seconds"], reached["starts_success"] = self._reach, self._on_optima.share
+        return reached | ({"success": self._own_episodes.share} if reached else {})
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> BatchStep:
@@ -238,21 +254,17 @@ class CurriculumBatch(BallbotBatch):
         return {
             "goal_factor": self._goal_factor,
             "ramp": self._ramp,
-            "counts": [self._ended, self._succeeded],
             "reach": self._reach,
-            "starts_counts": [self._starts_ended, self._starts_succeeded],
-            "starts_share": self._starts_share,
-            "share": self._share,
+            "own_episodes": self._own_episodes.state(),
+            "on_optima": self._on_optima.state(),
             "from_task": self._from_task,
             "starts": None if self._starts is None else list(self._starts),
         }
 
     def load_curriculum_state(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
-        self._goal_factor, self._ramp, self._share = state["goal_factor"], state["ramp"], state["share"]
-        self._ended, self._succeeded = state["counts"]
-        self._reach, (self._starts_ended, self._starts_succeeded) = state["reach"], state["starts_counts"]
-        self._starts_share = state["starts_share"]
+        self._goal_factor, self._ramp, self._reach = state["goal_factor"], state["ramp"], state["reach"]
+        self._own_episodes, self._on_optima = _Tally(*state["own_episodes"]), _Tally(*state["on_optima"])
         self._from_task = state["from_task"]
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
         self._set_difficulty()
@@ -262,26 +274,24 @@ class CurriculumBatch(BallbotBatch):
 
     def _count(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the episodes that ended, and makes the task harder if enough of them succeeded."""
-        self._ended += int(ended.sum())
-        self._succeeded += int((ended & success).sum())
-        if self._ended < self.curriculum.episodes:
-            return
-        self._share = self._succeeded / self._ended
-        self._ended = self._succeeded = 0
-        if self._share >= self.curriculum.success:
+        if self._enough(self._own_episodes, ended, success):
             self._harden()
 
     def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began on optima, and lets them begin earlier if enough of them succeeded."""
-        self._starts_ended += int(ended.sum())
-        self._starts_succeeded += int((ended & success).sum())
-        if self._starts_ended < self.curriculum.episodes:
-            return
-        self._starts_share = self._starts_succeeded / self._starts_ended
-        self._starts_ended = self._starts_succeeded = 0
-        if self._starts_share >= self.curriculum.success and 0 < self._reach < self._own.duration:
+        if self._enough(self._on_optima, ended, success) and 0 < self._reach < self._own.duration:
             self._reach = min(self._reach + self.curriculum.starts_step, self._own.duration)
             self._eligible = None
+
+    def _enough(self, tally: "_Tally", ended: torch.Tensor, success: torch.Tensor) -> bool:
+        """Counts the episodes that ended. True where `episodes` are complete now, and enough of them succeeded."""
+        tally.ended += int(ended.sum())
+        tally.succeeded += int((ended & success).sum())
+        if tally.ended < self.curriculum.episodes:
+            return False
+        tally.share = tally.succeeded / tally.ended
+        tally.ended = tally.succeeded = 0
+        return tally.share >= self.curriculum.success
 
     def _harden(self) -> None:
         """Takes a step towards the task itself."""

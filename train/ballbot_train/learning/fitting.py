@@ -10,7 +10,7 @@ import torch
 from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.learning.actors import RoutedSymmetry, spec_for
 from ballbot_train.policy import PolicyNetwork
 
 
@@ -48,7 +48,7 @@ class Samples:
 class Fit:
     """Fits a policy network to samples: Adam on the weighted mean squared error of its actions."""
 
-    def __init__(self, task: Task, params: BallbotParams, symmetry: Symmetry, hidden: tuple[int, ...], seed: int):
+    def __init__(self, task: Task, params: BallbotParams, symmetry: RoutedSymmetry, hidden: tuple[int, ...], seed: int):
         """The network starts as LQR if the task ends at rest in an equilibrium, and at zero otherwise."""
         torch.manual_seed(seed)
         self.network = PolicyNetwork(spec_for(task, symmetry, hidden, linear=True))

@@ -39,7 +39,7 @@ from ballbot_gym.paths import then_stay
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import Symmetry
+from ballbot_train.learning.actors import RoutedSymmetry
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
@@ -108,9 +108,10 @@ class DaggerConfig:
     """Gradient steps per iteration."""
     batch_size: int = 1024
     """Samples per gradient step."""
-    symmetry: Symmetry = "none"
+    symmetry: RoutedSymmetry = "none"
     """How the policy respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
+    over the task's mirror images, or it sees and acts in the task's frame or its fine frame, or it decides first on which
+    sides it passes obstacles (routes)."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the policy's hidden layers."""
     learning_rate: float = 3e-3

@@ -31,7 +31,7 @@ from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
-from ballbot_train.policy import PolicyNetwork, unsquashed
+from ballbot_train.policy import PolicyNetwork, centred
 from ballbot_train.policy_files import Mirrors
 
 
@@ -191,12 +191,15 @@ class CentredActor(Actor):
         self._frame = frame
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        _, log_std, more = super().get_action_dist_params(obs)
-        return self.mean_action().raw(cast(torch.Tensor, obs)), log_std, more
+        mean, log_std, more = super().get_action_dist_params(obs)
+        return _centred(mean, cast(torch.Tensor, obs), self._mlp, self._frame), log_std, more
 
     def mean_action(self) -> "CentredMean":
         """The mean of its actions, with the same layers."""
         return CentredMean(torch.nn.Sequential(*self.latent_pi, self.mu), self._frame)
+
+    def _mlp(self, features: torch.Tensor) -> torch.Tensor:
+        return self.mu(self.latent_pi(features))
 
 
 class CentredMean(torch.nn.Module):
@@ -207,14 +210,17 @@ class CentredMean(torch.nn.Module):
         self.mlp, self._frame = mlp, frame
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(self.raw(features))
+        return torch.tanh(_centred(self.mlp(features), features, self.mlp, self._frame))
 
-    def raw(self, features: torch.Tensor) -> torch.Tensor:
-        """(n, 2) of features (n, size), before it is squashed."""
-        assert self._frame.steady is not None
-        steady, action = self._frame.steady(features.unbind(-1))
-        kept = self.mlp(torch.stack(steady, -1))
-        return self.mlp(features) - kept + unsquashed(torch.stack(action, -1), "tanh_in_frame")
+
+def _centred(
+    output: torch.Tensor, features: torch.Tensor, network: Callable[[torch.Tensor], torch.Tensor], frame: Frame
+) -> torch.Tensor:
+    """(n, 2) centred output of a network for features (n, size), before it is squashed."""
+    assert frame.steady is not None
+    return centred(
+        output, features.unbind(-1), network, frame.steady, "tanh_in_frame", lambda values: torch.stack(values, -1)
+    )
 
 
 class OwnPolicy(SACPolicy):

@@ -24,7 +24,7 @@ from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import Symmetry, spec_for
+from ballbot_train.learning.actors import RoutedSymmetry, spec_for
 from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
@@ -48,9 +48,10 @@ class ShacConfig:
     """Share of the envs that start a new episode after each window, because the first second costs most."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers of policy and critic."""
-    symmetry: Symmetry = "none"
+    symmetry: RoutedSymmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
+    over the task's mirror images, or it sees and acts in the task's frame or its fine frame, or it decides first on which
+    sides it passes obstacles (routes)."""
     learning_rate: float = 3e-3
     """Learning rate of policy and critic at the start."""
     finetune_learning_rate: float = 5e-4
@@ -290,9 +291,7 @@ class Shac:
         cost = cost + config.failure_penalty * result.failure
         shaped = cost
         if config.margin_penalty:
-            routes = self._network.routes
-            sides = () if routes is None else routes(observation).detach().unbind(-1)
-            for margin in task.one_way_margins(x, c, sides) if config.one_way else task.margins(x, c):
+            for margin in self._one_way_margins(observation, x, c) if config.one_way else task.margins(x, c):
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * task.control_dt * squared
@@ -309,6 +308,12 @@ class Shac:
         start = torch.where(done[:, None], result.observation, start)
         record = _Record(observation.detach(), cost.detach(), result.success, result.failure)
         return new, start, alive, discount, loss, record
+
+    def _one_way_margins(self, observation: torch.Tensor, x: Any, c: Any) -> tuple[Any, ...]:
+        """Margins (B,) of states x that are open on the sides of the policy's routes alone, or on the task's choice."""
+        routes = self._network.routes
+        sides = () if routes is None else routes(observation).detach().unbind(-1)
+        return self.task.one_way_margins(x, c, sides)
 
     def _learn_values(self, log: list["_Record"], last: torch.Tensor) -> float:
         """Fits the critic to the cost of the window from each of its steps on; returns the loss.
