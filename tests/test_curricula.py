@@ -177,7 +177,7 @@ def test_a_share_of_the_episodes_begins_on_optima_with_the_time_that_is_left():
     torch.manual_seed(0)
     for _ in range(made.task.steps):
         result = made.step(torch.zeros(400, 2))
-    moved = ~made._from_task
+    moved = made._kind == curricula._ON_OPTIMUM
     assert 0.4 < float(moved.double().mean()) < 0.6
     known = {(*x, int(k)) for x, k in zip(starts.x.float().T.tolist(), starts.steps, strict=True)}
     assert {(*x, int(k)) for x, k in zip(made.state.x.T[moved].tolist(), made.state.steps[moved], strict=True)} <= known
@@ -210,6 +210,33 @@ def test_episodes_on_optima_begin_ever_earlier_as_they_succeed():
         assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * (steps_left + 1))
 
 
+def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
+    made = batch(curriculum=Curriculum(retries=0.5, goal_factor=2.0, episodes=1, success=0.0), num_envs=400)
+    torch.manual_seed(0)
+    first = made.state.c.clone()
+    run(made, made.task.steps)  # nobody gets to the gate in so short a time
+    again = made._kind == curricula._RETRY
+    assert 0.4 < float(again.double().mean()) < 0.6
+    assert set(made.state.c[0, again].tolist()) <= set(first[0].tolist())
+    assert not set(made.state.c[0, ~again].tolist()) & set(first[0].tolist())
+    assert torch.equal(made.state.x[5], made.state.c[0])  # each moves with the speed of the episode that it repeats
+    assert not made.state.steps.any()
+    result = made.step(torch.zeros(400, 2))
+    torch.testing.assert_close(result.observation, made.observe(made.state))
+    run(made, 40 * made.task.steps)
+    assert made._hard.shape == (9, curricula._KEPT_STARTS)
+
+
+def test_only_failures_are_repeated_where_an_episode_that_runs_out_of_time_may_be_a_good_one():
+    made = batch("stabilize", Curriculum(retries=1.0), num_envs=50)
+    run(made, made.task.steps)
+    assert not made._kind.any()
+    assert made._hard.shape[1] == 0
+    made = batch("stabilize", Curriculum(retries=1.0), num_envs=50, duration=2.0)
+    run(made, made.task.steps - 1)
+    assert (made._kind == curricula._RETRY).sum() > 10  # without any force the robot falls
+
+
 def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     task = make_task("turn", duration=8.0)
     starts = curricula.optimal_starts(task, default_params(), 1, 100)
@@ -236,7 +263,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
     easier = Curriculum(
         goal_factor=3.0, ramp="max_speed", ramp_start=3.0, starts_on_optima=0.5, shaping=1.0, episodes=2, success=0.0
     )
-    easier = replace(easier, starts_seconds=0.04)
+    easier = replace(easier, starts_seconds=0.04, retries=0.5)
     settings = replace(LEARNERS[name].settings("turn"), hidden=(8,), curriculum=easier, **TINY[name])
 
     def make(seed):
@@ -265,6 +292,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
     [
         ({"goal_factor": 0.5}, "curriculum.goal_factor must be 1 to 1000, not 0.5"),
         ({"success": float("nan")}, "curriculum.success must be 0 to 1, not nan"),
+        ({"retries": 2.0}, "curriculum.retries must be 0 to 1, not 2.0"),
         ({"starts_on_optima": 2.0}, "curriculum.starts_on_optima must be 0 to 1, not 2.0"),
     ],
 )

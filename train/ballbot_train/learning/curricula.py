@@ -9,6 +9,9 @@ A curriculum changes training alone. What is evaluated is always the task itself
   episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them. These
   episodes can begin shortly before the end of their optimum at first, and ever earlier as enough of them succeed (Florensa et
   al., "Reverse curriculum generation for reinforcement learning", 2017).
+- A share of the episodes repeats starts from which recent episodes failed or missed their goal, so that what is hard is met
+  more often, as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized level replay",
+  2021).
 - A share of the episodes is cut soon after its start, so that more of the samples are of starts.
 - Rewards are shaped by a potential, minus the distance to the goal. Shaping by a potential moves no optimum (Ng et al.,
   "Policy invariance under reward transformations", 1999).
@@ -35,6 +38,8 @@ from ballbot_train.evaluation import fresh
 
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
+_OWN, _ON_OPTIMUM, _RETRY = 0, 1, 2  # how an episode began
+_KEPT_STARTS = 1024  # of the last episodes that went wrong
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,9 @@ class Curriculum:
     """How long before the end of their optimum these episodes begin at most, at the start of training, s; 0: anywhere."""
     starts_step: float = 0.1
     """How much longer that gets whenever enough of these episodes succeed, s."""
+    retries: float = 0.0
+    """Share of the training episodes that repeat the start of one of the last episodes that failed or, on a task that ends
+    at its goal, missed it; 0: off. They do not count for `success`."""
     short_episodes: float = 0.0
     """Share of the training episodes that are cut after `short_seconds`; 0: off. So more of the samples are of the starts,
     where most of a good policy's regret arises."""
@@ -90,6 +98,7 @@ class Curriculum:
             ("optima", 1, 10**6),
             ("starts_seconds", 0.0, 1e6),
             ("starts_step", 1e-9, 1e6),
+            ("retries", 0.0, 1.0),
             ("short_episodes", 0.0, 1.0),
             ("short_seconds", 1e-3, 1e6),
             ("shaping", 0.0, 1e6),
@@ -105,6 +114,7 @@ class Curriculum:
             self.goal_factor > 1
             or self.ramp != ""
             or self.starts_on_optima > 0
+            or self.retries > 0
             or self.short_episodes > 0
             or self.shaping > 0
         )
@@ -204,7 +214,10 @@ class CurriculumBatch(BallbotBatch):
             _Tally(),
             _Tally(),
         )  # that ended: the task's own, and those begun on optima
-        self._from_task = torch.ones(num_envs, dtype=torch.bool)  # whose episode began as the task's own do
+        self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
+        constants = len(task.constant_names)
+        self._begun = torch.zeros(8 + constants, num_envs)  # states and constants at the starts of the running episodes
+        self._hard = torch.zeros(8 + constants, 0)  # those of the last episodes that went wrong
         self._demos, self._full = demos, task if full is None else full
         self._starts: Starts | None = None
         if demos is not None and curriculum.starts_on_optima:
@@ -222,6 +235,14 @@ class CurriculumBatch(BallbotBatch):
         if curriculum.starts_seconds:
             reached["starts_seconds"], reached["starts_success"] = self._reach, self._on_optima.share
         return reached | ({"success": self._own_episodes.share} if reached else {})
+
+    def reset(self, *args: Any, mask: torch.Tensor | None = None, **given: Any) -> torch.Tensor:
+        """As of `BallbotBatch`: these episodes begin as the task's own do."""
+        observation = super().reset(*args, mask=mask, **given)
+        begun = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
+        self._kind = torch.where(begun, _OWN, self._kind)
+        self._begin(begun)
+        return observation
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> BatchStep:
@@ -241,10 +262,19 @@ class CurriculumBatch(BallbotBatch):
             # An episode that terminates ends with a potential of 0, and a truncated one goes on.
             reward = reward + self.gamma * torch.where(result.terminated, 0.0, end) - start
         ended = result.terminated | result.truncated
-        self._count(ended & self._from_task, result.success)
+        self._count(ended & (self._kind == _OWN), result.success)
         if self.curriculum.starts_on_optima:
-            self._count_starts(ended & ~self._from_task, result.success)
+            self._count_starts(ended & (self._kind == _ON_OPTIMUM), result.success)
+        if self.curriculum.retries:
+            missed = result.truncated & ~result.success if task.first_exit else torch.zeros_like(ended)
+            wrong = (result.failure | missed) & (self._kind != _ON_OPTIMUM)
+            self._hard = torch.cat([self._hard, self._begun[:, wrong]], 1)[:, -_KEPT_STARTS:]
+        self._kind = torch.where(ended, _OWN, self._kind)
+        if self.curriculum.starts_on_optima:
             result = self._start_on_optima(result, ended)
+        if self.curriculum.retries:
+            result = self._retry(result, ended & (self._kind == _OWN))
+        self._begin(ended)
         if self.curriculum.short_episodes:
             self._shorten(ended)
         return result._replace(reward=reward)
@@ -257,7 +287,9 @@ class CurriculumBatch(BallbotBatch):
             "reach": self._reach,
             "own_episodes": self._own_episodes.state(),
             "on_optima": self._on_optima.state(),
-            "from_task": self._from_task,
+            "kind": self._kind,
+            "begun": self._begun,
+            "hard": self._hard,
             "starts": None if self._starts is None else list(self._starts),
         }
 
@@ -265,7 +297,7 @@ class CurriculumBatch(BallbotBatch):
         """Goes back to a state."""
         self._goal_factor, self._ramp, self._reach = state["goal_factor"], state["ramp"], state["reach"]
         self._own_episodes, self._on_optima = _Tally(*state["own_episodes"]), _Tally(*state["on_optima"])
-        self._from_task = state["from_task"]
+        self._kind, self._begun, self._hard = state["kind"], state["begun"], state["hard"]
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
         self._set_difficulty()
 
@@ -329,18 +361,35 @@ class CurriculumBatch(BallbotBatch):
             outside = (near & ~reached).nonzero()[:, 0]
             self._eligible = outside if len(outside) else near.nonzero()[:, 0]
         moved = ended & (torch.rand(self.num_envs) < self.curriculum.starts_on_optima)
-        self._from_task = torch.where(ended, ~moved, self._from_task)
+        self._kind = torch.where(moved, _ON_OPTIMUM, self._kind)
+        chosen = self._eligible[torch.randint(len(self._eligible), (int(moved.sum()),))]
+        starts = self._starts
+        return self._moved(result, moved, starts.x[:, chosen], starts.c[:, chosen], starts.steps[chosen])
+
+    def _retry(self, result: BatchStep, ended: torch.Tensor) -> BatchStep:
+        """Moves a share of the episodes that have just begun to starts from which others went wrong."""
+        again = ended & (torch.rand(self.num_envs) < self.curriculum.retries) & (self._hard.shape[1] > 0)
+        self._kind = torch.where(again, _RETRY, self._kind)
+        count = int(again.sum())
+        chosen = self._hard[:, torch.randint(max(1, self._hard.shape[1]), (count,))]
+        return self._moved(result, again, chosen[:8], chosen[8:], torch.zeros(count, dtype=torch.int64))
+
+    def _begin(self, begun: torch.Tensor) -> None:
+        """Remembers the starts of the episodes that have just begun."""
+        assert self.state is not None
+        self._begun = torch.where(begun, torch.cat([self.state.x, self.state.c]).float(), self._begun)
+
+    def _moved(
+        self, result: BatchStep, moved: torch.Tensor, x: torch.Tensor, c: torch.Tensor, passed: torch.Tensor
+    ) -> BatchStep:
+        """Moves n of the B episodes to states (8, n), constants (nc, n) and counts (n,) of control steps that have passed."""
         if not moved.any():
             return result
         assert self.state is not None
-        chosen = self._eligible[torch.randint(len(self._eligible), (int(moved.sum()),))]
-        x, c, steps = self.state.x.clone(), self.state.c.clone(), self.state.steps.clone()
-        x[:, moved] = self._starts.x[:, chosen].to(x.dtype)
-        c[:, moved] = self._starts.c[:, chosen].to(c.dtype)
-        steps[moved] = self._starts.steps[chosen]
-        self.state = self.state._replace(x=x, c=c, steps=steps)
-        seen = self.observe(self.state)
-        return result._replace(observation=torch.where(moved[:, None], seen, result.observation))
+        states, constants, steps = self.state.x.clone(), self.state.c.clone(), self.state.steps.clone()
+        states[:, moved], constants[:, moved], steps[moved] = x.to(states.dtype), c.to(constants.dtype), passed
+        self.state = self.state._replace(x=states, c=constants, steps=steps)
+        return result._replace(observation=torch.where(moved[:, None], self.observe(self.state), result.observation))
 
     def _shorten(self, ended: torch.Tensor) -> None:
         """Cuts a share of the episodes that have just begun: their clocks start late, which no observation shows."""
