@@ -60,6 +60,7 @@ def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
     config = replace(
         LEARNERS["shac"].settings(name), total_iterations=4, num_envs=4, horizon=3, hidden=(8,), compile=False
     )
+    config = replace(config, dear_share=0.5)
     whole = shac.Shac(task, params, config)
     for _ in range(4):
         whole.iterate()
@@ -91,6 +92,19 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     for _ in range(config.total_iterations):
         learner.iterate()
     assert training.score(learner.network, task).cost_ratio < 0.7 * before.cost_ratio
+
+
+def test_shac_starts_a_share_of_its_episodes_where_its_critic_expects_most():
+    task, params = TASKS["stabilize"](), default_params()
+    config = shac.ShacConfig(num_envs=100, hidden=(8,), reset_fraction=0.5, dear_share=0.4, compile=False)
+    learner = shac.Shac(task, params, config)
+    which = torch.arange(100) % 2 == 0
+    before = learner._start
+    seen = learner._new_episodes(which)
+    assert torch.equal(seen[~which], before[~which])
+    costs = learner.target(seen).detach()[which]
+    assert costs[:20].min() > costs[20:].median() * 2
+    assert torch.equal(learner._batch.observe(learner._state), seen)
 
 
 def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():

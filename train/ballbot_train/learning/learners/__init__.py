@@ -77,7 +77,7 @@ _MAY_BE_ZERO = {
     "tube_samples",
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
-_SHARES = {"batch_dear_share", "beta", "final_gamma", "gae_lambda", "gamma", "tau"}
+_SHARES = {"batch_dear_share", "beta", "dear_share", "final_gamma", "gae_lambda", "gamma", "tau"}
 _POSITIVE = {
     "demo_critic_learning_rate",
     "demo_std",

@@ -46,6 +46,9 @@ class ShacConfig:
     """Length of a window, through which the gradient runs, in control steps."""
     reset_fraction: float = 0.4
     """Share of the envs that start a new episode after each window, because the first second costs most."""
+    dear_share: float = 0.0
+    """Share of the new episodes that are the dearest of 16 times as many that are drawn, as the critic expects: a good
+    policy fails nowhere else."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers of policy and critic."""
     symmetry: RoutedSymmetry = "none"
@@ -94,6 +97,7 @@ class ShacConfig:
 _SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
 _DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
 _ENDLESS = 10**6  # control steps: longer than any episode in training
+_DEAR_AMONG = 16  # episodes that are drawn for each of the dearest
 
 TUNED: dict[str, ShacConfig] = {
     "stabilize": ShacConfig(symmetry="odd"),
@@ -182,6 +186,10 @@ class Shac:
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), config.learning_rate, betas=(0.7, 0.95))
         self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
         self._start = self._batch.reset(seed=seed)  # (B, no) first observations of the running episodes
+        dear = round(config.dear_share * config.reset_fraction * config.num_envs)  # new episodes of an iteration
+        self._drawn = BallbotBatch(self.task, _DEAR_AMONG * dear, compile=False, params=params) if dear else None
+        if self._drawn is not None:
+            self._drawn.reset(seed=seed + config.num_envs)
         self._step = self._one_step
         if config.compile:
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
@@ -228,8 +236,7 @@ class Shac:
         critic_loss = self._learn_values(log, last.detach())
         self._batch.state = BatchState(*(part.detach() for part in state))
         old = torch.rand(config.num_envs, generator=self._random) < config.reset_fraction
-        fresh = self._batch.reset(mask=old)
-        self._start = torch.where(old[:, None], fresh, start.detach())
+        self._start = torch.where(old[:, None], self._new_episodes(old), start.detach())
         self.iteration += 1
         failures = sum(float(record.failed.sum()) for record in log)
         ends = failures + sum(float(record.exited.sum()) for record in log) + float(old.sum())
@@ -250,6 +257,7 @@ class Shac:
             "policy_optimizer": self._policy_optimizer.state_dict(),
             "critic_optimizer": self._critic_optimizer.state_dict(),
             "batch": list(self._state),
+            "drawn": None if self._drawn is None else list(cast(BatchState, self._drawn.state)),
             "start": self._start,
             "random": self._random.get_state(),
         }
@@ -263,10 +271,28 @@ class Shac:
         self._critic_optimizer.load_state_dict(state["critic_optimizer"])
         self._batch.state, self._start = BatchState(*state["batch"]), state["start"]
         self._random.set_state(state["random"])
+        if self._drawn is not None:
+            self._drawn.state = BatchState(*state["drawn"])
 
     @property
     def _state(self) -> BatchState:
         return cast(BatchState, self._batch.state)  # reset in __init__
+
+    def _new_episodes(self, which: torch.Tensor) -> torch.Tensor:
+        """Starts new episodes in some envs (B,); returns the observations (B, no) of all. Some are the dearest of many."""
+        observations = self._batch.reset(mask=which)
+        if self._drawn is None:
+            return observations
+        seen = self._drawn.reset()
+        drawn = cast(BatchState, self._drawn.state)
+        with torch.no_grad():
+            dearest = self.target(seen).topk(self._drawn.num_envs // _DEAR_AMONG).indices
+        places = which.nonzero()[:, 0][: len(dearest)]
+        dearest = dearest[: len(places)]
+        x, c = self._state.x.clone(), self._state.c.clone()
+        x[:, places], c[:, places] = drawn.x[:, dearest], drawn.c[:, dearest]
+        self._batch.state = self._state._replace(x=x, c=c)
+        return self._batch.observe(self._state)
 
     def _annealed(self, rate: float) -> float:
         """A learning rate in the present iteration."""
