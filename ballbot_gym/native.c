@@ -99,6 +99,8 @@ enum { REWARD, COST, SURVIVE, RUNNING, GOAL };
 typedef struct {
     int64_t taken, done; /* robots that threads have taken, and finished */
     int64_t B;
+    int64_t bad;         /* whether an action is not finite */
+    int64_t env, component; /* how far apart the actions of robots are, and the components of one, in numbers */
     const real *x, *c, *action;
     const int64_t *steps, *episode, *seed;
     const uint8_t *idle;  /* whose action is ignored, and whose next episode begins; null where there are none */
@@ -114,55 +116,72 @@ typedef struct {
     float *end_seen;      /* and a row for each robot, of which those that end are written. */
 } Memory;
 
-/* One control step of robots n to n + count - 1, at most LANES, and what they see then; no episode begins. */
-static void step_block(const Memory *m, int64_t n, int64_t count) {
+/* Tells the rewards, costs and flags of robots n to n + count - 1. Where count is known, the compiler makes SIMD of it. */
+static inline __attribute__((always_inline)) void tell(const Memory *m, int64_t n, int64_t count, const real *paid,
+                                                       const real *marks, const real *limit) {
     const int64_t B = m->B;
-    real *const told = m->told + n;
-    real taken[LANES], paid[2 * LANES], marks[FLAGS * LANES], limit[LANES];
-    for (int k = 0; k < LANES; ++k)
-        taken[k] = (real)(k < count ? m->steps[n + k] : 0);
-    if (count == LANES) {
-        advance(m->x + n, B, m->c + n, B, m->action + n, B, taken, LANES, told, B, told + FORCE * B, B,
-                told + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
-        look(told, B, m->c + n, B, m->seen + n, B, told + TILT * B, B);
-    } else {
-        real in[(10 + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
-        real *const cs = in + 8 * LANES, *const as = cs + CONSTANTS * LANES, *const ss = out + TOLD * LANES;
-        rows_copy(8, count, m->x + n, B, in, LANES);
-        rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
-        rows_copy(2, count, m->action + n, B, as, LANES);
-        advance(in, LANES, cs, LANES, as, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
-                out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
-        look(out, LANES, cs, LANES, ss, LANES, out + TILT * LANES, LANES);
-        rows_copy(TOLD, count, out, LANES, told, B);
-        rows_copy(SEEN, count, ss, LANES, m->seen + n, B);
-    }
+    double *const pay = m->pay + n;
+    uint8_t *const flags = m->flags + n;
     for (int64_t k = 0; k < count; ++k) {
         const double reward = paid[k], cost = paid[LANES + k];
         /* the cost has a failure's price too, and the reward has not */
         const double running = limit[k] >= 0 ? reward - SURVIVAL_REWARD : -cost;
-        const double goal = FIRST_EXIT && marks[SUCCESS * LANES + k] != 0 ? reward - SURVIVAL_REWARD - running : 0;
-        double *const pay = m->pay + n + k;
-        pay[REWARD * B] = reward;
-        pay[COST * B] = cost;
-        pay[SURVIVE * B] = SURVIVAL_REWARD;
-        pay[RUNNING * B] = running;
-        pay[GOAL * B] = goal;
+        pay[REWARD * B + k] = reward;
+        pay[COST * B + k] = cost;
+        pay[SURVIVE * B + k] = SURVIVAL_REWARD;
+        pay[RUNNING * B + k] = running;
+        pay[GOAL * B + k] = FIRST_EXIT && marks[SUCCESS * LANES + k] != 0 ? reward - SURVIVAL_REWARD - running : 0;
+    }
+    for (int64_t k = 0; k < count; ++k) {
         m->violated[n + k] = (int64_t)limit[k];
         m->new_steps[n + k] = m->steps[n + k] + 1;
     }
     for (int i = 0; i < FLAGS; ++i)
         for (int64_t k = 0; k < count; ++k)
-            m->flags[i * B + n + k] = (uint8_t)(marks[i * LANES + k] != 0);
+            flags[i * B + k] = (uint8_t)(marks[i * LANES + k] != 0);
     for (int64_t k = 0; k < count; ++k)
-        m->flags[DONE * B + n + k] = m->flags[TERMINATED * B + n + k] | m->flags[TRUNCATED * B + n + k];
+        flags[DONE * B + k] = flags[TERMINATED * B + k] | flags[TRUNCATED * B + k];
+}
+
+/* One control step of robots n to n + count - 1, at most LANES, and what they see then; no episode begins. */
+static void step_block(Memory *m, int64_t n, int64_t count) {
+    const int64_t B = m->B;
+    const real *const action = m->action + n * m->env;
+    real *const told = m->told + n;
+    real taken[LANES] = {0}, acts[2 * LANES] = {0}, paid[2 * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
+    for (int64_t k = 0; k < count; ++k) {
+        acts[k] = action[k * m->env];
+        acts[LANES + k] = action[k * m->env + m->component];
+        taken[k] = (real)m->steps[n + k];
+    }
+    for (int k = 0; k < 2 * LANES; ++k)
+        off += acts[k] - acts[k]; /* not a number, unless all are finite */
+    if (!(off == 0))
+        __atomic_store_n(&m->bad, 1, __ATOMIC_RELAXED);
+    if (count == LANES) {
+        advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, told, B, told + FORCE * B, B,
+                told + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
+        look(told, B, m->c + n, B, m->seen + n, B, told + TILT * B, B);
+        tell(m, n, LANES, paid, marks, limit);
+    } else {
+        real in[(8 + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
+        real *const cs = in + 8 * LANES, *const ss = out + TOLD * LANES;
+        rows_copy(8, count, m->x + n, B, in, LANES);
+        rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
+        advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
+                out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
+        look(out, LANES, cs, LANES, ss, LANES, out + TILT * LANES, LANES);
+        rows_copy(TOLD, count, out, LANES, told, B);
+        rows_copy(SEEN, count, ss, LANES, m->seen + n, B);
+        tell(m, n, count, paid, marks, limit);
+    }
 }
 
 /* Robot n of rows of numbers becomes 0. */
 #define CLEAR(rows, pointer) for (int i = 0; i < (rows); ++i) (pointer)[i * B + n] = 0
 
 /* The step of the robots first to last - 1, and the starts of their next episodes. */
-static void step_chunk(const Memory *m, int64_t first, int64_t last) {
+static void step_chunk(Memory *m, int64_t first, int64_t last) {
     const int64_t B = m->B, size = last - first;
     int64_t begun[CHUNK], count = 0;
     for (int64_t n = first; n < last; n += LANES)

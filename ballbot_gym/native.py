@@ -7,9 +7,8 @@ bit-identical wherever an env stands in whatever batch.
 
 import ctypes
 import os
-import sys
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any, NamedTuple
@@ -18,10 +17,11 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_num_envs, seeds_of
+from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_finite, check_num_envs, seeds_of
 from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.spares import Spares
 from ballbot_gym.tasks import Task
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
@@ -159,6 +159,10 @@ class BallbotNative:
 
         The first info is of the envs now, the second of the step even where its end began a new episode. Without restart
         they are the same.
+
+        Raises:
+            ValueError: an action is not finite; the envs stay as they are.
+            gymnasium.error.ResetNeeded: before the first reset.
         """
         old = self.state
         if old is None:
@@ -169,9 +173,19 @@ class BallbotNative:
         told, seen, pay, flags, violated, steps = made[:6]
         episode, c = made[6:8] if begins else (old.episode, old.c)
         end_told, end_pay, end_flags, end_seen = made[8:] if restart else (told, pay[1:], flags[2:5], None)
-        read = _pointers(old.x, old.c, actions.T, old.steps, old.episode, old.seed)
+        given = actions
+        if any(stride % actions.itemsize for stride in actions.strides):
+            actions = actions.copy()
+        apart = (stride // actions.itemsize for stride in actions.strides)
+        actions = (
+            actions.T if actions.flags.f_contiguous else actions
+        )  # the same memory, in the order that `_pointer` likes
+        read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
         idle = 0 if waiting is None else _pointer(waiting)
-        self._run(_Memory(0, 0, self.num_envs, *read, idle, *addresses))
+        memory = _Memory(0, 0, self.num_envs, 0, *apart, *read, idle, *addresses)
+        self._run(memory)
+        if memory.bad:  # what was written is forgotten
+            check_finite(given)
         self._state = old._replace(x=told[:8], c=c, steps=steps, episode=episode)
         observation = seen.astype(np.float32, copy=False).T
         terminated, truncated, _, _, _, done = flags
@@ -228,7 +242,7 @@ class BallbotNative:
         self._look(self._all, state, seen, tilt)
         return seen, tilt
 
-    def _written(self) -> list["_Spare"]:
+    def _written(self) -> list[Spares]:
         """What a step writes, in the order of `_Memory`: 6 arrays always, 2 where episodes begin, 4 where they ended."""
         size, rows, real = self.num_envs, 11 + (4 if self.params.grips else 0), self.dtype
         kinds: list[tuple[tuple[int, ...], Any]] = [
@@ -245,7 +259,12 @@ class BallbotNative:
             ((3, size), np.bool_),
             ((size, self._seen_rows), np.float32),
         ]
-        return [_Spare(*kind) for kind in kinds]
+
+        def empty(shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
+            array = np.empty(shape, dtype)
+            return array, _pointer(array)
+
+        return [Spares(partial(empty, *kind)) for kind in kinds]
 
     def _run(self, memory: "_Memory") -> None:
         """A step, by several threads where that is faster."""
@@ -256,49 +275,11 @@ class BallbotNative:
         self._code.step(memory)
 
 
-class _Spare:
-    """Arrays of one kind whose memory is that of earlier ones to which nobody refers any more.
-
-    Memory that goes back to the system comes again as pages that the system clears, which takes longer than a step of large
-    batches. Views refer to the array whose memory they show.
-    """
-
-    _MOST = 4
-    """Arrays that are kept: of two steps, and two that users may hold for a while."""
-
-    def __init__(self, shape: tuple[int, ...], dtype: Any):
-        """Args: as of `np.empty`."""
-        self._shape, self._dtype = shape, dtype
-        self._kept: list[tuple[np.ndarray, int]] = []
-
-    def take(self) -> tuple[np.ndarray, int]:
-        """An array whose numbers are undefined, and where its memory begins."""
-        for array, address in self._kept:
-            if sys.getrefcount(array) == _KEPT_ONLY:
-                return array, address
-        array = np.empty(self._shape, self._dtype)
-        self._kept.append((array, _pointer(array)))
-        if len(self._kept) > self._MOST:
-            del self._kept[0]
-        return self._kept[-1]
-
-
-def _references(kept: list[tuple[np.ndarray, int]]) -> int:
-    """To the first array, as `_Spare.take` counts them; how many a local variable adds depends on the Python."""
-    for array, _ in kept:
-        return sys.getrefcount(array)
-    return 0
-
-
-_KEPT_ONLY = _references([(np.empty(1), 0)])
-"""References to an array that is only kept."""
-
-
 class _Memory(ctypes.Structure):
     """What a step reads and writes; native.c says what each is."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("taken", "done", "size")),
+        *((name, ctypes.c_int64) for name in ("taken", "done", "size", "bad", "env", "component")),
         *(
             (name, ctypes.c_void_p)
             for name in (

@@ -28,6 +28,7 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.scene import Scene
 from ballbot_gym.simulator import PHYSICS
+from ballbot_gym.spares import fill, sparse_objects
 from ballbot_gym.tasks import Task
 
 try:
@@ -38,7 +39,7 @@ except ImportError as error:
         'gymnasium.make_vec(..., vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, tilt_of
+from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, tilt_of
 from ballbot_gym.loop import BallbotLoop
 
 if TYPE_CHECKING:
@@ -168,6 +169,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self._limit_names = np.array([*limit_names(self.task, self.params), ""], dtype=object)  # the last has index −1
         self._no_names = np.full(self.num_envs, "", dtype=object)
         self._everywhere = np.ones(self.num_envs, np.bool_)
+        self._objects = sparse_objects(self.num_envs)
         self._no_names.flags.writeable = self._everywhere.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
         self._scene: Scene | None = None
@@ -240,13 +242,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
-        actions = np.asarray(actions, self._dtype, order="F")  # components contiguous, as everything in the batch
+        actions = np.asarray(actions, self._dtype)
         if actions.shape != (self.num_envs, 2):
             raise ValueError(f"actions must have shape ({self.num_envs}, 2), not {actions.shape}")
-        # for one env, all() and any() take several times as long as counting
-        if np.count_nonzero(np.isfinite(actions)) < actions.size:
-            bad = np.flatnonzero(~np.isfinite(actions).all(1))
-            raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
         waiting = self._ended if np.count_nonzero(self._ended) else None
         if waiting is not None and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
@@ -261,7 +259,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             self._ended = done
         elif ended.size:
             infos["final_info"] = self._info(end, done, ended)
-            infos["final_obs"] = _some_rows(result.final_observation, ended, self.num_envs)
+            infos["final_obs"] = fill(
+                self._objects, ended, np.fromiter(result.final_observation, dtype=object, count=ended.size)
+            )
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
         infos |= self._info(now, self._everywhere)
@@ -364,6 +364,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """
         if not isinstance(self.batch, BallbotBatch | BallbotLoop):
             return self.batch.step_with_infos(actions, waiting, restart)
+        check_finite(actions)
         constants = self._x_and_c()[1]
         if isinstance(self.batch, BallbotLoop):
             result: Any = self.batch.step(actions, waiting, restart)
@@ -424,9 +425,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         x, c, names = told.x.T, told.c.T, self._no_names
         x.flags.writeable = c.flags.writeable = False
         if np.count_nonzero(told.failure):
-            named = told.failure.nonzero()[0] if which is None else which
-            names = names.copy() if which is None else np.empty(self.num_envs, dtype=object)
-            names[named] = self._limit_names[told.violated[named]]
+            if which is None:
+                names, failed = names.copy(), told.failure.nonzero()[0]
+                names[failed] = self._limit_names[told.violated[failed]]
+            else:
+                names = fill(self._objects, which, self._limit_names[told.violated[which]])
         values = (
             x, told.cost, *told.reward_parts, told.tilt, told.success, told.failure, names, told.force.T, told.clipped, c
         )  # fmt: skip
@@ -622,10 +625,3 @@ def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
     for row in np.atleast_2d(copied):  # one after the other, which NumPy does three times as fast
         row[indices] = 0
     return copied
-
-
-def _some_rows(rows: np.ndarray, indices: np.ndarray, size: int) -> np.ndarray:
-    """Gymnasium's layout of `final_obs`: (size,) objects, rows where an index is given, else None."""
-    objects = np.empty(size, dtype=object)  # full of None
-    objects[indices] = np.fromiter(rows, dtype=object, count=len(rows))
-    return objects
