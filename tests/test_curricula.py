@@ -215,7 +215,7 @@ def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
     torch.manual_seed(0)
     first = made.state.c.clone()
     run(made, made.task.steps)  # nobody gets to the gate in so short a time
-    again = made._kind == curricula._RETRY
+    again = made._again
     assert 0.4 < float(again.double().mean()) < 0.6
     assert set(made.state.c[0, again].tolist()) <= set(first[0].tolist())
     assert not set(made.state.c[0, ~again].tolist()) & set(first[0].tolist())
@@ -224,17 +224,31 @@ def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
     result = made.step(torch.zeros(400, 2))
     torch.testing.assert_close(result.observation, made.observe(made.state))
     run(made, 40 * made.task.steps)
-    assert made._hard.shape == (9, curricula._KEPT_STARTS)
+    assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0)]
+
+
+def test_episodes_on_optima_that_went_wrong_are_repeated_as_such():
+    made = batch(curriculum=Curriculum(retries=1.0, starts_on_optima=1.0), num_envs=50)
+    given(made, starts := some_starts(made.task))
+    torch.manual_seed(0)
+    run(made, 2 * made.task.steps)
+    assert made._again.all()
+    assert (made._kind == curricula._ON_OPTIMUM).all()
+    known = {(*x, int(k)) for x, k in zip(starts.x.float().T.tolist(), starts.steps, strict=True)}
+    assert {(*x, int(k)) for x, k in zip(made._begun[:8].T.tolist(), made._begun[-1], strict=True)} <= known
+    counts = made._on_optima.state()
+    run(made, made.task.steps)
+    assert counts == pytest.approx(made._on_optima.state(), nan_ok=True)
 
 
 def test_only_failures_are_repeated_where_an_episode_that_runs_out_of_time_may_be_a_good_one():
     made = batch("stabilize", Curriculum(retries=1.0), num_envs=50)
     run(made, made.task.steps)
-    assert not made._kind.any()
-    assert made._hard.shape[1] == 0
+    assert not made._again.any()
+    assert made._hard[0].shape[1] == 0
     made = batch("stabilize", Curriculum(retries=1.0), num_envs=50, duration=2.0)
     run(made, made.task.steps - 1)
-    assert (made._kind == curricula._RETRY).sum() > 10  # without any force the robot falls
+    assert made._again.sum() > 10  # without any force the robot falls
 
 
 def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():

@@ -9,9 +9,9 @@ A curriculum changes training alone. What is evaluated is always the task itself
   episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them. These
   episodes can begin shortly before the end of their optimum at first, and ever earlier as enough of them succeed (Florensa et
   al., "Reverse curriculum generation for reinforcement learning", 2017).
-- A share of the episodes repeats starts from which recent episodes failed or missed their goal, so that what is hard is met
-  more often, as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized level replay",
-  2021).
+- A share of the episodes, also of those on optima, repeats starts from which recent ones failed or missed their goal. So what
+  is hard is met more often, as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized
+  level replay", 2021).
 - A share of the episodes is cut soon after its start, so that more of the samples are of starts.
 - Rewards are shaped by a potential, minus the distance to the goal. Shaping by a potential moves no optimum (Ng et al.,
   "Policy invariance under reward transformations", 1999).
@@ -38,7 +38,7 @@ from ballbot_train.evaluation import fresh
 
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
-_OWN, _ON_OPTIMUM, _RETRY = 0, 1, 2  # how an episode began
+_OWN, _ON_OPTIMUM = 0, 1  # how an episode began
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
 
 
@@ -76,8 +76,8 @@ class Curriculum:
     starts_step: float = 0.1
     """How much longer that gets whenever enough of these episodes succeed, s."""
     retries: float = 0.0
-    """Share of the training episodes that repeat the start of one of the last episodes that failed or, on a task that ends
-    at its goal, missed it; 0: off. They do not count for `success`."""
+    """Share of the training episodes, of the task's own and of those on optima, that repeat the start of one of the last such
+    episodes that failed or, on a task that ends at its goal, missed it; 0: off. They do not count for `success`."""
     short_episodes: float = 0.0
     """Share of the training episodes that are cut after `short_seconds`; 0: off. So more of the samples are of the starts,
     where most of a good policy's regret arises."""
@@ -210,14 +210,14 @@ class CurriculumBatch(BallbotBatch):
         self._goal_factor = curriculum.goal_factor
         self._ramp = curriculum.ramp_start if curriculum.ramp else 0.0
         self._reach = curriculum.starts_seconds
-        self._own_episodes, self._on_optima = (
-            _Tally(),
-            _Tally(),
-        )  # that ended: the task's own, and those begun on optima
+        self._own_episodes, self._on_optima = _Tally(), _Tally()  # that ended, by how they began
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
-        constants = len(task.constant_names)
-        self._begun = torch.zeros(8 + constants, num_envs)  # states and constants at the starts of the running episodes
-        self._hard = torch.zeros(8 + constants, 0)  # those of the last episodes that went wrong
+        self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
+        rows = 8 + len(task.constant_names) + 1
+        self._begun = torch.zeros(
+            rows, num_envs
+        )  # states, constants and passed steps at the starts of the running episodes
+        self._hard = [torch.zeros(rows, 0)] * 2  # those of the last episodes of either kind that went wrong
         self._demos, self._full = demos, task if full is None else full
         self._starts: Starts | None = None
         if demos is not None and curriculum.starts_on_optima:
@@ -241,6 +241,7 @@ class CurriculumBatch(BallbotBatch):
         observation = super().reset(*args, mask=mask, **given)
         begun = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
         self._kind = torch.where(begun, _OWN, self._kind)
+        self._again = self._again & ~begun
         self._begin(begun)
         return observation
 
@@ -262,18 +263,17 @@ class CurriculumBatch(BallbotBatch):
             # An episode that terminates ends with a potential of 0, and a truncated one goes on.
             reward = reward + self.gamma * torch.where(result.terminated, 0.0, end) - start
         ended = result.terminated | result.truncated
-        self._count(ended & (self._kind == _OWN), result.success)
+        counted = ended & ~self._again
+        self._count(counted & (self._kind == _OWN), result.success)
         if self.curriculum.starts_on_optima:
-            self._count_starts(ended & (self._kind == _ON_OPTIMUM), result.success)
+            self._count_starts(counted & (self._kind == _ON_OPTIMUM), result.success)
         if self.curriculum.retries:
-            missed = result.truncated & ~result.success if task.first_exit else torch.zeros_like(ended)
-            wrong = (result.failure | missed) & (self._kind != _ON_OPTIMUM)
-            self._hard = torch.cat([self._hard, self._begun[:, wrong]], 1)[:, -_KEPT_STARTS:]
-        self._kind = torch.where(ended, _OWN, self._kind)
+            self._keep_hard(result)
+        self._kind, self._again = torch.where(ended, _OWN, self._kind), self._again & ~ended
         if self.curriculum.starts_on_optima:
             result = self._start_on_optima(result, ended)
         if self.curriculum.retries:
-            result = self._retry(result, ended & (self._kind == _OWN))
+            result = self._retry(result, ended)
         self._begin(ended)
         if self.curriculum.short_episodes:
             self._shorten(ended)
@@ -288,6 +288,7 @@ class CurriculumBatch(BallbotBatch):
             "own_episodes": self._own_episodes.state(),
             "on_optima": self._on_optima.state(),
             "kind": self._kind,
+            "again": self._again,
             "begun": self._begun,
             "hard": self._hard,
             "starts": None if self._starts is None else list(self._starts),
@@ -297,7 +298,8 @@ class CurriculumBatch(BallbotBatch):
         """Goes back to a state."""
         self._goal_factor, self._ramp, self._reach = state["goal_factor"], state["ramp"], state["reach"]
         self._own_episodes, self._on_optima = _Tally(*state["own_episodes"]), _Tally(*state["on_optima"])
-        self._kind, self._begun, self._hard = state["kind"], state["begun"], state["hard"]
+        self._kind, self._again = state["kind"], state["again"]
+        self._begun, self._hard = state["begun"], list(state["hard"])
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
         self._set_difficulty()
 
@@ -362,22 +364,40 @@ class CurriculumBatch(BallbotBatch):
             self._eligible = outside if len(outside) else near.nonzero()[:, 0]
         moved = ended & (torch.rand(self.num_envs) < self.curriculum.starts_on_optima)
         self._kind = torch.where(moved, _ON_OPTIMUM, self._kind)
-        chosen = self._eligible[torch.randint(len(self._eligible), (int(moved.sum()),))]
-        starts = self._starts
+        starts, count = self._starts, int(moved.sum())
+        if not count:
+            return result
+        lengths = (starts.steps + starts.left)[self._eligible]  # so that every optimum is met as often as any other
+        chosen = self._eligible[torch.multinomial(1.0 / lengths, count, replacement=True)]
         return self._moved(result, moved, starts.x[:, chosen], starts.c[:, chosen], starts.steps[chosen])
 
+    def _keep_hard(self, result: BatchStep) -> None:
+        """Remembers the starts of the episodes that have just gone wrong."""
+        wrong = result.failure
+        if self.task.first_exit:
+            wrong = wrong | (result.truncated & ~result.success)
+        for kind in (_OWN, _ON_OPTIMUM):
+            starts = self._begun[:, wrong & (self._kind == kind)]
+            self._hard[kind] = torch.cat([self._hard[kind], starts], 1)[:, -_KEPT_STARTS:]
+
     def _retry(self, result: BatchStep, ended: torch.Tensor) -> BatchStep:
-        """Moves a share of the episodes that have just begun to starts from which others went wrong."""
-        again = ended & (torch.rand(self.num_envs) < self.curriculum.retries) & (self._hard.shape[1] > 0)
-        self._kind = torch.where(again, _RETRY, self._kind)
-        count = int(again.sum())
-        chosen = self._hard[:, torch.randint(max(1, self._hard.shape[1]), (count,))]
-        return self._moved(result, again, chosen[:8], chosen[8:], torch.zeros(count, dtype=torch.int64))
+        """Moves a share of the episodes that have just begun to starts from which others of their kind went wrong."""
+        drawn = ended & (torch.rand(self.num_envs) < self.curriculum.retries)
+        for kind in (_OWN, _ON_OPTIMUM):
+            hard = self._hard[kind]
+            again = drawn & (self._kind == kind)
+            if not hard.shape[1]:
+                continue
+            self._again = self._again | again
+            chosen = hard[:, torch.randint(hard.shape[1], (int(again.sum()),))]
+            result = self._moved(result, again, chosen[:8], chosen[8:-1], chosen[-1].long())
+        return result
 
     def _begin(self, begun: torch.Tensor) -> None:
         """Remembers the starts of the episodes that have just begun."""
         assert self.state is not None
-        self._begun = torch.where(begun, torch.cat([self.state.x, self.state.c]).float(), self._begun)
+        starts = torch.cat([self.state.x, self.state.c, self.state.steps[None]]).float()
+        self._begun = torch.where(begun, starts, self._begun)
 
     def _moved(
         self, result: BatchStep, moved: torch.Tensor, x: torch.Tensor, c: torch.Tensor, passed: torch.Tensor
