@@ -166,8 +166,8 @@ def solve(
     """Solves a problem from a guess.
 
     A guess that is no motion, such as the paper's straight line from state to state, is first bent toward a motion by one
-    Newton step on the dynamics. Without that step the solvers take up to 12 times as many iterations from the line, or stop
-    at an infeasible point.
+    or two Newton steps on the dynamics. Without them the solvers take up to 12 times as many iterations from the line, or
+    stop at an infeasible point.
 
     Raises:
         PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.

@@ -33,6 +33,10 @@ ACCEPTABLE = "Solved_To_Acceptable_Level"
 _DAMPING = (
     1e-8  # of the Newton step toward consistency, for constraints that repeat each other or have no free variables
 )
+_FAR = 5.0
+"""Largest change of a variable by a Newton step toward consistency, from which a second step follows. Measured on 33 turns
+and stops from straight lines: where the first changes more, a second one saves fatrop a third of its iterations on turns and
+costs it two on stops; where it changes less it saves nothing."""
 
 
 def no_path(s: casadi.SX, w: casadi.SX, p: casadi.SX) -> casadi.SX:
@@ -214,7 +218,6 @@ class OcpSolver:
             }
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
-        self._jac_at = tuple(map(np.array, self._jac_g.sparsity_out(1).get_triplet()))  # rows and columns
         spent.setup += time.perf_counter() - began
 
     def solve(
@@ -270,10 +273,10 @@ class OcpSolver:
     def toward_consistency(
         self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A guess moved by the shortest Newton step toward all equality constraints.
+        """A guess moved by the shortest Newton step toward all equality constraints, and by a second one where that is far.
 
         Use it for guesses that violate the dynamics, such as a straight line between two states: the step bends them toward
-        the nearest motion. Guesses that obey the constraints do not change. The step takes as long as one or two iterations.
+        the nearest motion. Guesses that obey the constraints do not change. A step takes as long as one or two iterations.
 
         Args:
             states: as `solve` takes them.
@@ -287,20 +290,20 @@ class OcpSolver:
         lower = _interleave(bounds.state_lower, bounds.input_lower)
         upper = _interleave(bounds.state_upper, bounds.input_upper)
         z = np.clip(_interleave(states, inputs), lower, upper)
-        g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
-        rows, columns = self._jac_at
-        equal = self._g_upper == 0
-        kept = equal[rows] & (lower < upper)[columns]
-        step = _least_norm(
-            np.array(jacobian.nonzeros())[kept],
-            (np.cumsum(equal) - 1)[rows[kept]],
-            columns[kept],
-            -np.array(g).ravel()[equal],
-            len(z),
-        )
-        if np.isfinite(step).all():
+        free, equal = lower < upper, self._g_upper == 0
+        for _ in range(2):
+            g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
+            step = self._newton.solve(np.array(jacobian.nonzeros()), free, -np.array(g).ravel()[equal])
+            if not np.isfinite(step).all():
+                break
             z = np.clip(z + step, lower, upper)
+            if np.abs(step).max(initial=0.0) < _FAR:
+                break
         return self._divide(z)
+
+    @functools.cached_property
+    def _newton(self) -> "_LeastNorm":
+        return _LeastNorm(self._jac_g.sparsity_out(1), self._g_upper == 0)
 
     def _divide(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
@@ -319,29 +322,39 @@ def _equality(equalities: int, constraints: int) -> list[bool]:
     return [True] * equalities + [False] * (constraints - equalities)
 
 
-def _least_norm(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, right: np.ndarray, size: int) -> np.ndarray:
-    """The shortest v (size,) with M v = right, up to `_DAMPING`.
+class _LeastNorm:
+    """The shortest v (size,) with M v = right, up to `_DAMPING`, for matrices M whose nonzeros stand at the same places.
 
-    Args:
-        values: nonzeros of M, column by column and downwards.
-        rows: that they stand in. They stand stage by stage, so M·Mᵀ is banded.
-        columns: that they stand in.
-        right: a number for each row.
-        size: number of columns.
+    What depends on these places alone is found once.
     """
-    places, products = [np.arange(len(right))], [np.full(len(right), _DAMPING)]
-    for ahead in range(len(values)):  # M·Mᵀ sums the products of two nonzeros of one column
-        first = np.flatnonzero(columns[ahead:] == columns[: len(columns) - ahead])
-        if not first.size:
-            break
-        second = first + ahead
-        places.append((rows[second] - rows[first]) * len(right) + rows[first])
-        products.append(values[second] * values[first])
-    filled = np.bincount(np.concatenate(places), np.concatenate(products))
-    band = np.zeros((-(-len(filled) // len(right)), len(right)))
-    band.flat[: len(filled)] = filled
-    solved = scipy.linalg.solveh_banded(band, right, lower=True)
-    return np.bincount(columns, values * solved[rows], size)
+
+    def __init__(self, sparsity: casadi.Sparsity, of_rows: np.ndarray):
+        """Makes it for the rows of a matrix that a mask has; they stand stage by stage, so M·Mᵀ is banded."""
+        rows, columns = map(np.array, sparsity.get_triplet())
+        count, self._size = int(of_rows.sum()), sparsity.size2()
+        self._kept = of_rows[rows]
+        self._rows, self._columns = (np.cumsum(of_rows) - 1)[rows[self._kept]], columns[self._kept]
+        firsts = [np.empty(0, np.int64)]
+        seconds = firsts.copy()
+        for ahead in range(len(self._rows)):  # M·Mᵀ sums the products of two nonzeros of one column
+            first = np.flatnonzero(self._columns[ahead:] == self._columns[: len(self._columns) - ahead])
+            if not first.size:
+                break
+            firsts.append(first)
+            seconds.append(first + ahead)
+        self._first, self._second = np.concatenate(firsts), np.concatenate(seconds)
+        below = self._rows[self._second] - self._rows[self._first]
+        self._places = below * count + self._rows[self._first]
+        self._shape = int(below.max(initial=0)) + 1, count
+
+    def solve(self, values: np.ndarray, free: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """v, given all nonzeros, column by column and downwards; which components of v may differ from 0; and right."""
+        values = values[self._kept] * free[self._columns]
+        products = values[self._second] * values[self._first]
+        band = np.bincount(self._places, products, self._shape[0] * self._shape[1]).reshape(self._shape)
+        band[0] += _DAMPING
+        solved = scipy.linalg.solveh_banded(band, right, overwrite_ab=True, lower=True)
+        return np.bincount(self._columns, values * solved[self._rows], self._size)
 
 
 def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
