@@ -147,31 +147,6 @@ def test_the_discount_of_ppo_rises_and_takes_all_values_with_it():
     assert learner._model.rollout_buffer.gamma == learner._env.batch.gamma == learner._model.gamma
 
 
-@pytest.mark.parametrize("task", ["stabilize", "orbit", "weave"])
-def test_a_bowl_has_its_summit_in_the_steady_motion_and_rises_with_the_discount(task):
-    settings = replace(TINY["ppo"], symmetry="centred", bowl=True)
-    learner = LEARNERS["ppo"].make(make_task(task), default_params(), settings, 0, None)
-    critic, batch = learner._model.policy.mlp_extractor.critic, learner._env.batch
-    seen = batch.observe(batch.state)
-    frame = FRAMES[learner.network.spec.frame]
-    features, _ = frame.features(seen.unbind(-1))
-    kept, _ = frame.steady(features)
-    for _ in range(2):
-        with torch.no_grad():
-            assert (critic(seen) < critic.level).all()
-            away = sum((feature - steady) ** 2 for feature, steady in zip(features, kept, strict=True))
-            torch.testing.assert_close(critic._inputs.away(seen)[:, 0] > 0, away > 0)
-        run(learner, 1)
-    before = critic.level.item()
-    learner._raise_gamma(0.9999)
-    assert critic.level.item() > before
-
-
-def test_a_bowl_needs_a_centred_actor():
-    with pytest.raises(ValueError, match='bowl needs the symmetry "centred", not "none"'):
-        make("ppo", bowl=True)
-
-
 def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
     learner = make("ppo", relative_advantages=1.0)
     learner.iterate()

@@ -65,8 +65,6 @@ class Frame:
     """Where a route decides on which sides obstacles are passed. `features` then takes these sides behind the observation."""
     steady: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, Any]]] | None = None
     """Features -> features (size), and action in the frame, of the steady motion in which the episode shall end."""
-    motion: int = 8
-    """How many features, the first ones, tell how the robot moves. The others tell where obstacles lie, or small errors."""
 
 
 def _radial(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
@@ -306,7 +304,7 @@ _OBSTACLES_SEEN = 4
 _BALL_RADIUS = 0.1  # m, about
 
 FRAMES: dict[str, Frame] = {
-    "radial": Frame(18, _radial, steady=_steady_orbit, motion=10),
+    "radial": Frame(18, _radial, steady=_steady_orbit),
     "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, steady=_rest_behind_obstacles),
     "routed_slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _routed_slalom, route=Route(5, _slalom_layout, _slalom_sides)),
     "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, steady=_rest_behind_obstacles_fine),

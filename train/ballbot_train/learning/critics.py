@@ -2,9 +2,6 @@
 
 The value of a control problem is nearly a quadratic form. A tanh network alone fits it badly near the goal, and so the robot
 rests beside the goal. A linear path over the products of all pairs of observed quantities fits it exactly.
-
-Where there are obstacles, one quadratic form does not do, and what the fit leaves over is still large beside the cost of a
-small error at the goal. A `BowlCritic` has the summit of its values at the goal by its form.
 """
 
 import itertools
@@ -39,15 +36,6 @@ class CriticInputs:
         self.size = entries + (0 if self._pairs is None else self._pairs.shape[1])
         """Number of inputs."""
 
-    def away(self, observation: torch.Tensor) -> torch.Tensor:
-        """(B, observations) to the squared distance (B, 1) of the frame's features from those of its steady motion."""
-        assert self._frame is not None
-        assert self._frame.steady is not None
-        features, _ = self._frame.features(observation.unbind(-1))
-        kept, _ = self._frame.steady(features)
-        pairs = zip(features[: self._frame.motion], kept, strict=False)
-        return torch.stack([(feature - steady) ** 2 for feature, steady in pairs], -1).sum(-1, keepdim=True)
-
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """(B, observations) to (B, size)."""
         if self._routes is not None:
@@ -76,11 +64,6 @@ class QuadraticCritic(torch.nn.Module):
         self.linear = torch.nn.Linear(inputs.size, 1)
         self.start_at(value)
 
-    @property
-    def level(self) -> torch.nn.Parameter:
-        """(1,) what is added to all values."""
-        return self.linear.bias
-
     def start_at(self, value: float) -> None:
         """Makes all values about `value`."""
         start_at(value, self.linear, cast(torch.nn.Linear, self.mlp[-1]))
@@ -89,33 +72,6 @@ class QuadraticCritic(torch.nn.Module):
         """(B, observations) to values (B, 1)."""
         seen = self._inputs(observation)
         return self.mlp(seen) + self.linear(seen)
-
-
-class BowlCritic(torch.nn.Module):
-    """A level, less the squared distance from the steady motion of the frame times a positive factor.
-
-    So the greatest value is that of the steady motion itself, and the network's errors are relative to the distance.
-    """
-
-    def __init__(
-        self, inputs: CriticInputs, hidden: Sequence[int], activation: type[torch.nn.Module], value: float = 0.0
-    ):
-        """Args: as of `QuadraticCritic`; the frame of the inputs has a steady motion."""
-        super().__init__()
-        self._inputs = inputs
-        self._factor = QuadraticCritic(inputs, hidden, activation)
-        self.level = torch.nn.Parameter(torch.empty(1))
-        self.start_at(value)
-
-    def start_at(self, value: float) -> None:
-        """Makes all values near the steady motion about `value`."""
-        self._factor.start_at(0.0)
-        torch.nn.init.constant_(self.level, value)
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """(B, observations) to values (B, 1)."""
-        factor = torch.nn.functional.softplus(self._factor(observation))
-        return self.level - factor * self._inputs.away(observation)
 
 
 def value_of_living(task: Task, reward_scale: float, gamma: float) -> float:

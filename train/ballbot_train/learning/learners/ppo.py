@@ -21,7 +21,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, spec_for
-from ballbot_train.learning.critics import BowlCritic, CriticInputs, QuadraticCritic, relative_advantages
+from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
 from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
@@ -41,9 +41,6 @@ class PpoConfig(ModelFreeConfig):
     symmetry: Symmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
     over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
-    bowl: bool = False
-    """Whether the critic's values have their summit in the steady motion of the actor's frame by their form; only for an
-    actor that is centred. Then errors of the values are small where little cost is left."""
     final_gamma: float | None = None
     """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
     averaged_iterations: int = 10
@@ -143,7 +140,7 @@ class Branches(torch.nn.Module):
 
     latent_dim_pi, latent_dim_vf = 2, 1
 
-    def __init__(self, actor: MeanAction, critic: QuadraticCritic | BowlCritic):
+    def __init__(self, actor: MeanAction, critic: QuadraticCritic):
         super().__init__()
         self.actor, self.critic = actor, critic
 
@@ -160,23 +157,15 @@ class Branches(torch.nn.Module):
 class BranchedPolicy(ActorCriticPolicy):
     """SB3's policy around an actor that respects a symmetry and a critic that sees products."""
 
-    def __init__(self, *args: Any, spec: PolicySpec, products: bool, value: float, bowl: bool, **kwargs: Any):
-        """Takes what `PPO` passes on, and:
-
-        Args:
-            spec: of the actor.
-            products: whether the critic sees them.
-            value: of every state at the start.
-            bowl: whether the critic's values have their summit in the steady motion.
-        """
+    def __init__(self, *args: Any, spec: PolicySpec, products: bool, value: float, **kwargs: Any):
+        """Args: spec: of the actor; products: whether the critic sees them; value: of every state at the start."""
         self._spec, self._products, self._value = spec, products, value
-        self._critic = BowlCritic if bowl else QuadraticCritic
         super().__init__(*args, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
         inputs = CriticInputs(self.features_dim, self._products, self._spec.frame)
         self.branches = Branches(
-            MeanAction(PolicyNetwork(self._spec)), self._critic(inputs, self._spec.hidden, torch.nn.Tanh)
+            MeanAction(PolicyNetwork(self._spec)), QuadraticCritic(inputs, self._spec.hidden, torch.nn.Tanh)
         )
         self.mlp_extractor = cast(MlpExtractor, self.branches)
 
@@ -198,10 +187,8 @@ class Ppo(ModelFree):
         """Takes demonstrations to imitate, or None.
 
         Raises:
-            ValueError: the task does not have the symmetry that the settings ask for, or they ask for a bowl without it.
+            ValueError: the task does not have the symmetry that the settings ask for.
         """
-        if config.bowl and config.symmetry != "centred":
-            raise ValueError(f'bowl needs the symmetry "centred", not "{config.symmetry}"')
         spec = spec_for(task, config.symmetry, config.hidden)
         super().__init__(task, params, config, demos)
         self.config = config
@@ -223,7 +210,7 @@ class Ppo(ModelFree):
             policy_kwargs=(
                 {"net_arch": list(config.hidden)}
                 if plain
-                else {"spec": spec, "products": config.products, "value": value, "bowl": config.bowl}
+                else {"spec": spec, "products": config.products, "value": value}
             ),
             rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
             rollout_buffer_kwargs=(
@@ -276,9 +263,9 @@ class Ppo(ModelFree):
         """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
         policy = cast(ActorCriticPolicy, self._model.policy)
         more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
-        level = policy.branches.critic.level if isinstance(policy, BranchedPolicy) else policy.value_net.bias
+        critic = policy.branches.critic.linear if isinstance(policy, BranchedPolicy) else policy.value_net
         with torch.no_grad():
-            cast(torch.nn.Parameter, level).add_(more)
+            cast(torch.nn.Linear, critic).bias.add_(more)
         self._take_gamma(gamma)
 
     def _take_gamma(self, gamma: float) -> None:
