@@ -85,7 +85,7 @@ _OF_PPO: dict[str, Range | Choice] = {
 
 SPACES: dict[str, dict[str, Range | Choice]] = {
     "ppo": {
-        "num_steps": Choice((24, 64, 128, 256, 512)),
+        "num_steps": Choice((24, 48, 64, 96, 128, 256, 512)),
         "batch_size": Choice((256, 512, 1024, 2048, 3072)),
         "update_epochs": Choice((3, 5, 10)),
         "learning_rate": Range(1e-4, 5e-3),
