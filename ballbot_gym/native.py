@@ -177,9 +177,8 @@ class BallbotNative:
         if any(stride % actions.itemsize for stride in actions.strides):
             actions = actions.copy()
         apart = (stride // actions.itemsize for stride in actions.strides)
-        actions = (
-            actions.T if actions.flags.f_contiguous else actions
-        )  # the same memory, in the order that `_pointer` likes
+        if actions.flags.f_contiguous:
+            actions = actions.T  # the same memory, in the order that `_pointer` likes
         read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
         idle = 0 if waiting is None else _pointer(waiting)
         memory = _Memory(0, 0, self.num_envs, 0, *apart, *read, idle, *addresses)

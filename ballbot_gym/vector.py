@@ -365,6 +365,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if not isinstance(self.batch, BallbotBatch | BallbotLoop):
             return self.batch.step_with_infos(actions, waiting, restart)
         check_finite(actions)
+        actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
         constants = self._x_and_c()[1]
         if isinstance(self.batch, BallbotLoop):
             result: Any = self.batch.step(actions, waiting, restart)

@@ -127,6 +127,66 @@ def test_what_a_step_returned_never_changes_later_though_memory_is_used_again():
 
 
 @needs_compiler
+def test_actions_may_lie_in_memory_in_any_way():
+    plain = actions_of(21, 30)
+    packed = np.zeros((30, 21), np.dtype([("odd", "i1"), ("action", "f4", 2)]))
+    packed["action"] = plain
+    wide = np.zeros((30, 21, 7), np.float32)
+    wide[..., 5:2:-2] = plain
+    backwards = plain[:, ::-1].copy()[:, ::-1]
+    by_component = plain.transpose(0, 2, 1).copy().transpose(0, 2, 1)
+    expected = play(BallbotVectorEnv(21, "turn", engine="native"), plain, 0)
+    for laid in (packed["action"], wide[..., 5:2:-2], backwards, by_component, plain.astype(float)):
+        got = play(BallbotVectorEnv(21, "turn", engine="native"), laid, 0)
+        assert all(map(np.array_equal, got, expected))
+    one = np.broadcast_to(np.float32([0.3, -0.2]), (21, 2))
+    assert not one.flags.writeable
+    envs = BallbotVectorEnv(21, "turn", engine="native")
+    assert all(map(np.array_equal, play(envs, [one] * 9, 0), play(envs, [one.copy()] * 9, 0)))
+
+
+@needs_compiler
+@pytest.mark.parametrize("count", [5, 16, 9000])
+def test_an_action_that_is_not_finite_changes_nothing(count):
+    envs, twin = (BallbotVectorEnv(count, "stabilize", engine="native") for _ in range(2))
+    for env in (envs, twin):
+        env.reset(seed=0)
+    good = actions_of(count, 2)
+    for bad_value in (np.nan, np.inf, -np.inf):
+        bad = good[0].copy()
+        bad[count - 1, 1] = bad_value
+        with pytest.raises(ValueError, match=rf"those of envs \[{count - 1}\] are not"):
+            envs.step(bad)
+    for action in good:
+        assert all(map(np.array_equal, envs.step(action)[:4], twin.step(action)[:4]))
+
+
+@needs_compiler
+def test_infos_that_a_user_keeps_stay_as_they_are():
+    """Arrays of objects are used again, but not while somebody has them."""
+    env = BallbotVectorEnv(50, "stabilize", engine="native")
+    env.reset(seed=0)
+    kept = [env.step(action)[4] for action in actions_of(50, 60, scale=3)]
+    told = [
+        (infos["final_obs"].tolist(), infos["final_info"]["violated"].tolist())
+        for infos in kept
+        if "final_obs" in infos
+    ]
+    assert len(told) > 10
+    for action in actions_of(50, 30, scale=3):
+        env.step(action)
+    again = [
+        (infos["final_obs"].tolist(), infos["final_info"]["violated"].tolist())
+        for infos in kept
+        if "final_obs" in infos
+    ]
+    for (seen, names), (seen_again, names_again) in zip(told, again, strict=True):
+        assert names == names_again
+        assert all(map(np.array_equal, seen, seen_again))
+        assert [row is None for row in seen] == [name is None for name in names]
+
+
+@needs_compiler
 def test_copies_and_pickles_go_on_alike_and_apart():
     env, actions = BallbotVectorEnv(5, "weave", engine="native", max_episode_steps=8), actions_of(5)
     play(env, actions[:10], 0)
