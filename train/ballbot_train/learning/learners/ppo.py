@@ -120,8 +120,8 @@ TUNED: dict[str, PpoConfig] = {
     "turn": replace(
         _LONG,
         symmetry="frame",
-        rl_iterations=1000,
-        evaluations=40,
+        rl_iterations=550,
+        evaluations=22,
         num_envs=1024,
         num_steps=48,
         episode_seconds=8.0,
@@ -131,6 +131,7 @@ TUNED: dict[str, PpoConfig] = {
         gamma=0.998,
         gae_lambda=0.97,
         std=0.15,
+        final_std=0.02,
         reward_scale=0.05,
         pay=False,
         curriculum=Curriculum(
