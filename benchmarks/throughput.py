@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import tyro
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from ballbot_gym import TASKS, BallbotEnv, files
@@ -249,6 +250,7 @@ def _resident() -> float:
 def _plot(rows: list[Row], path: Path) -> None:
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
+    axes.set_prop_cycle(color=colormaps["tab20"](np.arange(20)))  # there are more curves than the ten colours of the default
     curves: dict[str, list[Row]] = {}
     for row in rows:
         if row.what != "soak" and row.steps_per_second > 0:
