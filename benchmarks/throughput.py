@@ -250,7 +250,7 @@ def _resident() -> float:
 def _plot(rows: list[Row], path: Path) -> None:
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
-    axes.set_prop_cycle(color=colormaps["tab20"](np.arange(20)))  # there are more curves than the ten colours of the default
+    axes.set_prop_cycle(color=colormaps["tab20"](np.arange(20)))  # the default has fewer colours than there are curves
     curves: dict[str, list[Row]] = {}
     for row in rows:
         if row.what != "soak" and row.steps_per_second > 0:
