@@ -394,7 +394,9 @@ class CurriculumBatch(BallbotBatch):
         return result
 
     def _begin(self, begun: torch.Tensor) -> None:
-        """Remembers the starts of the episodes that have just begun."""
+        """Remembers the starts of the episodes that have just begun, if any may be repeated."""
+        if not self.curriculum.retries:
+            return
         assert self.state is not None
         starts = torch.cat([self.state.x, self.state.c, self.state.steps[None]]).float()
         self._begun = torch.where(begun, starts, self._begun)
