@@ -210,6 +210,18 @@ def test_episodes_on_optima_begin_ever_earlier_as_they_succeed():
         assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * (steps_left + 1))
 
 
+def test_no_episode_begins_on_an_optimum_when_the_goal_has_narrowed_enough():
+    settings = Curriculum(starts_on_optima=1.0, goal_factor=2.0, goal_step=0.7, starts_goal_factor=1.5)
+    made = batch(curriculum=settings, num_envs=50)
+    given(made, some_starts(made.task))
+    run(made, made.task.steps)
+    assert (made._kind == curricula._ON_OPTIMUM).all()
+    made._harden()
+    run(made, made.task.steps)
+    assert made.difficulty["goal_factor"] == pytest.approx(1.4)
+    assert (made._kind == curricula._OWN).all()
+
+
 def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
     made = batch(curriculum=Curriculum(retries=0.5, goal_factor=2.0, episodes=1, success=0.0), num_envs=400)
     torch.manual_seed(0)
@@ -327,6 +339,11 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
         ("turn", {"ramp": "max_speed", "ramp_start": 1.0}, "curriculum.ramp_start 1 is out of range"),
         ("turn", {"starts_seconds": 0.5}, "curriculum.starts_seconds needs curriculum.starts_on_optima above 0"),
         ("weave", {"starts_seconds": 0.5, "starts_on_optima": 0.5}, "BallbotWeave-v0 does not end at its goal"),
+        (
+            "turn",
+            {"goal_factor": 2.0, "starts_goal_factor": 2.0},
+            "starts_goal_factor must be less than curriculum.goal_factor 2, not 2",
+        ),
     ],
 )
 def test_what_a_task_has_not_is_refused(name, settings, message):

@@ -374,6 +374,23 @@ def test_ppo_refuses_a_symmetry_that_the_task_has_not():
         LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], symmetry="mirrors"), 0, None)
 
 
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_forces_may_be_held_for_longer_in_training_and_living_pays_as_much(name):
+    settings = replace(TINY[name], control_dt=0.05, gamma=0.9)
+    learner = LEARNERS[name].make(make_task("stabilize"), default_params(), settings, 0, None)
+    run(learner)
+    assert learner._env.batch.task.control_dt == 0.05
+    assert learner.network.spec.task == make_task("stabilize").problem()
+    paid = settings.reward_scale * make_task("stabilize").survival_reward * 0.05
+    assert learner._value_of_living(0.9) == pytest.approx(paid / 0.1)
+
+
+def test_longer_forces_are_refused_where_optima_are_shown():
+    settings = replace(TINY["ppo"], control_dt=0.05, curriculum=Curriculum(starts_on_optima=0.5))
+    with pytest.raises(ValueError, match="control_dt cannot be used with"):
+        LEARNERS["ppo"].make(make_task("turn"), default_params(), settings, 0, None)
+
+
 def assert_envs_act_as_its_policy(learner):
     """What SAC's envs do is what its policy says of what they show."""
     batch = learner._env.batch

@@ -75,6 +75,9 @@ class Curriculum:
     """How long before the end of their optimum these episodes begin at most, at the start of training, s; 0: anywhere."""
     starts_step: float = 0.1
     """How much longer that gets whenever enough of these episodes succeed, s."""
+    starts_goal_factor: float = 0.0
+    """No more episodes begin on optima when the goal's tolerances have narrowed to so many times the task's own; 0: they do
+    to the end. Where the goal is narrow, many such episodes begin too close before it for a policy that comes otherwise."""
     retries: float = 0.0
     """Share of the training episodes, of the task's own and of those on optima, that repeat the start of one of the last such
     episodes that failed or, on a task that ends at its goal, missed it; 0: off. They do not count for `success`."""
@@ -98,6 +101,7 @@ class Curriculum:
             ("optima", 1, 10**6),
             ("starts_seconds", 0.0, 1e6),
             ("starts_step", 1e-9, 1e6),
+            ("starts_goal_factor", 0.0, 1e3),
             ("retries", 0.0, 1.0),
             ("short_episodes", 0.0, 1.0),
             ("short_seconds", 1e-3, 1e6),
@@ -133,6 +137,11 @@ class Curriculum:
             raise ValueError("curriculum.starts_seconds needs curriculum.starts_on_optima above 0")
         if self.starts_seconds and not task.first_exit:
             raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_seconds must be 0")
+        if self.starts_goal_factor and self.starts_goal_factor >= self.goal_factor:
+            raise ValueError(
+                f"curriculum.starts_goal_factor must be less than curriculum.goal_factor {self.goal_factor:g}, "
+                f"not {self.starts_goal_factor:g}"
+            )
         if self.short_episodes and task.first_exit:
             raise ValueError(
                 f"{task.id} pays at its goal for the time that is left, so curriculum.short_episodes must be 0"
@@ -270,7 +279,7 @@ class CurriculumBatch(BallbotBatch):
         if self.curriculum.retries:
             self._keep_hard(result)
         self._kind, self._again = torch.where(ended, _OWN, self._kind), self._again & ~ended
-        if self.curriculum.starts_on_optima:
+        if self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor:
             result = self._start_on_optima(result, ended)
         if self.curriculum.retries:
             result = self._retry(result, ended)

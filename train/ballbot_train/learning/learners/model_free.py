@@ -42,6 +42,9 @@ class ModelFreeConfig:
     """Number of evaluations, at equal distances."""
     episode_seconds: float = 4.0
     """Duration of an episode in training, s."""
+    control_dt: float | None = None
+    """How long each force is held in training, s; default, as in the task. Longer, an action changes more of what follows,
+    and critics tell actions apart more easily. From scratch only."""
     reward_scale: float = 0.02
     """Factor of every reward."""
     gamma: float = 0.995
@@ -91,8 +94,17 @@ class ModelFree(ABC):
         demos: Demos | None,
         frame: Frame | None = None,
     ):
-        """Args: frame: in which the envs show observations and take actions; demos must be of it already."""
+        """Args: frame: in which the envs show observations and take actions; demos must be of it already.
+
+        Raises:
+            ValueError: forces are held for longer than in the demonstrations, or in the optima on which episodes begin.
+        """
         self.iteration, self._settings, self._task, self._demos = 0, config, task, demos
+        if config.control_dt is not None:
+            if demos is not None or config.curriculum.starts_on_optima:
+                raise ValueError("control_dt cannot be used with demonstrations or curriculum.starts_on_optima")
+            task = replace(task, control_dt=config.control_dt)
+        self._trained = task
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
         self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
@@ -124,7 +136,7 @@ class ModelFree(ABC):
 
     def _value_of_living(self, gamma: float) -> float:
         """Value of living for ever without cost."""
-        return value_of_living(self._task, self._settings.reward_scale, gamma) if self._settings.pay else 0.0
+        return value_of_living(self._trained, self._settings.reward_scale, gamma) if self._settings.pay else 0.0
 
     @property
     def _kept(self) -> nn.Module:

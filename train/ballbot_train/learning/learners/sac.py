@@ -327,7 +327,7 @@ class Sac(ModelFree):
         if not config.curriculum.shaping:  # which adds to rewards
             # Critics overestimate, more and more, because they learn from their own estimates. Costs are not negative, so
             # there is a limit, and values drift no farther.
-            highest = highest_value(task, config.reward_scale, config.gamma) if config.pay else 0.0
+            highest = highest_value(self._trained, config.reward_scale, config.gamma) if config.pay else 0.0
             model.critic_target.register_forward_hook(
                 lambda _module, _inputs, values: tuple(value.clamp(max=highest) for value in values)
             )
