@@ -67,6 +67,7 @@ class Algorithm:
 
 _MAY_BE_ZERO = {
     "batch_episodes",
+    "buffer_steps",
     "candidate_episodes",
     "clone_iterations",
     "critic_gradient_steps",
@@ -132,6 +133,7 @@ def check_settings(settings: Any) -> None:
 _HERE = __name__
 
 LEARNERS: dict[str, Algorithm] = {
+    "apg": Algorithm(f"{_HERE}.apg", "ApgConfig", "analytic policy gradient", demonstrations=False),
     "bc": Algorithm(f"{_HERE}.bc", "BcConfig", "behaviour cloning of demonstrations", demonstrations=True),
     "dagger": Algorithm(f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True),
     "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True),

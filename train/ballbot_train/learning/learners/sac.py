@@ -54,6 +54,9 @@ class SacConfig(ModelFreeConfig):
     task's frame, or its fine frame, and act in it; with an actor that is exact in the steady motion of the end (centred)."""
     n_steps: int = 1
     """Control steps whose rewards a target of the critics adds up before it takes a value; 1 with demonstrations."""
+    buffer_steps: int = 0
+    """Env steps of its own that it keeps to learn from; 0: all. With the last ones alone, `n_steps` may be larger, because
+    they are of nearly the same policy."""
     layer_norm: bool = False
     """Whether the critics' hidden layers are normalized, as Ball et al. do, unless they see products."""
     num_critics: int = 2
@@ -289,7 +292,7 @@ class Sac(ModelFree):
             OwnPolicy if own else "MlpPolicy",
             self._env,
             learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
-            buffer_size=config.rl_iterations * config.num_steps * config.num_envs,
+            buffer_size=config.buffer_steps or config.rl_iterations * config.num_steps * config.num_envs,
             learning_starts=0,
             batch_size=config.batch_size,
             tau=config.tau,

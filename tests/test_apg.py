@@ -1,0 +1,94 @@
+"""Analytic policy gradient: its gradient is that of whole episodes, on every task."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.tasks import TASKS
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy import load_network, shipped_policies
+
+
+def made(name, seed=0, **settings):
+    small = {"total_iterations": 4, "num_envs": 4, "episode_seconds": 0.2, "hidden": (8,), "compile": False}
+    settings = replace(LEARNERS["apg"].settings(name), **(small | settings))
+    return LEARNERS["apg"].make(make_task(name), default_params(), settings, seed, None)
+
+
+def parameters(learner):
+    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_it_goes_on_from_its_state_as_if_never_stopped(name):
+    whole, first, second = made(name, start_noise=0.1), made(name, start_noise=0.1), made(name, 5, start_noise=0.1)
+    for _ in range(4):
+        whole.iterate()
+    for _ in range(2):
+        first.iterate()
+    second.load_state_dict(first.state_dict())
+    for _ in range(2):
+        second.iterate()
+    assert torch.equal(parameters(whole), parameters(second))
+    assert not torch.equal(parameters(whole), parameters(made(name)))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name):
+    learner = made(name, num_envs=3, margin_clearance=0.2, margin_penalty=10.0, symmetry="none")
+    weight = learner._trained.mlp[-1].bias
+    state = learner._batch.state
+    costs = []
+    for change in (0.0, 2e-3, -2e-3):  # of the force along x, in units of its limit
+        learner._batch.state = state
+        with torch.no_grad():
+            weight[0] += change
+        costs.append(learner._episodes()[0].sum())
+        with torch.no_grad():
+            weight[0] -= change
+    costs[0].backward()
+    slope = (costs[1] - costs[2]).item() / 4e-3
+    assert weight.grad is not None
+    assert weight.grad[0].item() == pytest.approx(slope, rel=0.03, abs=0.01)
+
+
+def test_a_good_policy_gets_better_and_costs_are_those_of_its_episodes():
+    learner = made("turn", num_envs=16, episode_seconds=4.6, goal_penalty=1e4, goal_clearance=0.0)
+    learner.start_from(load_network(shipped_policies(make_task("turn"))["ppo"], make_task("turn")))
+    state = learner._batch.state
+    costs, reached = learner._episodes()
+    assert reached.all()
+    batch = learner._batch
+    batch.state, total, running = state, torch.zeros(16), torch.ones(16, dtype=torch.bool)
+    batch.reset()
+    for _ in range(learner.task.steps):
+        result = batch.step(learner._trained(batch.observe(batch.state)))
+        total += torch.where(running, result.cost, 0.0)
+        running &= ~result.success
+    np.testing.assert_allclose(costs.detach(), total.detach(), rtol=1e-4)
+
+
+def test_an_episode_that_fails_has_a_price_and_finite_gradients():
+    learner = made("stabilize", episode_seconds=2.0)
+    with torch.no_grad():
+        learner._trained.linear.weight.mul_(-1)  # away from the equilibrium
+    costs, ended_well = learner._episodes()
+    assert not ended_well.any()
+    assert (costs > learner.config.failure_penalty).all()
+    figures = learner.iterate()
+    assert figures["train/failure_rate"] == 1
+    assert np.isfinite(figures["train/gradient"])
+
+
+def test_who_misses_the_gate_is_led_to_it():
+    learner = made("turn", episode_seconds=2.0, num_envs=2)
+    costs, reached = learner._episodes()
+    assert not reached.any()
+    costs.sum().backward()
+    gradients = [p.grad for p in learner._trained.parameters() if p.grad is not None]
+    assert all(torch.isfinite(gradient).all() for gradient in gradients)
+    assert any(gradient.any() for gradient in gradients)
