@@ -38,6 +38,8 @@ TINY = {
     ),
     "sac": sac.SacConfig(
         products=True,
+        final_gamma=0.999,
+        learning_rate_schedule="geometric",
         rl_iterations=3,
         num_envs=4,
         num_steps=8,
@@ -145,6 +147,33 @@ def test_the_discount_of_ppo_rises_and_takes_all_values_with_it():
     logged = [learner.iterate()["train/gamma"] for _ in range(3)]
     assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
     assert learner._model.rollout_buffer.gamma == learner._env.batch.gamma == learner._model.gamma
+
+
+@pytest.mark.parametrize("products", [False, True])
+def test_the_discount_of_sac_rises_and_takes_all_values_with_it(products):
+    learner = make("sac", gamma=0.99, final_gamma=0.999, products=products)
+    seen, acted = observed(20), torch.zeros(20, 2)
+    with torch.no_grad():
+        before = learner._model.critic(seen, acted)
+        learner._raise_gamma(0.999)
+        after = learner._model.critic(seen, acted)
+        highest = learner._highest()
+        learner._raise_gamma(0.99)
+    task, scale = make_task("stabilize"), learner.config.reward_scale
+    change = value_of_living(task, scale, 0.999) - value_of_living(task, scale, 0.99)
+    for ours, value in zip(after, before, strict=True):
+        torch.testing.assert_close(ours, value + change)
+    assert highest == pytest.approx(value_of_living(task, scale, 0.999))
+    logged = [learner.iterate()["train/gamma"] for _ in range(3)]
+    assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
+    assert learner._replay.gamma == learner._env.batch.gamma == learner._model.gamma
+
+
+def test_the_learning_rate_of_sac_falls_as_its_schedule_says():
+    for schedule, halfway in (("linear", 0.55), ("geometric", 0.1**0.5)):
+        learner = make("sac", learning_rate=1.0, final_learning_rate_fraction=0.1, learning_rate_schedule=schedule)
+        learner.iteration = learner.iterations / 2
+        assert learner._annealed(1.0) == pytest.approx(halfway)
 
 
 def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
@@ -425,7 +454,7 @@ def test_sac_with_a_centred_actor_acts_as_its_policy_does_and_keeps_the_steady_m
 
 def test_targets_of_sac_can_add_up_the_rewards_of_several_steps():
     learner = run(make("sac", n_steps=3), 2)
-    replay, gamma = learner._replay, learner.config.gamma
+    replay, gamma = learner._replay, learner._replay.gamma
     drawn = replay.sample(200)
     steps = replay.observations[: replay.pos]
     several = 0

@@ -64,7 +64,11 @@ class SacConfig(ModelFreeConfig):
     learning_rate: float = 5e-4
     """Learning rate at the start."""
     final_learning_rate_fraction: float = 0.1
-    """Learning rate at the end, as a fraction of that at the start. It falls linearly."""
+    """Learning rate at the end, as a fraction of that at the start."""
+    learning_rate_schedule: Literal["linear", "geometric"] = "linear"
+    """How it falls: along a straight line, or by the same factor in every iteration."""
+    final_gamma: float | None = None
+    """Discount factor at the end; 1 less it goes there geometrically, as in `ppo`. Default, `gamma` throughout."""
     batch_size: int = 256
     """Env steps per gradient step."""
     tau: float = 0.005
@@ -261,6 +265,12 @@ def _critic_network(config: SacConfig, value: float) -> CriticNetwork:
     return network
 
 
+def last_bias(critic: torch.nn.Module) -> torch.Tensor:
+    """The bias of a critic's output."""
+    last = critic.linear if isinstance(critic, QuadraticCritic) else cast(torch.nn.Sequential, critic)[-1]
+    return cast(torch.nn.Linear, last).bias
+
+
 class Sac(ModelFree):
     """The learner; see `training.Learner`."""
 
@@ -291,7 +301,7 @@ class Sac(ModelFree):
         model = SAC(
             OwnPolicy if own else "MlpPolicy",
             self._env,
-            learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
+            learning_rate=lambda _: self._annealed(rate),
             buffer_size=config.buffer_steps or config.rl_iterations * config.num_steps * config.num_envs,
             learning_starts=0,
             batch_size=config.batch_size,
@@ -325,15 +335,14 @@ class Sac(ModelFree):
         torch.nn.init.constant_(log_std.bias, math.log(config.std if demos is None else config.demo_std))
         if not config.products:
             for critic in (*model.critic.q_networks, *model.critic_target.q_networks):
-                last = cast(torch.nn.Linear, cast(torch.nn.Sequential, critic)[-1])
-                torch.nn.init.constant_(last.bias, value)
+                torch.nn.init.constant_(last_bias(critic), value)
         if not config.curriculum.shaping:  # which adds to rewards
             # Critics overestimate, more and more, because they learn from their own estimates. Costs are not negative, so
             # there is a limit, and values drift no farther.
-            highest = highest_value(self._trained, config.reward_scale, config.gamma) if config.pay else 0.0
             model.critic_target.register_forward_hook(
-                lambda _module, _inputs, values: tuple(value.clamp(max=highest) for value in values)
+                lambda _module, _inputs, values: tuple(value.clamp(max=self._highest()) for value in values)
             )
+        self._model: SAC
         self._set_model(
             model,
             actor.mean_action()
@@ -349,13 +358,48 @@ class Sac(ModelFree):
         return as_policy(self._kept.modules(), self._task, activation="silu", squash=squash, **symmetry)
 
     def state_dict(self) -> dict[str, Any]:
-        own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}
+        own = {
+            "log_ent_coef": self._log_ent_coef.detach(),
+            "replay": self._replay.state_dict(),
+            "gamma": self._model.gamma,
+        }
         return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
         self._log_ent_coef.data.copy_(state["log_ent_coef"])
         self._replay.load_state_dict(state["replay"])
+        self._take_gamma(state["gamma"])
+
+    def _improve(self) -> dict[str, float]:
+        config = self.config
+        if config.final_gamma is not None:
+            self._raise_gamma(schedules.discount(config.gamma, config.final_gamma, self._progress))
+        return {**super()._improve(), "train/gamma": self._model.gamma}
+
+    def _annealed(self, rate: float) -> float:
+        """A learning rate in the present iteration."""
+        fraction, progress = self.config.final_learning_rate_fraction, self._progress
+        if self.config.learning_rate_schedule == "linear":
+            return schedules.linear(rate, fraction, progress)
+        return schedules.geometric(rate, fraction * rate, progress)
+
+    def _highest(self) -> float:
+        """The most that a value can be."""
+        config = self.config
+        return highest_value(self._trained, config.reward_scale, self._model.gamma) if config.pay else 0.0
+
+    def _raise_gamma(self, gamma: float) -> None:
+        """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
+        more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
+        with torch.no_grad():
+            for critic in (*self._model.critic.q_networks, *self._model.critic_target.q_networks):
+                last_bias(critic).add_(more)
+        self._take_gamma(gamma)
+
+    def _take_gamma(self, gamma: float) -> None:
+        """Gives the discount factor to all that have a copy of it."""
+        self._model.gamma = self._replay.gamma = self._env.batch.gamma = gamma
 
     def _imitation_scale(self) -> float:
         return 1.0
