@@ -411,6 +411,7 @@ def test_forces_may_be_held_for_longer_in_training_and_living_pays_as_much(name)
     assert learner._env.batch.task.control_dt == 0.05
     assert learner.network.spec.task == make_task("stabilize").problem()
     paid = settings.reward_scale * make_task("stabilize").survival_reward * 0.05
+    assert make(name, control_dt=0.05, gamma=0.9)._model.gamma == pytest.approx(0.9**2.5)
     assert learner._value_of_living(0.9) == pytest.approx(paid / 0.1)
 
 
@@ -467,9 +468,11 @@ def test_targets_of_sac_can_add_up_the_rewards_of_several_steps():
     assert several > 100
 
 
-def test_several_steps_are_refused_beside_demonstrations(demos):
-    with pytest.raises(ValueError, match="sac with demonstrations needs n_steps 1, not 3"):
-        make("sac", demos, n_steps=3)
+def test_beside_demonstrations_sac_learns_from_single_steps_of_the_task(demos):
+    learner = make("sac", demos, n_steps=3, buffer_steps=40, control_dt=0.05)
+    replay = learner._replay
+    assert (replay.n_steps, replay.buffer_size, learner._env.batch.task.control_dt) == (1, 3 * 8, 0.02)
+    assert make("sac", n_steps=3, buffer_steps=40)._replay.buffer_size == 40 // 4
 
 
 @pytest.mark.parametrize("demonstrated", [False, True])

@@ -43,12 +43,12 @@ class ModelFreeConfig:
     episode_seconds: float = 4.0
     """Duration of an episode in training, s."""
     control_dt: float | None = None
-    """How long each force is held in training, s; default, as in the task. Longer, an action changes more of what follows,
-    and critics tell actions apart more easily. From scratch only."""
+    """How long each force is held in training from scratch, s; default, as in the task. Longer, an action changes more of
+    what follows, and critics tell actions apart more easily. With demonstrations forces are held as in them."""
     reward_scale: float = 0.02
     """Factor of every reward."""
     gamma: float = 0.995
-    """Discount factor per control step."""
+    """Discount factor per control step of the task; with a longer `control_dt` that for as long."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers of actor and critics."""
     products: bool = True
@@ -97,14 +97,15 @@ class ModelFree(ABC):
         """Args: frame: in which the envs show observations and take actions; demos must be of it already.
 
         Raises:
-            ValueError: forces are held for longer than in the demonstrations, or in the optima on which episodes begin.
+            ValueError: forces are held for longer than in the optima on which episodes begin.
         """
         self.iteration, self._settings, self._task, self._demos = 0, config, task, demos
-        if config.control_dt is not None:
-            if demos is not None or config.curriculum.starts_on_optima:
-                raise ValueError("control_dt cannot be used with demonstrations or curriculum.starts_on_optima")
+        if config.control_dt is not None and demos is None:
+            if config.curriculum.starts_on_optima:
+                raise ValueError("control_dt cannot be used with curriculum.starts_on_optima")
             task = replace(task, control_dt=config.control_dt)
         self._trained = task
+        self._gamma = self._per_step(config.gamma)
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
         self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
@@ -115,7 +116,7 @@ class ModelFree(ABC):
             config.episode_seconds,
             config.reward_scale,
             config.curriculum,
-            config.gamma,
+            self._gamma,
             frame,
             pay=config.pay,
             failure_price=config.failure_price,
@@ -133,6 +134,10 @@ class ModelFree(ABC):
         )
         optimizers[0].register_step_pre_hook(self._add_imitation)
         self._random = ScopedRng()
+
+    def _per_step(self, gamma: float) -> float:
+        """The discount factor for a control step in training, from that for a control step of the task."""
+        return gamma ** (self._trained.control_dt / self._task.control_dt)
 
     def _value_of_living(self, gamma: float) -> float:
         """Value of living for ever without cost."""

@@ -233,7 +233,7 @@ class Ppo(ModelFree):
         self.config = config
         self._std = config.std if demos is None else config.demo_std
         rate = config.learning_rate if demos is None else config.demo_learning_rate
-        value = self._value_of_living(config.gamma)
+        value = self._value_of_living(self._gamma)
         plain = config.symmetry == "none" and not config.products
         model = PPO(
             "MlpPolicy" if plain else BranchedPolicy,
@@ -242,7 +242,7 @@ class Ppo(ModelFree):
             n_steps=config.num_steps,
             batch_size=config.batch_size if demos is None else config.demo_batch_size,
             n_epochs=config.update_epochs,
-            gamma=config.gamma,
+            gamma=self._gamma,
             gae_lambda=config.gae_lambda,
             clip_range=config.clip_range,
             max_grad_norm=config.max_grad_norm,
@@ -294,7 +294,7 @@ class Ppo(ModelFree):
         std = schedules.geometric(self._std, config.final_std, progress)
         self._log_std.data.fill_(np.log(std))
         if config.final_gamma is not None:
-            self._raise_gamma(schedules.discount(config.gamma, config.final_gamma, progress))
+            self._raise_gamma(self._per_step(schedules.discount(config.gamma, config.final_gamma, progress)))
         figures = super()._improve()
         return {**figures, "train/gamma": self._model.gamma}
 

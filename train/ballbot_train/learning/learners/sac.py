@@ -53,10 +53,10 @@ class SacConfig(ModelFreeConfig):
     """Whether actor and critics learn from the task's mirror images as well, over which the policy is averaged; or see the
     task's frame, or its fine frame, and act in it; with an actor that is exact in the steady motion of the end (centred)."""
     n_steps: int = 1
-    """Control steps whose rewards a target of the critics adds up before it takes a value; 1 with demonstrations."""
+    """Control steps whose rewards a target of the critics adds up before it takes a value; with demonstrations one alone."""
     buffer_steps: int = 0
-    """Env steps of its own that it keeps to learn from; 0: all. With the last ones alone, `n_steps` may be larger, because
-    they are of nearly the same policy."""
+    """Env steps of its own that it keeps to learn from; 0, or with demonstrations: all. With the last ones alone, `n_steps`
+    may be larger, because they are of nearly the same policy."""
     layer_norm: bool = False
     """Whether the critics' hidden layers are normalized, as Ball et al. do, unless they see products."""
     num_critics: int = 2
@@ -284,8 +284,6 @@ class Sac(ModelFree):
             raise ValueError(
                 "curriculum.shaping cannot be used with sac's demonstrations, because their rewards are not shaped"
             )
-        if demos is not None and config.n_steps != 1:
-            raise ValueError(f"sac with demonstrations needs n_steps 1, not {config.n_steps}")
         if demos is not None and not config.pay:
             demos = demos.without_pay(task, config.failure_price)
         self._spec = spec_for(task, config.symmetry, config.hidden)
@@ -295,26 +293,27 @@ class Sac(ModelFree):
         super().__init__(task, params, config, demos, frame)
         self.config = config
         rate = config.learning_rate
-        value = self._value_of_living(config.gamma)
+        value = self._value_of_living(self._gamma)
         own = config.products or config.layer_norm or self._spec.centred
         networks = {"network": _critic_network(config, value), "centre": frame if self._spec.centred else None}
         model = SAC(
             OwnPolicy if own else "MlpPolicy",
             self._env,
             learning_rate=lambda _: self._annealed(rate),
-            buffer_size=config.buffer_steps or config.rl_iterations * config.num_steps * config.num_envs,
+            buffer_size=(demos is None and config.buffer_steps)
+            or config.rl_iterations * config.num_steps * config.num_envs,
             learning_starts=0,
             batch_size=config.batch_size,
             tau=config.tau,
-            gamma=config.gamma,
+            gamma=self._gamma,
             gradient_steps=config.gradient_steps,
             replay_buffer_class=SymmetricReplay,
             replay_buffer_kwargs={
                 "demos": demos,
                 "reward_scale": config.reward_scale,
                 "mirrors": self._spec.mirrors,
-                "n_steps": config.n_steps,
-                "gamma": config.gamma,
+                "n_steps": config.n_steps if demos is None else 1,
+                "gamma": self._gamma,
             },
             ent_coef=f"auto_{config.ent_coef}",
             target_entropy=config.target_entropy,
@@ -374,7 +373,7 @@ class Sac(ModelFree):
     def _improve(self) -> dict[str, float]:
         config = self.config
         if config.final_gamma is not None:
-            self._raise_gamma(schedules.discount(config.gamma, config.final_gamma, self._progress))
+            self._raise_gamma(self._per_step(schedules.discount(config.gamma, config.final_gamma, self._progress)))
         return {**super()._improve(), "train/gamma": self._model.gamma}
 
     def _annealed(self, rate: float) -> float:
