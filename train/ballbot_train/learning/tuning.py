@@ -438,7 +438,8 @@ def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:
         "# python -m rl_zoo3.train --algo NAME --env ID --conf-file THIS --gym-packages ballbot_gym "
         "--env-kwargs physics:\"'rk4'\"",
         "# Not expressed here, because rl-zoo3 has no setting for them: critics that see products, symmetric actors,",
-        "# the schedule of the standard deviation, scaled rewards and shorter training episodes.",
+        "# the schedules of discount and standard deviation, scaled rewards, shorter training episodes, longer control",
+        "# steps.",
     ]
     for task, chosen in settings.items():
         lines += ["", f"{TASKS[task].id}:"]
@@ -470,7 +471,8 @@ def _zoo_ppo(chosen: Any) -> dict[str, Any]:
 
 def _zoo_sac(chosen: Any) -> dict[str, Any]:
     return _zoo_common(chosen) | {
-        "buffer_size": 1_000_000,
+        "buffer_size": chosen.buffer_steps or 1_000_000,
+        "n_steps": chosen.n_steps,
         "train_freq": 1,
         "gradient_steps": chosen.gradient_steps,
         "tau": round(chosen.tau, 5),
