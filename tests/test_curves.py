@@ -1,6 +1,7 @@
 """Trainings on several seeds, and their learning curves."""
 
 import json
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -64,6 +65,15 @@ def test_runs_of_earlier_versions_are_drawn_against_wall_minutes_alone(tmp_path)
     (curve,) = report.grouped(report.read_runs([tmp_path / "old"]))
     assert len(curve.against("env_steps", "regret")[0]) == 0
     assert curve.against("minutes", "regret")[0][-1] == pytest.approx(2.0)
+
+
+def test_a_record_without_a_later_setting_is_of_the_same_curve(tmp_path):
+    settings = json.loads(json.dumps(asdict(LEARNERS["ppo"].settings("orbit"))))
+    a_run(tmp_path / "new", 1, [4.0, 2.0], task="orbit", settings=settings)
+    del settings["control_dt"], settings["curriculum"]["starts_goal_factor"]
+    a_run(tmp_path / "old", 0, [4.0, 2.0], task="orbit", settings=settings)
+    a_run(tmp_path / "other", 2, [4.0, 2.0], task="orbit", settings=settings | {"gamma": 0.9})
+    assert sorted(len(curve.runs) for curve in report.grouped(report.read_runs([tmp_path]))) == [1, 2]
 
 
 def test_settings_of_one_learner_are_curves_of_their_own(tmp_path):

@@ -113,7 +113,7 @@ TUNED: dict[str, PpoConfig] = {
         episode_seconds=8.0,
         hidden=(128, 128),
         final_learning_rate_fraction=0.02,
-        final_gamma=0.996,
+        final_gamma=0.994,
         relative_advantages=1.0,
         curriculum=Curriculum(short_episodes=0.3),
     ),
