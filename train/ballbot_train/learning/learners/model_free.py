@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import gymnasium
 import numpy as np
@@ -59,6 +59,8 @@ class ModelFreeConfig:
     """Whether living pays in training. If not, the reward is minus the running cost. Evaluation is the same."""
     failure_price: float = 300.0
     """What a failure costs at once in training where living does not pay."""
+    learning_rate_schedule: Literal["linear", "geometric"] = "linear"
+    """How the learning rate falls: along a straight line, or by the same factor in every iteration."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
@@ -206,6 +208,12 @@ class ModelFree(ABC):
     def _progress(self) -> float:
         """Share of the iterations of reinforcement learning that are done."""
         return (self.iteration - self._clone_iterations) / self._settings.rl_iterations
+
+    def _annealed(self, rate: float, final_fraction: float) -> float:
+        """A learning rate in the present iteration."""
+        if self._settings.learning_rate_schedule == "linear":
+            return schedules.linear(rate, final_fraction, self._progress)
+        return schedules.geometric(rate, final_fraction * rate, self._progress)
 
     @property
     def _critic_only(self) -> bool:

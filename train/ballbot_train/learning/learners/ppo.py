@@ -55,7 +55,7 @@ class PpoConfig(ModelFreeConfig):
     demo_critic_learning_rate: float | None = None
     """Learning rate of the critic throughout if there are demonstrations; default, the actor's, which is small."""
     final_learning_rate_fraction: float = 0.02
-    """Learning rate at the end, as a fraction of that at the start. It falls linearly."""
+    """Learning rate at the end, as a fraction of that at the start. It falls as `learning_rate_schedule` says."""
     update_epochs: int = 5
     """Passes over the rollouts of an iteration."""
     batch_size: int = 512
@@ -238,7 +238,7 @@ class Ppo(ModelFree):
         model = PPO(
             "MlpPolicy" if plain else BranchedPolicy,
             self._env,
-            learning_rate=lambda _: schedules.linear(rate, config.final_learning_rate_fraction, self._progress),
+            learning_rate=lambda _: self._annealed(rate, config.final_learning_rate_fraction),
             n_steps=config.num_steps,
             batch_size=config.batch_size if demos is None else config.demo_batch_size,
             n_epochs=config.update_epochs,

@@ -64,9 +64,7 @@ class SacConfig(ModelFreeConfig):
     learning_rate: float = 5e-4
     """Learning rate at the start."""
     final_learning_rate_fraction: float = 0.1
-    """Learning rate at the end, as a fraction of that at the start."""
-    learning_rate_schedule: Literal["linear", "geometric"] = "linear"
-    """How it falls: along a straight line, or by the same factor in every iteration."""
+    """Learning rate at the end, as a fraction of that at the start. It falls as `learning_rate_schedule` says."""
     final_gamma: float | None = None
     """Discount factor at the end; 1 less it goes there geometrically, as in `ppo`. Default, `gamma` throughout."""
     batch_size: int = 256
@@ -303,7 +301,7 @@ class Sac(ModelFree):
         model = SAC(
             OwnPolicy if own else "MlpPolicy",
             self._env,
-            learning_rate=lambda _: self._annealed(rate),
+            learning_rate=lambda _: self._annealed(rate, config.final_learning_rate_fraction),
             buffer_size=(demos is None and config.buffer_steps)
             or config.rl_iterations * config.num_steps * config.num_envs,
             learning_starts=0,
@@ -379,13 +377,6 @@ class Sac(ModelFree):
         if config.final_gamma is not None:
             self._raise_gamma(self._per_step(schedules.discount(config.gamma, config.final_gamma, self._progress)))
         return {**super()._improve(), "train/gamma": self._model.gamma}
-
-    def _annealed(self, rate: float) -> float:
-        """A learning rate in the present iteration."""
-        fraction, progress = self.config.final_learning_rate_fraction, self._progress
-        if self.config.learning_rate_schedule == "linear":
-            return schedules.linear(rate, fraction, progress)
-        return schedules.geometric(rate, fraction * rate, progress)
 
     def _highest(self) -> float:
         """The most that a value can be."""
