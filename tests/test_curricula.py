@@ -341,7 +341,7 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
         ("weave", {"starts_seconds": 0.5, "starts_on_optima": 0.5}, "BallbotWeave-v0 does not end at its goal"),
         (
             "turn",
-            {"goal_factor": 2.0, "starts_goal_factor": 2.0},
+            {"starts_on_optima": 0.5, "goal_factor": 2.0, "starts_goal_factor": 2.0},
             "starts_goal_factor must be less than curriculum.goal_factor 2, not 2",
         ),
     ],

@@ -137,7 +137,7 @@ class Curriculum:
             raise ValueError("curriculum.starts_seconds needs curriculum.starts_on_optima above 0")
         if self.starts_seconds and not task.first_exit:
             raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_seconds must be 0")
-        if self.starts_goal_factor and self.starts_goal_factor >= self.goal_factor:
+        if self.starts_on_optima and self.starts_goal_factor and self.starts_goal_factor >= self.goal_factor:
             raise ValueError(
                 f"curriculum.starts_goal_factor must be less than curriculum.goal_factor {self.goal_factor:g}, "
                 f"not {self.starts_goal_factor:g}"
