@@ -770,7 +770,7 @@ TYPED = [
     ("demos --backoff.goal -1", "Backoff: goal must be at least 0"),
     ("demos --workers 0", "workers must be at least 1"),
     ("demos --out mine", "is named NAME-vNUMBER"),
-    ("train dance", "unknown learner dance; known: bc"),
+    ("train dance", "unknown learner dance; known: apg, bc"),
     ("train shac --task dance", "unknown task dance"),
     ("train shac --threads 0", "threads must be 1 to"),
     ("train shac --seed -1", "seed must be 0 to"),

@@ -78,7 +78,7 @@ _OF_PPO: dict[str, Range | Choice] = {
     "clip_range": Choice((0.1, 0.2, 0.3)),
     "max_grad_norm": Range(0.2, 5.0),
     "std": Range(0.1, 0.8),
-    "final_std": Range(0.01, 0.1),
+    "final_std": Range(0.005, 0.1),
     "reward_scale": Range(0.005, 0.2),
     "hidden": _WIDTHS,
 }
