@@ -56,7 +56,7 @@ def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name):
     assert weight.grad[0].item() == pytest.approx(slope, rel=0.03, abs=0.01)
 
 
-def test_a_good_policy_gets_better_and_costs_are_those_of_its_episodes():
+def test_costs_are_those_of_the_policy_s_episodes():
     learner = made("turn", num_envs=16, episode_seconds=4.6, goal_penalty=1e4, goal_clearance=0.0)
     learner.start_from(load_network(shipped_policies(make_task("turn"))["ppo"], make_task("turn")))
     state = learner._batch.state

@@ -49,6 +49,8 @@ class ModelFreeConfig:
     """Factor of every reward."""
     gamma: float = 0.995
     """Discount factor per control step of the task; with a longer `control_dt` that for as long."""
+    final_gamma: float | None = None
+    """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers of actor and critics."""
     products: bool = True
@@ -126,7 +128,8 @@ class ModelFree(ABC):
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
-        self._model, self._actor, self._optimizers = model, actor, optimizers
+        self._model: Any = model  # PPO or SAC, which both have a gamma
+        self._actor, self._optimizers = actor, optimizers
         self._average = average_of(actor, self._settings.averaged_iterations)
         model.set_logger(Logger(folder=None, output_formats=[]))
         model._last_obs = self._env.reset()
@@ -154,6 +157,22 @@ class ModelFree(ABC):
     @abstractmethod
     def network(self) -> PolicyNetwork:
         """The policy learnt so far."""
+
+    @abstractmethod
+    def _value_biases(self) -> list[torch.Tensor]:
+        """The biases of the outputs of all critics."""
+
+    def _raise_gamma(self, gamma: float) -> None:
+        """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
+        more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
+        with torch.no_grad():
+            for bias in self._value_biases():
+                bias.add_(more)
+        self._take_gamma(gamma)
+
+    def _take_gamma(self, gamma: float) -> None:
+        """Gives the discount factor to all that have a copy of it."""
+        self._model.gamma = self._env.batch.gamma = gamma
 
     @abstractmethod
     def _imitation_scale(self) -> float:
@@ -184,6 +203,7 @@ class ModelFree(ABC):
             "optimizers": [optimizer.state_dict() for optimizer in self._optimizers],
             "imitation": self._imitation and self._imitation.state_dict(),
             "env_steps": model.num_timesteps,
+            "gamma": model.gamma,
             "env": self._env.state_dict(),
             "observations": torch.as_tensor(model._last_obs),
             "starts": torch.as_tensor(model._last_episode_starts),
@@ -200,6 +220,7 @@ class ModelFree(ABC):
         if self._imitation is not None:
             self._imitation.load_state_dict(state["imitation"])
         model.num_timesteps = state["env_steps"]
+        self._take_gamma(state["gamma"])
         self._env.load_state_dict(state["env"])
         model._last_obs, model._last_episode_starts = state["observations"].numpy(), state["starts"].numpy()
         self._random.load_state_dict(state["random"])
@@ -229,13 +250,20 @@ class ModelFree(ABC):
     def _improve(self) -> dict[str, float]:
         """One iteration of reinforcement learning."""
         settings, model = self._settings, self._model
+        if settings.final_gamma is not None:
+            self._raise_gamma(self._per_step(schedules.discount(settings.gamma, settings.final_gamma, self._progress)))
         self._actor.requires_grad_(not self._critic_only)
         # SB3 takes None as "never" for its own printing
         model.learn(settings.num_envs * settings.num_steps, log_interval=cast(int, None), reset_num_timesteps=False)
         self._actor.requires_grad_(True)
         self._average.update_parameters(self._actor)
         reached = {f"curriculum/{name}": value for name, value in self.difficulty.items()}
-        return {**model.logger.name_to_value, "train/env_steps": model.num_timesteps, **reached}
+        return {
+            **model.logger.name_to_value,
+            "train/env_steps": model.num_timesteps,
+            "train/gamma": model.gamma,
+            **reached,
+        }
 
     def _add_imitation(self, *_: object) -> None:
         """Adds the gradient of the imitation loss to that of a step of the actor."""

@@ -4,7 +4,7 @@
 complex dexterous manipulation with deep reinforcement learning and demonstrations", 2018.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -41,8 +41,6 @@ class PpoConfig(ModelFreeConfig):
     symmetry: Symmetry = "none"
     """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
     over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
-    final_gamma: float | None = None
-    """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
     averaged_iterations: int = 10
     gae_lambda: float = 0.95
     """λ of generalized advantage estimation."""
@@ -283,34 +281,19 @@ class Ppo(ModelFree):
             return actor.network
         return as_policy(actor.children(), self._task, activation="tanh", squash="clip")
 
-    def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"gamma": self._model.gamma}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        super().load_state_dict(state)
-        self._take_gamma(state["gamma"])
-
     def _improve(self) -> dict[str, float]:
-        config, progress = self.config, self._progress
-        std = schedules.geometric(self._std, config.final_std, progress)
+        std = schedules.geometric(self._std, self.config.final_std, self._progress)
         self._log_std.data.fill_(np.log(std))
-        if config.final_gamma is not None:
-            self._raise_gamma(self._per_step(schedules.discount(config.gamma, config.final_gamma, progress)))
-        figures = super()._improve()
-        return {**figures, "train/gamma": self._model.gamma}
+        return super()._improve()
 
-    def _raise_gamma(self, gamma: float) -> None:
-        """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
+    def _value_biases(self) -> list[torch.Tensor]:
         policy = cast(ActorCriticPolicy, self._model.policy)
-        more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
         critic = policy.branches.critic.linear if isinstance(policy, BranchedPolicy) else policy.value_net
-        with torch.no_grad():
-            cast(torch.nn.Linear, critic).bias.add_(more)
-        self._take_gamma(gamma)
+        return [cast(torch.nn.Linear, critic).bias]
 
     def _take_gamma(self, gamma: float) -> None:
-        """Gives the discount factor to all that have a copy of it."""
-        self._model.gamma = self._model.rollout_buffer.gamma = self._env.batch.gamma = gamma
+        super()._take_gamma(gamma)
+        self._model.rollout_buffer.gamma = gamma
 
     def _imitation_scale(self) -> float:
         return float(self._log_std.detach().exp()[0]) ** -2

@@ -24,7 +24,6 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES, Frame
-from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value
 from ballbot_train.learning.curricula import Curriculum
@@ -65,8 +64,6 @@ class SacConfig(ModelFreeConfig):
     """Learning rate at the start."""
     final_learning_rate_fraction: float = 0.1
     """Learning rate at the end, as a fraction of that at the start. It falls as `learning_rate_schedule` says."""
-    final_gamma: float | None = None
-    """Discount factor at the end; 1 less it goes there geometrically, as in `ppo`. Default, `gamma` throughout."""
     batch_size: int = 256
     """Env steps per gradient step."""
     tau: float = 0.005
@@ -359,41 +356,26 @@ class Sac(ModelFree):
         return as_policy(self._kept.modules(), self._task, activation="silu", squash=squash, **symmetry)
 
     def state_dict(self) -> dict[str, Any]:
-        own = {
-            "log_ent_coef": self._log_ent_coef.detach(),
-            "replay": self._replay.state_dict(),
-            "gamma": self._model.gamma,
-        }
+        own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}
         return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
         self._log_ent_coef.data.copy_(state["log_ent_coef"])
         self._replay.load_state_dict(state["replay"])
-        self._take_gamma(state["gamma"])
-
-    def _improve(self) -> dict[str, float]:
-        config = self.config
-        if config.final_gamma is not None:
-            self._raise_gamma(self._per_step(schedules.discount(config.gamma, config.final_gamma, self._progress)))
-        return {**super()._improve(), "train/gamma": self._model.gamma}
 
     def _highest(self) -> float:
         """The most that a value can be."""
         config = self.config
         return highest_value(self._trained, config.reward_scale, self._model.gamma) if config.pay else 0.0
 
-    def _raise_gamma(self, gamma: float) -> None:
-        """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
-        more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
-        with torch.no_grad():
-            for critic in (*self._model.critic.q_networks, *self._model.critic_target.q_networks):
-                last_bias(critic).add_(more)
-        self._take_gamma(gamma)
+    def _value_biases(self) -> list[torch.Tensor]:
+        critics = (*self._model.critic.q_networks, *self._model.critic_target.q_networks)
+        return [last_bias(critic) for critic in critics]
 
     def _take_gamma(self, gamma: float) -> None:
-        """Gives the discount factor to all that have a copy of it."""
-        self._model.gamma = self._replay.gamma = self._env.batch.gamma = gamma
+        super()._take_gamma(gamma)
+        self._replay.gamma = gamma
 
     def _imitation_scale(self) -> float:
         return 1.0
