@@ -14,7 +14,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.learning.critics import CriticInputs, relative_advantages, value_of_living
+from ballbot_train.learning.critics import CriticInputs, cost_to_go, relative_advantages, value_of_living
 from ballbot_train.learning.curricula import Curriculum
 from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
 from ballbot_train.learning.frames import demos_in_frame
@@ -466,6 +466,36 @@ def test_targets_of_sac_can_add_up_the_rewards_of_several_steps():
         assert float(reward[0]) == pytest.approx(summed, rel=1e-5)
         several += count == 3
     assert several > 100
+
+
+def test_gradients_at_sacs_critics_are_relative_to_the_cost_to_go():
+    plain, relative = make("sac"), make("sac", relative_values=1.0)
+    seen, acted = torch.rand(16, 8), torch.rand(16, 2, requires_grad=True)
+    gradients = [
+        torch.autograd.grad(learner._model.critic(seen, acted)[0].sum(), acted)[0] for learner in (plain, relative)
+    ]
+    with torch.no_grad():
+        lowest = torch.stack(relative._model.critic(seen, acted)).amin(0)
+    assert_relative(relative, *gradients, lowest)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_gradients_at_ppos_critic_are_relative_to_the_cost_to_go(plain):
+    kind = {"symmetry": "none", "products": False} if plain else {}
+    gradients = []
+    for learner in (make("ppo", **kind), relative := make("ppo", relative_values=1.0, **kind)):
+        seen = torch.linspace(-1, 1, 128).reshape(16, 8).requires_grad_()
+        values = learner._model.policy.evaluate_actions(seen, torch.zeros(16, 2))[0]
+        gradients.append(torch.autograd.grad(values.sum(), seen)[0])
+    assert_relative(relative, *gradients, values.detach())
+
+
+def assert_relative(learner, plain, relative, values):
+    """The learner's gradients (n, ...) are the plain ones divided by the cost to go that the values (n, 1) say."""
+    weights = 1 / cost_to_go(values, learner._value_of_living(learner._model.gamma))
+    torch.testing.assert_close(relative, plain * weights / weights.mean())
+    assert float(weights.max() / weights.min()) > 1.01
+    run(learner)
 
 
 def test_beside_demonstrations_sac_learns_from_single_steps_of_the_task(demos):

@@ -101,9 +101,33 @@ def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: flo
         living: value of a state without any cost, so that the cost to go is `living` minus the value.
         power: of the cost to go by which they are divided.
     """
-    cost = living - values
-    relative = (returns - values) / torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6)) ** power
+    relative = (returns - values) / cost_to_go(values, living) ** power
     return (relative - relative.mean()) / (relative.std() + 1e-8)
+
+
+def weigh_gradients(values: Sequence[torch.Tensor], living: float, power: float) -> None:
+    """Divides gradients that flow back into the values (n, 1) of several critics by the cost to go, as the lowest say it.
+
+    The mean of all n factors is 1. `living` and `power` are as of `relative_advantages`.
+    """
+    if not values[0].requires_grad:
+        return
+    lowest = torch.stack([value.detach() for value in values]).amin(0)
+    weights = cost_to_go(lowest, living) ** -power
+    weights /= weights.mean()
+    for value in values:
+        value.register_hook(lambda gradient: gradient * weights)
+
+
+def cost_to_go(values: torch.Tensor, living: float) -> torch.Tensor:
+    """The costs to go that values of any shape stand for, but no less than a share of their mean.
+
+    Args:
+        values: what the critic expects.
+        living: value of a state without any cost.
+    """
+    cost = living - values
+    return torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6))
 
 
 def start_at(value: float, linear: torch.nn.Linear, last: torch.nn.Linear) -> None:

@@ -73,7 +73,7 @@ class Choice:
 
 
 _WIDTHS = Choice(((64, 64), (128, 128), (256, 256)))
-_GAMMAS = Choice((0.98, 0.99, 0.995, 0.998))
+_GAMMAS = Choice((0.98, 0.985, 0.99, 0.995, 0.998))
 _OF_PPO: dict[str, Range | Choice] = {
     "clip_range": Choice((0.1, 0.2, 0.3)),
     "max_grad_norm": Range(0.2, 5.0),

@@ -20,7 +20,7 @@ from ballbot_gym.tasks.symmetry import Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import average_of
-from ballbot_train.learning.critics import value_of_living
+from ballbot_train.learning.critics import value_of_living, weigh_gradients
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
 from ballbot_train.learning.demonstrations import Demos
 from ballbot_train.learning.frames import seen_in, to_world
@@ -55,6 +55,9 @@ class ModelFreeConfig:
     """Units of the hidden layers of actor and critics."""
     products: bool = True
     """Whether the critics have a linear path, and see the products of all pairs of their inputs; see `learning.critics`."""
+    relative_values: float = 0.0
+    """Power of the cost to go, as the critics expect it, by which gradients at their values are divided: of their own errors,
+    and of what the actor of SAC gains; 0: off. So states near the goal count too, as they do in regret."""
     curriculum: Curriculum = Curriculum()
     """What training makes easier at first."""
     pay: bool = True
@@ -147,6 +150,10 @@ class ModelFree(ABC):
     def _value_of_living(self, gamma: float) -> float:
         """Value of living for ever without cost."""
         return value_of_living(self._trained, self._settings.reward_scale, gamma) if self._settings.pay else 0.0
+
+    def _weigh(self, values: Sequence[torch.Tensor]) -> None:
+        """Makes gradients at critics' values relative to the cost to go."""
+        weigh_gradients(values, self._value_of_living(self._model.gamma), self._settings.relative_values)
 
     @property
     def _kept(self) -> nn.Module:

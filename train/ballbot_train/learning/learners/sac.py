@@ -98,7 +98,27 @@ TUNED: dict[str, SacConfig] = {
         evaluations=30,
         curriculum=Curriculum(short_episodes=0.3),
     ),
-    "orbit": SacConfig(symmetry="frame"),
+    "orbit": SacConfig(
+        symmetry="centred",
+        rl_iterations=700,
+        num_envs=256,
+        num_steps=12,
+        gradient_steps=16,
+        batch_size=512,
+        learning_rate=1e-3,
+        final_learning_rate_fraction=0.03,
+        control_dt=0.05,
+        n_steps=8,
+        buffer_steps=128_000,
+        gamma=0.985,
+        final_gamma=0.994,
+        relative_values=1.0,
+        std=0.3,
+        target_entropy=-4.0,
+        averaged_iterations=10,
+        evaluations=35,
+        curriculum=Curriculum(short_episodes=0.3, short_seconds=1.0),
+    ),
     "turn": SacConfig(episode_seconds=8.0, symmetry="frame"),
     "weave": SacConfig(episode_seconds=8.0, symmetry="frame"),
 }
@@ -340,6 +360,8 @@ class Sac(ModelFree):
             model.critic_target.register_forward_hook(
                 lambda _module, _inputs, values: tuple(value.clamp(max=self._highest()) for value in values)
             )
+        if config.relative_values:
+            model.critic.register_forward_hook(lambda _critics, _inputs, values: self._weigh(values))
         self._model: SAC
         self._set_model(
             model,
