@@ -113,6 +113,7 @@ TUNED: dict[str, PpoConfig] = {
         final_learning_rate_fraction=0.02,
         final_gamma=0.994,
         relative_advantages=1.0,
+        relative_values=1.0,
         curriculum=Curriculum(short_episodes=0.3),
     ),
     "turn": replace(
