@@ -499,9 +499,12 @@ def assert_relative(learner, plain, relative, values):
 
 
 def test_beside_demonstrations_sac_learns_from_single_steps_of_the_task(demos):
-    learner = make("sac", demos, n_steps=3, buffer_steps=40, control_dt=0.05)
+    farther = {"n_steps": 3, "buffer_steps": 40, "control_dt": 0.05, "products": True, "relative_values": 1.0}
+    learner = make("sac", demos, **farther)
     replay = learner._replay
     assert (replay.n_steps, replay.buffer_size, learner._env.batch.task.control_dt) == (1, 3 * 8, 0.02)
+    assert type(learner._model.critic.q_networks[0]) is torch.nn.Sequential
+    assert not learner._model.critic._forward_hooks
     assert make("sac", n_steps=3, buffer_steps=40)._replay.buffer_size == 40 // 4
 
 

@@ -57,7 +57,8 @@ class ModelFreeConfig:
     """Whether the critics have a linear path, and see the products of all pairs of their inputs; see `learning.critics`."""
     relative_values: float = 0.0
     """Power of the cost to go, as the critics expect it, by which gradients at their values are divided: of their own errors,
-    and of what the actor of SAC gains; 0: off. So states near the goal count too, as they do in regret."""
+    and of what the actor of SAC gains; 0, or with demonstrations: off. So states near the goal count too, as they do in
+    regret."""
     curriculum: Curriculum = Curriculum()
     """What training makes easier at first."""
     pay: bool = True
@@ -112,6 +113,7 @@ class ModelFree(ABC):
                 raise ValueError("control_dt cannot be used with curriculum.starts_on_optima")
             task = replace(task, control_dt=config.control_dt)
         self._trained = task
+        self._relative_values = config.relative_values if demos is None else 0.0
         self._gamma = self._per_step(config.gamma)
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
@@ -151,9 +153,10 @@ class ModelFree(ABC):
         """Value of living for ever without cost."""
         return value_of_living(self._trained, self._settings.reward_scale, gamma) if self._settings.pay else 0.0
 
-    def _weigh(self, values: Sequence[torch.Tensor]) -> None:
-        """Makes gradients at critics' values relative to the cost to go."""
-        weigh_gradients(values, self._value_of_living(self._model.gamma), self._settings.relative_values)
+    def _weigh(self, _critics: nn.Module, _inputs: Any, values: Any) -> None:
+        """A forward hook of critics: makes gradients at their values, a tensor or several, relative to the cost to go."""
+        several = (values,) if isinstance(values, torch.Tensor) else values
+        weigh_gradients(several, self._value_of_living(self._model.gamma), self._relative_values)
 
     @property
     def _kept(self) -> nn.Module:

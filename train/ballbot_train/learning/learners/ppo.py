@@ -270,8 +270,8 @@ class Ppo(ModelFree):
             actor = policy.branches.actor
         else:
             actor = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
-        if config.relative_values:  # its last layer, which a `BranchedPolicy` has as an identity
-            policy.value_net.register_forward_hook(lambda _layer, _inputs, values: self._weigh([values]))
+        if self._relative_values:  # its last layer, which a `BranchedPolicy` has as an identity
+            policy.value_net.register_forward_hook(self._weigh)
         if demos is not None and config.demo_critic_learning_rate is not None:
             _set_critic_rate(policy, actor, config.demo_critic_learning_rate)
         self._model: PPO

@@ -39,8 +39,8 @@ class SacConfig(ModelFreeConfig):
     """Settings of `Sac`."""
 
     products: bool = False
-    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions. With
-    targets of one step of 0.02 s nothing was learnt with them; with farther ones they halve the regret on Stabilize."""
+    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions; with
+    demonstrations they do not. With targets of one step of 0.02 s, as those have, nothing was learnt with them."""
     rl_iterations: int = 200
     num_envs: int = 16
     num_steps: int = 63
@@ -275,13 +275,13 @@ CriticNetwork = Callable[[int, list[int], type[torch.nn.Module]], torch.nn.Modul
 """From number of inputs, units of the hidden layers and activation to a network with one output."""
 
 
-def _critic_network(config: SacConfig, value: float) -> CriticNetwork:
+def _critic_network(products: bool, layer_norm: bool, value: float) -> CriticNetwork:
     """What makes critics: they see products and expect `value` everywhere at the start, or their layers may be normalized."""
 
     def network(inputs: int, hidden: list[int], activation: type[torch.nn.Module]) -> torch.nn.Module:
-        if config.products:
+        if products:
             return QuadraticCritic(CriticInputs(inputs), hidden, activation, value)
-        after: Any = [torch.nn.LayerNorm] if config.layer_norm else None
+        after: Any = [torch.nn.LayerNorm] if layer_norm else None
         return torch.nn.Sequential(*create_mlp(inputs, 1, hidden, activation, post_linear_modules=after))
 
     return network
@@ -314,10 +314,12 @@ class Sac(ModelFree):
             demos = demos_in_frame(demos, frame)
         super().__init__(task, params, config, demos, frame)
         self.config = config
+        products = config.products and demos is None
         rate = config.learning_rate
         value = self._value_of_living(self._gamma)
-        own = config.products or config.layer_norm or self._spec.centred
-        networks = {"network": _critic_network(config, value), "centre": frame if self._spec.centred else None}
+        own = products or config.layer_norm or self._spec.centred
+        critic = _critic_network(products, config.layer_norm, value)
+        networks = {"network": critic, "centre": frame if self._spec.centred else None}
         model = SAC(
             OwnPolicy if own else "MlpPolicy",
             self._env,
@@ -354,7 +356,7 @@ class Sac(ModelFree):
         actor, log_std = model.actor, cast(torch.nn.Linear, model.actor.log_std)
         torch.nn.init.zeros_(log_std.weight)
         torch.nn.init.constant_(log_std.bias, math.log(config.std if demos is None else config.demo_std))
-        if not config.products:
+        if not products:
             for critic in (*model.critic.q_networks, *model.critic_target.q_networks):
                 torch.nn.init.constant_(last_bias(critic), value)
         if not config.curriculum.shaping:  # which adds to rewards
@@ -363,8 +365,8 @@ class Sac(ModelFree):
             model.critic_target.register_forward_hook(
                 lambda _module, _inputs, values: tuple(value.clamp(max=self._highest()) for value in values)
             )
-        if config.relative_values:
-            model.critic.register_forward_hook(lambda _critics, _inputs, values: self._weigh(values))
+        if self._relative_values:
+            model.critic.register_forward_hook(self._weigh)
         self._model: SAC
         self._set_model(
             model,
