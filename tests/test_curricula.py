@@ -202,7 +202,8 @@ def test_episodes_on_optima_begin_ever_earlier_as_they_succeed():
     given(made, some_starts(made.task))
     of_four, everywhere = torch.ones(4, dtype=torch.bool), torch.ones(200, dtype=torch.bool)
     for steps_left in (2, 3, 4, 5):
-        made._start_on_optima(made.step(torch.zeros(200, 2)), everywhere)
+        made.step(torch.zeros(200, 2))
+        made._start_on_optima(everywhere)
         assert int((5 - made.state.steps).max()) == steps_left
         made._count_starts(of_four, torch.tensor([True, True, False, False]))
         assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * steps_left)
@@ -236,7 +237,7 @@ def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
     result = made.step(torch.zeros(400, 2))
     torch.testing.assert_close(result.observation, made.observe(made.state))
     run(made, 40 * made.task.steps)
-    assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0)]
+    assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0), (10, 0)]
 
 
 def test_episodes_on_optima_that_went_wrong_are_repeated_as_such():
@@ -251,6 +252,59 @@ def test_episodes_on_optima_that_went_wrong_are_repeated_as_such():
     counts = made._on_optima.state()
     run(made, made.task.steps)
     assert counts == pytest.approx(made._on_optima.state(), nan_ok=True)
+
+
+def test_no_episode_begins_in_the_gap_and_a_share_begins_just_above_it():
+    made = batch(curriculum=Curriculum(gap_low=4.0, gap_high=6.0, gap_step=0.1, gap_share=0.25), num_envs=400)
+    torch.manual_seed(0)
+    for _ in range(3):
+        run(made, made.task.steps)
+        speed = made.state.c[0]
+        assert not ((speed > 4) & (speed < 6)).any()
+        assert torch.equal(made.state.x[5], speed)
+        above = made._kind == curricula._ABOVE_GAP
+        assert 0.15 < float(above.double().mean()) < 0.35
+        assert (speed[above] <= 6.2).all()
+        assert (speed[above] >= 6).all()
+    assert (speed < 4).any()
+    assert (speed > 7).any()
+    result = made.step(torch.zeros(400, 2))
+    torch.testing.assert_close(result.observation, made.observe(made.state))
+
+
+def test_the_first_episodes_are_outside_of_the_gap_too():
+    made = batch(curriculum=Curriculum(gap_low=2.0, gap_high=9.0), num_envs=100)
+    assert (made.state.c[0] >= 9).all()
+    again = made.reset(mask=torch.arange(100) < 50)
+    assert (made.state.c[0] >= 9).all()
+    assert torch.equal(again, made.observe(made.state))
+
+
+def test_the_gap_closes_from_above_as_the_episodes_above_it_succeed():
+    made = batch(curriculum=Curriculum(gap_low=4.0, gap_high=4.5, gap_step=0.2, episodes=4, success=0.75), num_envs=100)
+    of_four = torch.ones(4, dtype=torch.bool)
+    made._count_above_gap(of_four, torch.tensor([True, True, False, False]))
+    assert made.difficulty["gap_high"] == 4.5
+    for reached in (4.3, 4.1, 4.0):
+        made._count_above_gap(of_four, torch.tensor([True, True, True, False]))
+        assert made.difficulty["gap_high"] == pytest.approx(reached)
+    torch.manual_seed(0)
+    run(made, 20 * made.task.steps)
+    assert (made._kind == curricula._OWN).all()
+
+
+def test_while_the_goal_is_wide_the_gap_stays_and_nothing_crowds_above_it():
+    settings = Curriculum(goal_factor=2.0, gap_low=4.0, gap_high=6.0, starts_on_optima=0.5, gap_share=1.0)
+    made = batch(curriculum=settings, num_envs=100)
+    starts = some_starts(made.task)
+    speeds = torch.where(torch.arange(20) < 10, 3.0, 5.0)
+    given(made, starts._replace(c=speeds.double()[None]))
+    torch.manual_seed(0)
+    run(made, made.task.steps)
+    assert not (made._kind == curricula._ABOVE_GAP).any()
+    on_optima = made._kind == curricula._ON_OPTIMUM
+    assert on_optima.any()
+    assert (made.state.c[0, on_optima] == 3).all()  # those of 5 m/s lie in the gap
 
 
 def test_only_failures_are_repeated_where_an_episode_that_runs_out_of_time_may_be_a_good_one():
@@ -289,7 +343,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
     easier = Curriculum(
         goal_factor=3.0, ramp="max_speed", ramp_start=3.0, starts_on_optima=0.5, shaping=1.0, episodes=2, success=0.0
     )
-    easier = replace(easier, starts_seconds=0.04, retries=0.5)
+    easier = replace(easier, starts_seconds=0.04, retries=0.5, gap_low=2.2, gap_high=2.6)
     settings = replace(LEARNERS[name].settings("turn"), hidden=(8,), curriculum=easier, **TINY[name])
 
     def make(seed):
@@ -308,7 +362,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
     second.iterate()
     for ours, theirs in zip(second.network.parameters(), whole.network.parameters(), strict=True):
         assert torch.equal(ours, theirs)
-    assert second.difficulty == whole.difficulty
+    assert second.difficulty == pytest.approx(whole.difficulty, nan_ok=True, rel=0)
     assert 1 < whole.difficulty["goal_factor"] < 3
     assert figures["curriculum/goal_factor"] == whole.difficulty["goal_factor"]
 
@@ -319,6 +373,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
         ({"goal_factor": 0.5}, "curriculum.goal_factor must be 1 to 1000, not 0.5"),
         ({"success": float("nan")}, "curriculum.success must be 0 to 1, not nan"),
         ({"retries": 2.0}, "curriculum.retries must be 0 to 1, not 2.0"),
+        ({"gap_share": 0.0}, "curriculum.gap_share must be 0.001 to 1, not 0.0"),
         ({"starts_on_optima": 2.0}, "curriculum.starts_on_optima must be 0 to 1, not 2.0"),
     ],
 )
@@ -336,6 +391,12 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
             {"ramp": "max_speed"},
             "BallbotStabilize-v0 has no field 'max_speed' for curriculum.ramp; it has",
         ),
+        (
+            "stabilize",
+            {"gap_high": 1.0},
+            "BallbotStabilize-v0 draws no constants, so curriculum.gap_high must not be above",
+        ),
+        ("turn", {"gap_high": 11.0}, "BallbotTurn-v0 draws no speed just above curriculum.gap_high 11"),
         ("turn", {"ramp": "max_speed", "ramp_start": 1.0}, "curriculum.ramp_start 1 is out of range"),
         ("turn", {"starts_seconds": 0.5}, "curriculum.starts_seconds needs curriculum.starts_on_optima above 0"),
         ("weave", {"starts_seconds": 0.5, "starts_on_optima": 0.5}, "BallbotWeave-v0 does not end at its goal"),

@@ -12,6 +12,9 @@ A curriculum changes training alone. What is evaluated is always the task itself
 - A share of the episodes, also of those on optima, repeats starts from which recent ones failed or missed their goal. So what
   is hard is met more often, as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized
   level replay", 2021).
+- Values of the first constant, as Turn's speed, can be left out at first. This gap closes from above, by a step whenever
+  enough of the episodes just above it succeed. So the way of the episodes above it, as Turn's loop, is carried on into the
+  gap, where a policy that begins with all of them averages two ways.
 - A share of the episodes is cut soon after its start, so that more of the samples are of starts.
 - Rewards are shaped by a potential, minus the distance to the goal. Shaping by a potential moves no optimum (Ng et al.,
   "Policy invariance under reward transformations", 1999).
@@ -38,8 +41,9 @@ from ballbot_train.evaluation import fresh
 
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
-_OWN, _ON_OPTIMUM = 0, 1  # how an episode began
+_OWN, _ON_OPTIMUM, _ABOVE_GAP = 0, 1, 2  # how an episode began
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
+_CANDIDATES = 100_000  # constants, of which those outside of the gap are taken
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,14 @@ class Curriculum:
     retries: float = 0.0
     """Share of the training episodes, of the task's own and of those on optima, that repeat the start of one of the last such
     episodes that failed or, on a task that ends at its goal, missed it; 0: off. They do not count for `success`."""
+    gap_low: float = 0.0
+    """No episode has a first constant, as Turn's speed, between this value and `gap_high` at the start of training."""
+    gap_high: float = 0.0
+    """The upper end of that gap, in the unit of the constant; not above `gap_low`: no gap."""
+    gap_step: float = 0.05
+    """How much lower it gets whenever enough of the episodes just above it succeed, once the goal is the task's own."""
+    gap_share: float = 0.2
+    """Share of the task's own episodes that begin just above the gap, within two steps, until it is closed."""
     short_episodes: float = 0.0
     """Share of the training episodes that are cut after `short_seconds`; 0: off. So more of the samples are of the starts,
     where most of a good policy's regret arises."""
@@ -103,6 +115,10 @@ class Curriculum:
             ("starts_step", 1e-9, 1e6),
             ("starts_goal_factor", 0.0, 1e3),
             ("retries", 0.0, 1.0),
+            ("gap_low", -1e6, 1e6),
+            ("gap_high", -1e6, 1e6),
+            ("gap_step", 1e-9, 1e6),
+            ("gap_share", 1e-3, 1.0),
             ("short_episodes", 0.0, 1.0),
             ("short_seconds", 1e-3, 1e6),
             ("shaping", 0.0, 1e6),
@@ -119,9 +135,15 @@ class Curriculum:
             or self.ramp != ""
             or self.starts_on_optima > 0
             or self.retries > 0
+            or self.has_gap
             or self.short_episodes > 0
             or self.shaping > 0
         )
+
+    @property
+    def has_gap(self) -> bool:
+        """Whether episodes are left out at first."""
+        return self.gap_high > self.gap_low
 
     def check(self, task: Task) -> None:
         """Raises a ValueError that says what of this the task does not have."""
@@ -141,6 +163,10 @@ class Curriculum:
             raise ValueError(
                 f"curriculum.starts_goal_factor must be less than curriculum.goal_factor {self.goal_factor:g}, "
                 f"not {self.starts_goal_factor:g}"
+            )
+        if self.has_gap and not task.constant_draws:
+            raise ValueError(
+                f"{task.id} draws no constants, so curriculum.gap_high must not be above curriculum.gap_low"
             )
         if self.short_episodes and task.first_exit:
             raise ValueError(
@@ -219,14 +245,19 @@ class CurriculumBatch(BallbotBatch):
         self._goal_factor = curriculum.goal_factor
         self._ramp = curriculum.ramp_start if curriculum.ramp else 0.0
         self._reach = curriculum.starts_seconds
-        self._own_episodes, self._on_optima = _Tally(), _Tally()  # that ended, by how they began
+        self._gap_high = curriculum.gap_high
+        self._own_episodes, self._on_optima, self._above_gap = (
+            _Tally(),
+            _Tally(),
+            _Tally(),
+        )  # that ended, by how they began
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
         rows = 8 + len(task.constant_names) + 1
         self._begun = torch.zeros(
             rows, num_envs
         )  # states, constants and passed steps at the starts of the running episodes
-        self._hard = [torch.zeros(rows, 0)] * 2  # those of the last episodes of either kind that went wrong
+        self._hard = [torch.zeros(rows, 0)] * 3  # those of the last episodes of each kind that went wrong
         self._demos, self._full = demos, task if full is None else full
         self._starts: Starts | None = None
         if demos is not None and curriculum.starts_on_optima:
@@ -243,16 +274,21 @@ class CurriculumBatch(BallbotBatch):
             reached[curriculum.ramp] = self._ramp
         if curriculum.starts_seconds:
             reached["starts_seconds"], reached["starts_success"] = self._reach, self._on_optima.share
+        if curriculum.has_gap:
+            reached["gap_high"], reached["gap_success"] = self._gap_high, self._above_gap.share
         return reached | ({"success": self._own_episodes.share} if reached else {})
 
     def reset(self, *args: Any, mask: torch.Tensor | None = None, **given: Any) -> torch.Tensor:
         """As of `BallbotBatch`: these episodes begin as the task's own do."""
-        observation = super().reset(*args, mask=mask, **given)
+        super().reset(*args, mask=mask, **given)
         begun = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
         self._kind = torch.where(begun, _OWN, self._kind)
         self._again = self._again & ~begun
+        if self._gap_is_open and given.get("c") is None:
+            self._leave_gap(begun)
         self._begin(begun)
-        return observation
+        assert self.state is not None
+        return self.observe(self.state)
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> BatchStep:
@@ -276,17 +312,23 @@ class CurriculumBatch(BallbotBatch):
         self._count(counted & (self._kind == _OWN), result.success)
         if self.curriculum.starts_on_optima:
             self._count_starts(counted & (self._kind == _ON_OPTIMUM), result.success)
+        if self._gap_is_open:
+            self._count_above_gap(counted & (self._kind == _ABOVE_GAP), result.success)
         if self.curriculum.retries:
             self._keep_hard(result)
         self._kind, self._again = torch.where(ended, _OWN, self._kind), self._again & ~ended
+        if self._gap_is_open:
+            self._leave_gap(ended)
         if self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor:
-            result = self._start_on_optima(result, ended)
+            self._start_on_optima(ended)
         if self.curriculum.retries:
-            result = self._retry(result, ended)
+            self._retry(ended)
         self._begin(ended)
         if self.curriculum.short_episodes:
             self._shorten(ended)
-        return result._replace(reward=reward)
+        assert self.state is not None
+        observation = torch.where(ended[:, None], self.observe(self.state), result.observation)
+        return result._replace(observation=observation, reward=reward)
 
     def curriculum_state(self) -> dict[str, Any]:
         """What the batch remembers besides `state`: tensors and plain values."""
@@ -294,8 +336,10 @@ class CurriculumBatch(BallbotBatch):
             "goal_factor": self._goal_factor,
             "ramp": self._ramp,
             "reach": self._reach,
+            "gap_high": self._gap_high,
             "own_episodes": self._own_episodes.state(),
             "on_optima": self._on_optima.state(),
+            "above_gap": self._above_gap.state(),
             "kind": self._kind,
             "again": self._again,
             "begun": self._begun,
@@ -306,7 +350,9 @@ class CurriculumBatch(BallbotBatch):
     def load_curriculum_state(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
         self._goal_factor, self._ramp, self._reach = state["goal_factor"], state["ramp"], state["reach"]
+        self._gap_high = state["gap_high"]
         self._own_episodes, self._on_optima = _Tally(*state["own_episodes"]), _Tally(*state["on_optima"])
+        self._above_gap = _Tally(*state["above_gap"])
         self._kind, self._again = state["kind"], state["again"]
         self._begun, self._hard = state["begun"], list(state["hard"])
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
@@ -325,6 +371,16 @@ class CurriculumBatch(BallbotBatch):
         if self._enough(self._on_optima, ended, success) and 0 < self._reach < self._own.duration:
             self._reach = min(self._reach + self.curriculum.starts_step, self._own.duration)
             self._eligible = None
+
+    def _count_above_gap(self, ended: torch.Tensor, success: torch.Tensor) -> None:
+        """Counts the ended episodes that began just above the gap, and narrows it if enough of them succeeded."""
+        if self._enough(self._above_gap, ended, success):
+            self._gap_high = max(self._gap_high - self.curriculum.gap_step, self.curriculum.gap_low)
+            self._set_difficulty()
+
+    @property
+    def _gap_is_open(self) -> bool:
+        return self._gap_high > self.curriculum.gap_low
 
     def _enough(self, tally: "_Tally", ended: torch.Tensor, success: torch.Tensor) -> bool:
         """Counts the episodes that ended. True where `episodes` are complete now, and enough of them succeeded."""
@@ -358,49 +414,78 @@ class CurriculumBatch(BallbotBatch):
             task = replace(task, **{self.curriculum.ramp: self._ramp})
         self.task = widened(task, self._goal_factor)
         self._eligible: torch.Tensor | None = None
+        if self._gap_is_open:
+            self._draw_candidates()
 
-    def _start_on_optima(self, result: BatchStep, ended: torch.Tensor) -> BatchStep:
+    def _draw_candidates(self) -> None:
+        """Draws constants, and finds those outside of the gap, and among them those just above it."""
+        generator = torch.Generator().manual_seed(0)
+        z = torch.rand(self.task.constant_draws, _CANDIDATES, dtype=self.dtype, generator=generator)
+        drawn = (torch.as_tensor(value, dtype=self.dtype) for value in self.task.draw_constants(tuple(z), self.params))
+        self._candidates = torch.stack(torch.broadcast_tensors(*drawn))
+        first = self._candidates[0]
+        above = (first >= self._gap_high) & (first <= self._gap_high + 2 * self.curriculum.gap_step)
+        self._outside, self._near = (~self._in_gap(first)).nonzero()[:, 0], above.nonzero()[:, 0]
+        if not len(self._near):
+            name = self._own.constant_names[0]
+            raise ValueError(f"{self._own.id} draws no {name} just above curriculum.gap_high {self._gap_high:g}")
+
+    def _in_gap(self, first: torch.Tensor) -> torch.Tensor:
+        """Whether episodes with these first constants are left out."""
+        return (first > self.curriculum.gap_low) & (first < self._gap_high)
+
+    def _leave_gap(self, begun: torch.Tensor) -> None:
+        """Draws the episodes anew that have just begun in the gap, and a share of the others just above it."""
+        assert self.state is not None
+        above = begun & (torch.rand(self.num_envs) < self.curriculum.gap_share * (self._goal_factor == 1))
+        self._kind = torch.where(above, _ABOVE_GAP, self._kind)
+        for drawn, which in ((above, self._near), (begun & ~above & self._in_gap(self.state.c[0]), self._outside)):
+            count = int(drawn.sum())
+            c = self._candidates[:, which[torch.randint(len(which), (count,))]]
+            z = torch.rand(self._own.state_draws, count, dtype=self.dtype)
+            x = torch.stack(self._own.draw_state(tuple(z), tuple(c), self.params))
+            self._move(drawn, x, c, torch.zeros(count, dtype=torch.long))
+
+    def _start_on_optima(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun into states along optima."""
         if self._starts is None:
             self._starts = optimal_starts(self._full, self.params, self.curriculum.optima, self._own.steps)
         if self._eligible is None:  # states outside of the goal, which may be wide
             inside = self.task.goal(self._starts.x.unbind(0), self._starts.c.unbind(0))
             reached = torch.stack([excess <= 0 for excess in inside]).all(0)
-            near = torch.ones_like(reached)
+            near = ~self._in_gap(self._starts.c[0]) if self._gap_is_open else torch.ones_like(reached)
             if self._reach:
-                near = self._starts.left <= max(1, round(self._reach / self.task.control_dt))
+                near = near & (self._starts.left <= max(1, round(self._reach / self.task.control_dt)))
             outside = (near & ~reached).nonzero()[:, 0]
             self._eligible = outside if len(outside) else near.nonzero()[:, 0]
         moved = ended & (torch.rand(self.num_envs) < self.curriculum.starts_on_optima)
         self._kind = torch.where(moved, _ON_OPTIMUM, self._kind)
         starts, count = self._starts, int(moved.sum())
         if not count:
-            return result
+            return
         lengths = (starts.steps + starts.left)[self._eligible]  # so that every optimum is met as often as any other
         chosen = self._eligible[torch.multinomial(1.0 / lengths, count, replacement=True)]
-        return self._moved(result, moved, starts.x[:, chosen], starts.c[:, chosen], starts.steps[chosen])
+        self._move(moved, starts.x[:, chosen], starts.c[:, chosen], starts.steps[chosen])
 
     def _keep_hard(self, result: BatchStep) -> None:
         """Remembers the starts of the episodes that have just gone wrong."""
         wrong = result.failure
         if self.task.first_exit:
             wrong = wrong | (result.truncated & ~result.success)
-        for kind in (_OWN, _ON_OPTIMUM):
+        for kind in range(len(self._hard)):
             starts = self._begun[:, wrong & (self._kind == kind)]
             self._hard[kind] = torch.cat([self._hard[kind], starts], 1)[:, -_KEPT_STARTS:]
 
-    def _retry(self, result: BatchStep, ended: torch.Tensor) -> BatchStep:
+    def _retry(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun to starts from which others of their kind went wrong."""
         drawn = ended & (torch.rand(self.num_envs) < self.curriculum.retries)
-        for kind in (_OWN, _ON_OPTIMUM):
-            hard = self._hard[kind]
+        for kind, hard in enumerate(self._hard):
             again = drawn & (self._kind == kind)
             if not hard.shape[1]:
                 continue
             self._again = self._again | again
             chosen = hard[:, torch.randint(hard.shape[1], (int(again.sum()),))]
-            result = self._moved(result, again, chosen[:8], chosen[8:-1], chosen[-1].long())
-        return result
+            self._move(again, chosen[:8], chosen[8:-1], chosen[-1].long())
 
     def _begin(self, begun: torch.Tensor) -> None:
         """Remembers the starts of the episodes that have just begun, if any may be repeated."""
@@ -410,17 +495,14 @@ class CurriculumBatch(BallbotBatch):
         starts = torch.cat([self.state.x, self.state.c, self.state.steps[None]]).float()
         self._begun = torch.where(begun, starts, self._begun)
 
-    def _moved(
-        self, result: BatchStep, moved: torch.Tensor, x: torch.Tensor, c: torch.Tensor, passed: torch.Tensor
-    ) -> BatchStep:
+    def _move(self, moved: torch.Tensor, x: torch.Tensor, c: torch.Tensor, passed: torch.Tensor) -> None:
         """Moves n of the B episodes to states (8, n), constants (nc, n) and counts (n,) of control steps that have passed."""
         if not moved.any():
-            return result
+            return
         assert self.state is not None
         states, constants, steps = self.state.x.clone(), self.state.c.clone(), self.state.steps.clone()
         states[:, moved], constants[:, moved], steps[moved] = x.to(states.dtype), c.to(constants.dtype), passed
         self.state = self.state._replace(x=states, c=constants, steps=steps)
-        return result._replace(observation=torch.where(moved[:, None], self.observe(self.state), result.observation))
 
     def _shorten(self, ended: torch.Tensor) -> None:
         """Cuts a share of the episodes that have just begun: their clocks start late, which no observation shows."""
