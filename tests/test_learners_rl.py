@@ -186,6 +186,22 @@ def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
     assert buffer.advantages.std() == pytest.approx(1, abs=0.02)
 
 
+def test_what_shaping_adds_to_values_is_no_cost_to_go():
+    task = make_task("turn")
+    settings = replace(TINY["ppo"], relative_advantages=1.0, pay=False, curriculum=Curriculum(shaping=10.0))
+    learner = ppo.make(task, default_params(), settings, 0, None)
+    learner.iterate()
+    buffer = learner._model.rollout_buffer
+    x, y, gamma, theta, vx, vy = (task.observation_scale[i] * buffer.observations[..., i] for i in range(6))
+    away = np.sqrt(x**2 + y**2 + (0.3 * vx) ** 2 + (0.3 * vy) ** 2 + gamma**2 + theta**2)
+    potentials = buffer.swap_and_flatten(buffer.potentials[..., np.newaxis])  # as SB3 does with the others
+    np.testing.assert_allclose(potentials[:, 0], -10 * learner.config.reward_scale * away, rtol=1e-4)
+    returns, values = torch.as_tensor(buffer.returns), torch.as_tensor(buffer.values)
+    without_cost = -torch.as_tensor(potentials)  # who reaches the gate from there at once
+    expected = relative_advantages(returns, values, without_cost)
+    torch.testing.assert_close(torch.as_tensor(buffer.advantages).flatten(), expected.flatten())
+
+
 def test_demonstrations_of_another_task_are_refused(name, demos):
     with pytest.raises(ValueError, match="not of Orbit"):
         LEARNERS[name].make(make_task("orbit"), default_params(), TINY[name], 0, demos)

@@ -254,6 +254,8 @@ class CurriculumBatch(BallbotBatch):
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
         rows = 8 + len(task.constant_names) + 1
+        self.last_potential = torch.zeros(num_envs)
+        """(B,) potential of the states from which the last step was taken; 0 without shaping."""
         self._begun = torch.zeros(
             rows, num_envs
         )  # states, constants and passed steps at the starts of the running episodes
@@ -303,7 +305,7 @@ class CurriculumBatch(BallbotBatch):
             if task.first_exit:
                 reward = reward - survive * (task.steps - before.steps - 1) * result.success
         if self.curriculum.shaping:
-            start = self._potential(before.x, before.c)
+            start = self.last_potential = self._potential(before.x, before.c)
             end = self._potential(result.final_x, before.c)
             # An episode that terminates ends with a potential of 0, and a truncated one goes on.
             reward = reward + self.gamma * torch.where(result.terminated, 0.0, end) - start

@@ -152,15 +152,37 @@ TUNED: dict[str, PpoConfig] = {
 class RelativeRollouts(RolloutBuffer):
     """A rollout buffer of advantages relative to the cost to go."""
 
-    def __init__(self, *args: Any, living: Callable[[float], float], power: float, **kwargs: Any):
-        """Args: living: from a discount factor to the value of living for ever without cost; power: of the cost to go."""
-        self._living, self._power = living, power
+    def __init__(
+        self,
+        *args: Any,
+        living: Callable[[float], float],
+        potential: Callable[[], np.ndarray],
+        power: float,
+        **kwargs: Any,
+    ):
+        """Makes an empty one.
+
+        Args:
+            living: from a discount factor to the value of living for ever without cost.
+            potential: the scaled potentials (n_envs,), by which rewards are shaped, of the states before the last step.
+            power: of the cost to go.
+        """
+        self._living, self._potential, self._power = living, potential, power
         super().__init__(*args, **kwargs)
+
+    def reset(self) -> None:
+        super().reset()
+        self.potentials = np.zeros((self.buffer_size, self.n_envs), np.float32)
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        self.potentials[self.pos] = self._potential()
+        super().add(*args, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
         super().compute_returns_and_advantage(last_values, dones)
         returns, values = torch.as_tensor(self.returns), torch.as_tensor(self.values)
-        self.advantages = relative_advantages(returns, values, self._living(self.gamma), self._power).numpy()
+        living = self._living(self.gamma) - torch.as_tensor(self.potentials)
+        self.advantages = relative_advantages(returns, values, living, self._power).numpy()
 
 
 class MeanAction(torch.nn.Module):
@@ -255,6 +277,7 @@ class Ppo(ModelFree):
             rollout_buffer_kwargs=(
                 {
                     "living": self._value_of_living,
+                    "potential": lambda: config.reward_scale * self._env.batch.last_potential.numpy(),
                     "power": config.relative_advantages,
                 }
                 if config.relative_advantages

@@ -316,17 +316,19 @@ class RslPpo:
         self._actor.set_std(std)
         self._set_gamma(schedules.discount(config.gamma, config.final_gamma, progress))
         ended = early = paid = 0.0
+        potentials = []
         with torch.no_grad():
             for _ in range(config.num_steps):
                 self._seen, reward, ends, extras = self._env.step(self._ppo.act(self._seen))
                 self._ppo.process_env_step(self._seen, config.reward_scale * reward, ends, extras)
                 terminated = ends.bool() & ~extras["time_outs"]
+                potentials.append(config.reward_scale * self._batch.last_potential[:, None])
                 ended, early = ended + float(ends.sum()), early + float(terminated.sum())
                 paid += float(reward.mean())
             self._ppo.compute_returns(self._seen)
             if config.relative_advantages:
                 storage = self._ppo.storage
-                living = self._value_of_living(self._ppo.gamma)
+                living = self._value_of_living(self._ppo.gamma) - torch.stack(potentials)
                 storage.advantages = relative_advantages(
                     storage.returns, storage.values, living, config.relative_advantages
                 )
