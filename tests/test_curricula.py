@@ -240,6 +240,17 @@ def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
     assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0), (10, 0)]
 
 
+def test_no_start_is_repeated_when_the_goal_has_narrowed_enough():
+    settings = Curriculum(retries=1.0, goal_factor=2.0, goal_step=0.7, retries_goal_factor=1.5)
+    made = batch(curriculum=settings, num_envs=50)
+    run(made, 2 * made.task.steps)
+    assert made._again.all()
+    made._harden()
+    assert made.difficulty["goal_factor"] == pytest.approx(1.4)
+    run(made, made.task.steps)
+    assert not made._again.any()
+
+
 def test_episodes_on_optima_that_went_wrong_are_repeated_as_such():
     made = batch(curriculum=Curriculum(retries=1.0, starts_on_optima=1.0), num_envs=50)
     given(made, starts := some_starts(made.task))

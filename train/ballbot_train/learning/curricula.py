@@ -85,6 +85,9 @@ class Curriculum:
     retries: float = 0.0
     """Share of the training episodes, of the task's own and of those on optima, that repeat the start of one of the last such
     episodes that failed or, on a task that ends at its goal, missed it; 0: off. They do not count for `success`."""
+    retries_goal_factor: float = 0.0
+    """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to the
+    end. Failures cost so much more than anything else that where many are repeated, cost is hardly learnt."""
     gap_low: float = 0.0
     """No episode has a first constant, as Turn's speed, between this value and `gap_high` at the start of training."""
     gap_high: float = 0.0
@@ -115,6 +118,7 @@ class Curriculum:
             ("starts_step", 1e-9, 1e6),
             ("starts_goal_factor", 0.0, 1e3),
             ("retries", 0.0, 1.0),
+            ("retries_goal_factor", 0.0, 1e3),
             ("gap_low", -1e6, 1e6),
             ("gap_high", -1e6, 1e6),
             ("gap_step", 1e-9, 1e6),
@@ -323,7 +327,7 @@ class CurriculumBatch(BallbotBatch):
             self._leave_gap(ended)
         if self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor:
             self._start_on_optima(ended)
-        if self.curriculum.retries:
+        if self.curriculum.retries and self._goal_factor > self.curriculum.retries_goal_factor:
             self._retry(ended)
         self._begin(ended)
         if self.curriculum.short_episodes:
