@@ -148,8 +148,25 @@ def test_the_fine_gate_shows_leans_and_their_rates_in_units_of_the_tolerances():
         np.testing.assert_allclose(fine, 0.5**0.5 * (np.array([2, 3, 6, 7]) == state), atol=1e-6)
 
 
+def test_the_fine_gate_shows_the_speed_in_steps_that_are_not_sharp():
+    task = TASKS["turn"]()
+    state = np.array([0.3, -0.5, 0.1, 0.2, 1, 3, 0.5, 0.6])
+
+    def seen(name, speed):
+        return np.array(FRAMES[name].features(tuple(task.observe(state, np.array([speed]))))[0])
+
+    assert len(seen("fine_gate", 4.0)) == FRAMES["fine_gate"].size
+    for speed in (2.0, 3.95, 4.23, 8.0):
+        sharp, smooth = seen("gate", speed), seen("fine_gate", speed)[:-4]
+        np.testing.assert_array_equal(smooth[:9], sharp[:9])
+        np.testing.assert_array_equal(smooth[22:], sharp[22:])
+        assert (np.sign(smooth[9:22]) == np.sign(sharp[9:22])).all()
+    assert np.abs(seen("fine_gate", 4.201) - seen("fine_gate", 4.199))[9:22].max() < 0.02
+    assert np.abs(seen("gate", 4.201) - seen("gate", 4.199))[9:22].max() == 1
+
+
 def test_a_fine_frame_shows_what_the_task_or_its_frame_shows(params, rng):
-    for task, added in ((TASKS["stabilize"](), 6), (TASKS["weave"](), 6), (TASKS["turn"](), 4)):
+    for task, added in ((TASKS["stabilize"](), 6), (TASKS["weave"](), 6)):
         seen = tuple(task.observe(*task.sample(rng, params)))
         shown = seen if task.frame is None else FRAMES[task.frame].features(seen)[0]
         fine = FRAMES[task.fine_frame].features(seen)[0]

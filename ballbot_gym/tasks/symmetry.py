@@ -276,19 +276,27 @@ def _gate(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     Slow turns go directly, fast ones loop. Somewhere between 3.4 and 4.6 m/s, depending on the robot and on the reserve that
     is kept at the gate, the best way switches. A network that sees the speed alone averages both ways there.
     """
-    x, y, _, _, vx, vy, _, _, speed = observation
+    speed = observation[8]
     steps = [ops.where(5.0 * speed > switch, 0.5, -0.5) for switch in _SWITCHES]
-
-    fine = _fine(x, 0.2 / 5), _fine(y, 0.2 / 5), _fine(vx, 0.5 / 5), _fine(vy, 0.5 / 5)
-    return (*observation, *steps, *fine), lambda action: action
+    return (*observation, *steps, *_gate_errors(observation)), lambda action: action
 
 
 def _fine_gate(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
-    """As `_gate`, and then leans and lean rates in units of the gate's tolerances too."""
-    features, back = _gate(observation)
-    _, _, gamma, theta, _, _, gamma_dot, theta_dot, _ = observation
-    errors = ((gamma, 0.17), (theta, 0.17), (gamma_dot, 1.0 / 5), (theta_dot, 1.0 / 5))
-    return (*features, *(_fine(*error) for error in errors)), back
+    """As `_gate`, but its steps are 0.1 m/s wide, and leans and lean rates are seen in units of the gate's tolerances too.
+
+    Over a sharp step no way of turning is carried on from one speed to the next.
+    """
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot, speed = observation
+    steps = [0.5 * _fine(5.0 * speed - switch, 0.1) for switch in _SWITCHES]
+    leans = ((gamma, 0.17), (theta, 0.17), (gamma_dot, 1.0 / 5), (theta_dot, 1.0 / 5))
+    shown = (*observation, *steps, *_gate_errors(observation), *(_fine(*error) for error in leans))
+    return shown, lambda action: action
+
+
+def _gate_errors(observation: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Errors of position and velocity at the gate in units of its tolerances (`_fine`)."""
+    x, y, _, _, vx, vy, *_ = observation
+    return _fine(x, 0.2 / 5), _fine(y, 0.2 / 5), _fine(vx, 0.5 / 5), _fine(vy, 0.5 / 5)
 
 
 def _fine(error: Any, tolerance: float) -> Any:

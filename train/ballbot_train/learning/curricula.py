@@ -86,8 +86,8 @@ class Curriculum:
     """Share of the training episodes, of the task's own and of those on optima, that repeat the start of one of the last such
     episodes that failed or, on a task that ends at its goal, missed it; 0: off. They do not count for `success`."""
     retries_goal_factor: float = 0.0
-    """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to the
-    end. Failures cost so much more than anything else that where many are repeated, cost is hardly learnt."""
+    """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to
+    the end. A failure costs so much more than all else that where many are repeated, cost is hardly learnt."""
     gap_low: float = 0.0
     """No episode has a first constant, as Turn's speed, between this value and `gap_high` at the start of training."""
     gap_high: float = 0.0
