@@ -373,7 +373,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
     second.iterate()
     for ours, theirs in zip(second.network.parameters(), whole.network.parameters(), strict=True):
         assert torch.equal(ours, theirs)
-    assert second.difficulty == pytest.approx(whole.difficulty, nan_ok=True, rel=0)
+    assert second.difficulty == pytest.approx(whole.difficulty, nan_ok=True, rel=0, abs=0)
     assert 1 < whole.difficulty["goal_factor"] < 3
     assert figures["curriculum/goal_factor"] == whole.difficulty["goal_factor"]
 

@@ -286,15 +286,16 @@ class CurriculumBatch(BallbotBatch):
 
     def reset(self, *args: Any, mask: torch.Tensor | None = None, **given: Any) -> torch.Tensor:
         """As of `BallbotBatch`: these episodes begin as the task's own do."""
-        super().reset(*args, mask=mask, **given)
+        observation = super().reset(*args, mask=mask, **given)
         begun = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
         self._kind = torch.where(begun, _OWN, self._kind)
         self._again = self._again & ~begun
-        if self._gap_is_open and given.get("c") is None:
+        if self._gap_is_open and given.get("x") is None and given.get("c") is None:
             self._leave_gap(begun)
+            assert self.state is not None
+            observation = self.observe(self.state)
         self._begin(begun)
-        assert self.state is not None
-        return self.observe(self.state)
+        return observation
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> BatchStep:
@@ -323,18 +324,22 @@ class CurriculumBatch(BallbotBatch):
         if self.curriculum.retries:
             self._keep_hard(result)
         self._kind, self._again = torch.where(ended, _OWN, self._kind), self._again & ~ended
+        began = self.state
         if self._gap_is_open:
             self._leave_gap(ended)
         if self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor:
             self._start_on_optima(ended)
         if self.curriculum.retries and self._goal_factor > self.curriculum.retries_goal_factor:
             self._retry(ended)
+        if self.state is not began:  # some were moved
+            assert self.state is not None
+            result = result._replace(
+                observation=torch.where(ended[:, None], self.observe(self.state), result.observation)
+            )
         self._begin(ended)
         if self.curriculum.short_episodes:
             self._shorten(ended)
-        assert self.state is not None
-        observation = torch.where(ended[:, None], self.observe(self.state), result.observation)
-        return result._replace(observation=observation, reward=reward)
+        return result._replace(reward=reward)
 
     def curriculum_state(self) -> dict[str, Any]:
         """What the batch remembers besides `state`: tensors and plain values."""
