@@ -348,13 +348,40 @@ def test_episodes_begin_on_successful_demonstrations(tmp_path):
         curricula.demonstrated_starts(data, make_task("turn"), 50)
 
 
+def test_optima_with_a_reserve_end_deeper_in_the_goal():
+    task = make_task("turn", duration=8.0)
+
+    def last_excess(reserve):
+        starts = curricula.optimal_starts(task, default_params(), 1, 100, reserve)
+        return max(float(excess) for excess in task.goal(starts.x[:, -1], starts.c[:, -1]))
+
+    assert last_excess(0.5) < last_excess(0.0)
+
+
+def test_episodes_begin_where_the_goal_was_missed_and_their_clocks_start_anew():
+    made = given(
+        batch(curriculum=Curriculum(starts_missed=1.0, retries=1.0), num_envs=50), some_starts(make_task("turn"))
+    )
+    run(made, made.task.steps)
+    last = made._starts.x[:, made._starts.left == 1]
+    x, c = made.state.x, made.state.c
+    assert (made._kind == curricula._MISSED).all()
+    assert not made._again.any()
+    assert (made.state.steps == 0).all()
+    assert torch.isin(x[0], last[0]).all()  # they move along y
+    assert ((x[1] > -0.5) & (x[1] <= -0.5 + 0.6 * 3.0)).all()
+    assert x[1].unique().numel() > 40
+    excess = torch.stack(made.task.goal(tuple(x), tuple(c)))
+    assert (excess.max(0).values > 0).all()
+
+
 @pytest.mark.parametrize("name", ["rsl_ppo", "ppo", "sac"])
 def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(name, monkeypatch):
-    monkeypatch.setattr(curricula, "optimal_starts", lambda task, params, count, steps: some_starts(task))
+    monkeypatch.setattr(curricula, "optimal_starts", lambda task, params, count, steps, reserve: some_starts(task))
     easier = Curriculum(
         goal_factor=3.0, ramp="max_speed", ramp_start=3.0, starts_on_optima=0.5, shaping=1.0, episodes=2, success=0.0
     )
-    easier = replace(easier, starts_seconds=0.04, retries=0.5, gap_low=2.2, gap_high=2.6)
+    easier = replace(easier, starts_seconds=0.04, retries=0.5, starts_missed=0.2, gap_low=2.2, gap_high=2.6)
     settings = replace(LEARNERS[name].settings("turn"), hidden=(8,), curriculum=easier, **TINY[name])
 
     def make(seed):

@@ -9,6 +9,9 @@ A curriculum changes training alone. What is evaluated is always the task itself
   episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them. These
   episodes can begin shortly before the end of their optimum at first, and ever earlier as enough of them succeed (Florensa et
   al., "Reverse curriculum generation for reinforcement learning", 2017).
+- A share of the episodes begins where the goal has just been missed: at the ends of these optima, carried on beyond the goal.
+  A robot that has learnt to come back from there need not fear a miss, which else ends in a fall and costs so much that it
+  turns ever more carefully.
 - A share of the episodes, also of those on optima, repeats starts from which recent ones failed or missed their goal. So what
   is hard is met more often, as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized
   level replay", 2021).
@@ -41,8 +44,9 @@ from ballbot_train.evaluation import fresh
 
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
-_OWN, _ON_OPTIMUM, _ABOVE_GAP = 0, 1, 2  # how an episode began
+_OWN, _ON_OPTIMUM, _ABOVE_GAP, _MISSED = 0, 1, 2, 3  # how an episode began
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
+_MISSED_SECONDS = 0.6  # s: how far beyond the goal an episode begins at most that has just missed it
 _CANDIDATES = 100_000  # constants, of which those outside of the gap are taken
 
 
@@ -79,6 +83,12 @@ class Curriculum:
     """How long before the end of their optimum these episodes begin at most, at the start of training, s; 0: anywhere."""
     starts_step: float = 0.1
     """How much longer that gets whenever enough of these episodes succeed, s."""
+    starts_reserve: float = 0.0
+    """Share of the goal's tolerances that these optima leave unused. Without one, slow optima touch the goal where no noise
+    is allowed, and loops, which are safer, begin at higher speeds."""
+    starts_missed: float = 0.0
+    """Share of the training episodes that begin beyond the goal: at the end of such an optimum, carried on by up to 0.6 s,
+    with all the time of an episode; 0: off. They do not count for `success`, and go on after `starts_goal_factor`."""
     starts_goal_factor: float = 0.0
     """No more episodes begin on optima when the goal's tolerances have narrowed to so many times the task's own; 0: they do
     to the end. Where the goal is narrow, many such episodes begin too close before it for a policy that comes otherwise."""
@@ -116,6 +126,8 @@ class Curriculum:
             ("optima", 1, 10**6),
             ("starts_seconds", 0.0, 1e6),
             ("starts_step", 1e-9, 1e6),
+            ("starts_reserve", 0.0, 1 - 1e-6),
+            ("starts_missed", 0.0, 1.0),
             ("starts_goal_factor", 0.0, 1e3),
             ("retries", 0.0, 1.0),
             ("retries_goal_factor", 0.0, 1e3),
@@ -138,6 +150,7 @@ class Curriculum:
             self.goal_factor > 1
             or self.ramp != ""
             or self.starts_on_optima > 0
+            or self.starts_missed > 0
             or self.retries > 0
             or self.has_gap
             or self.short_episodes > 0
@@ -163,6 +176,8 @@ class Curriculum:
             raise ValueError("curriculum.starts_seconds needs curriculum.starts_on_optima above 0")
         if self.starts_seconds and not task.first_exit:
             raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_seconds must be 0")
+        if self.starts_missed and not task.first_exit:
+            raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_missed must be 0")
         if self.starts_on_optima and self.starts_goal_factor and self.starts_goal_factor >= self.goal_factor:
             raise ValueError(
                 f"curriculum.starts_goal_factor must be less than curriculum.goal_factor {self.goal_factor:g}, "
@@ -266,7 +281,7 @@ class CurriculumBatch(BallbotBatch):
         self._hard = [torch.zeros(rows, 0)] * 3  # those of the last episodes of each kind that went wrong
         self._demos, self._full = demos, task if full is None else full
         self._starts: Starts | None = None
-        if demos is not None and curriculum.starts_on_optima:
+        if demos is not None and (curriculum.starts_on_optima or curriculum.starts_missed):
             self._starts = demonstrated_starts(demos, self._full, task.steps)
         self._set_difficulty()
 
@@ -329,6 +344,8 @@ class CurriculumBatch(BallbotBatch):
             self._leave_gap(ended)
         if self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor:
             self._start_on_optima(ended)
+        if self.curriculum.starts_missed:
+            self._start_beyond_goal(ended)
         if self.curriculum.retries and self._goal_factor > self.curriculum.retries_goal_factor:
             self._retry(ended)
         if self.state is not began:  # some were moved
@@ -459,8 +476,7 @@ class CurriculumBatch(BallbotBatch):
 
     def _start_on_optima(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun into states along optima."""
-        if self._starts is None:
-            self._starts = optimal_starts(self._full, self.params, self.curriculum.optima, self._own.steps)
+        self._starts = self._found_starts()
         if self._eligible is None:  # states outside of the goal, which may be wide
             inside = self.task.goal(self._starts.x.unbind(0), self._starts.c.unbind(0))
             reached = torch.stack([excess <= 0 for excess in inside]).all(0)
@@ -477,6 +493,27 @@ class CurriculumBatch(BallbotBatch):
         lengths = (starts.steps + starts.left)[self._eligible]  # so that every optimum is met as often as any other
         chosen = self._eligible[torch.multinomial(1.0 / lengths, count, replacement=True)]
         self._move(moved, starts.x[:, chosen], starts.c[:, chosen], starts.steps[chosen])
+
+    def _start_beyond_goal(self, ended: torch.Tensor) -> None:
+        """Moves a share of the episodes that have just begun to where the goal has just been missed."""
+        moved = ended & (torch.rand(self.num_envs) < self.curriculum.starts_missed)
+        self._kind = torch.where(moved, _MISSED, self._kind)
+        self._starts, count = self._found_starts(), int(moved.sum())
+        ends = (self._starts.left == 1).nonzero()[:, 0]
+        chosen = ends[torch.randint(len(ends), (count,))]
+        x, c = self._starts.x[:, chosen], self._starts.c[:, chosen]
+        seconds = _MISSED_SECONDS * torch.rand(count, dtype=x.dtype)
+        beyond = torch.cat([x[:2] + seconds * x[4:6], x[2:]])
+        inside = torch.stack([excess <= 0 for excess in self.task.goal(beyond.unbind(0), c.unbind(0))]).all(0)
+        farthest = torch.cat([x[:2] + _MISSED_SECONDS * x[4:6], x[2:]])
+        self._move(moved, torch.where(inside, farthest, beyond), c, torch.zeros(count, dtype=torch.long))
+
+    def _found_starts(self) -> Starts:
+        """The states along optima, which are found when they are first needed."""
+        if self._starts is not None:
+            return self._starts
+        curriculum = self.curriculum
+        return optimal_starts(self._full, self.params, curriculum.optima, self._own.steps, curriculum.starts_reserve)
 
     def _keep_hard(self, result: BatchStep) -> None:
         """Remembers the starts of the episodes that have just gone wrong."""
@@ -544,19 +581,21 @@ def without_arena(task: Task) -> Task:
     return replace(task, **{field.name: _NO_ARENA for field in fields(task) if field.name in _ARENAS})
 
 
-def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) -> Starts:
+def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int, reserve: float = 0.0) -> Starts:
     """The states along the optima of `count` episodes drawn for training, before their ends and before control step `steps`.
+
+    The optima leave the share `reserve` of the goal's tolerances unused.
 
     Raises:
         ValueError: no optimum was found.
     """
-    from ballbot_baselines.optimum import find_optimum  # it imports CasADi
+    from ballbot_baselines.optimum import Backoff, find_optimum  # it imports CasADi
 
     console.print(f"finding {count} optima on which training episodes begin")
-    found = []
+    found, backoff = [], replace(Backoff(), goal=max(Backoff().goal, reserve))
     for x, c in zip(*fresh.draw(task, range(count), 0, "training"), strict=True):
         try:
-            states = find_optimum(task, params, x, c).trajectory.x
+            states = find_optimum(task, params, x, c, backoff).trajectory.x
         except PlanError:
             continue
         found.append((states, c))
