@@ -358,6 +358,24 @@ def test_optima_with_a_reserve_end_deeper_in_the_goal():
     assert last_excess(0.5) < last_excess(0.0)
 
 
+def test_where_all_episodes_begin_on_optima_the_goal_narrows_with_their_success_and_own_starts_come_last(monkeypatch):
+    easier = Curriculum(
+        goal_factor=1.1, starts_on_optima=1.0, starts_goal_factor=1.0, starts_seconds=0.06, starts_step=0.04, episodes=1
+    )
+    made = given(batch(curriculum=replace(easier, success=0.0), num_envs=50), some_starts(make_task("turn")))
+    made._kind[:] = curricula._ON_OPTIMUM  # the first ones, which are the task's own, narrow the goal too
+    factors = []
+    while made.difficulty["goal_factor"] > 1:
+        run(made, 1)
+        factors.append((made.difficulty["starts_seconds"], made.difficulty["goal_factor"]))
+        assert len(factors) < 100
+    begun = [factor for _, factor in factors]
+    assert begun == sorted(begun, reverse=True)
+    assert all(factor == 1.1 for seconds, factor in factors if seconds < 0.1)  # the longest optimum
+    run(made, 3 * made.task.steps)
+    assert (made._kind == curricula._OWN).all()
+
+
 def test_episodes_begin_where_the_goal_was_missed_and_their_clocks_start_anew():
     made = given(
         batch(curriculum=Curriculum(starts_missed=1.0, retries=1.0), num_envs=50), some_starts(make_task("turn"))

@@ -76,7 +76,9 @@ class Curriculum:
     """Number of ended training episodes after which that share is looked at; then they are counted anew."""
     starts_on_optima: float = 0.0
     """Share of the training episodes that begin in a state along an optimum, drawn from all values of the task; 0: off.
-    They are states of optima that the run finds first; of rsl_ppo with --demos, of the successful demonstrations."""
+    They are states of optima that the run finds first; of rsl_ppo with --demos, of the successful demonstrations. With 1
+    and a `starts_goal_factor` the goal narrows with their success, once they begin anywhere, and the task's own starts come
+    afterwards. So no start is learnt with a goal so wide that another way hits it."""
     optima: int = 64
     """Number of optima that the run finds for them, of about a second each."""
     starts_seconds: float = 0.0
@@ -396,9 +398,23 @@ class CurriculumBatch(BallbotBatch):
 
     def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began on optima, and lets them begin earlier if enough of them succeeded."""
-        if self._enough(self._on_optima, ended, success) and 0 < self._reach < self._own.duration:
+        if not self._enough(self._on_optima, ended, success):
+            return
+        if 0 < self._reach < self._own.duration and not (self._optima_alone and self._reach >= self._longest):
             self._reach = min(self._reach + self.curriculum.starts_step, self._own.duration)
             self._eligible = None
+        elif self._optima_alone:
+            self._harden()
+
+    @property
+    def _optima_alone(self) -> bool:
+        """Whether the task's own starts come only after those on optima."""
+        return self.curriculum.starts_on_optima == 1 and self.curriculum.starts_goal_factor > 0
+
+    @property
+    def _longest(self) -> float:
+        """Duration of the longest optimum, s."""
+        return 0.0 if self._starts is None else float(self._starts.left.max()) * self.task.control_dt
 
     def _count_above_gap(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began just above the gap, and narrows it if enough of them succeeded."""
