@@ -358,6 +358,17 @@ def test_optima_with_a_reserve_end_deeper_in_the_goal():
     assert last_excess(0.5) < last_excess(0.0)
 
 
+@pytest.mark.parametrize(("share", "narrows"), [(0.5, False), (0.7, True), (float("nan"), True)])
+def test_the_goal_narrows_only_where_enough_episodes_on_optima_succeed_too(share, narrows):
+    made = batch(
+        curriculum=Curriculum(goal_factor=2.0, starts_on_optima=0.5, starts_success=0.6, episodes=1, success=0.0)
+    )
+    given(made, some_starts(made.task))
+    made._on_optima.share = share
+    made._count(torch.ones(6, dtype=torch.bool), torch.ones(6, dtype=torch.bool))
+    assert (made.difficulty["goal_factor"] < 2) == narrows
+
+
 def test_where_all_episodes_begin_on_optima_the_goal_narrows_with_their_success_and_own_starts_come_last(monkeypatch):
     easier = Curriculum(
         goal_factor=1.1, starts_on_optima=1.0, starts_goal_factor=1.0, starts_seconds=0.06, starts_step=0.04, episodes=1

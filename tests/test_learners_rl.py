@@ -614,10 +614,10 @@ def test_the_deviation_of_ppo_falls_near_the_goal(symmetry):
     policy, env = learner._model.policy, learner._env
     state = env.batch.state
     distance = env.batch.task.goal_distance(tuple(state.x), tuple(state.c))
-    shares = (distance / 2).clamp(0.1, 1).numpy()
+    shares = (distance / 2).clamp(0.3, 1).numpy()
     assert learner._model._last_obs[:, -1] == pytest.approx(shares)
     seen = torch.as_tensor(learner._model._last_obs).repeat(3, 1)
-    seen[:, -1] = torch.linspace(0.1, 1, len(seen))
+    seen[:, -1] = torch.linspace(0.3, 1, len(seen))
     noise = policy.get_distribution(seen).distribution
     torch.testing.assert_close(noise.stddev, policy.log_std.exp() * seen[:, -1:])
     torch.testing.assert_close(noise.mean, policy.branches.actor(seen[:, :-1]))

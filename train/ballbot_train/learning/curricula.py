@@ -85,6 +85,8 @@ class Curriculum:
     """How long before the end of their optimum these episodes begin at most, at the start of training, s; 0: anywhere."""
     starts_step: float = 0.1
     """How much longer that gets whenever enough of these episodes succeed, s."""
+    starts_success: float = 0.0
+    """Share of these episodes that has to succeed besides those that begin as the task's own do, before the goal narrows."""
     starts_reserve: float = 0.0
     """Share of the goal's tolerances that these optima leave unused. Without one, slow optima touch the goal where no noise
     is allowed, and loops, which are safer, begin at higher speeds."""
@@ -128,6 +130,7 @@ class Curriculum:
             ("optima", 1, 10**6),
             ("starts_seconds", 0.0, 1e6),
             ("starts_step", 1e-9, 1e6),
+            ("starts_success", 0.0, 1.0),
             ("starts_reserve", 0.0, 1 - 1e-6),
             ("starts_missed", 0.0, 1.0),
             ("starts_goal_factor", 0.0, 1e3),
@@ -393,7 +396,7 @@ class CurriculumBatch(BallbotBatch):
 
     def _count(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the episodes that ended, and makes the task harder if enough of them succeeded."""
-        if self._enough(self._own_episodes, ended, success):
+        if self._enough(self._own_episodes, ended, success) and self._optima_succeed:
             self._harden()
 
     def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
@@ -415,6 +418,12 @@ class CurriculumBatch(BallbotBatch):
     def _longest(self) -> float:
         """Duration of the longest optimum, s."""
         return 0.0 if self._starts is None else float(self._starts.left.max()) * self.task.control_dt
+
+    @property
+    def _optima_succeed(self) -> bool:
+        """Whether enough of the episodes on optima succeed for a narrower goal."""
+        used = self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor
+        return not used or not self._on_optima.share < self.curriculum.starts_success
 
     def _count_above_gap(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began just above the gap, and narrows it if enough of them succeeded."""

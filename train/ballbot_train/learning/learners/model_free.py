@@ -27,7 +27,7 @@ from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
-_LEAST_STD_SHARE = 0.1
+_LEAST_STD_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -321,7 +321,7 @@ class TrainingEnv(VecEnvWrapper):
             frame: in which observations are shown and actions taken; default, the task's own.
             pay, failure_price: as of `CurriculumBatch`.
             std_distance: distance to the goal, m, within which the share of the actions' deviation falls that the last of the
-                observed quantities then is, from 1 down to 0.1; 0: no such quantity.
+                observed quantities then is, from 1 down to 0.3; 0: no such quantity.
 
         Raises:
             ValueError: the task has not what the curriculum or `std_distance` asks for.

@@ -70,9 +70,9 @@ class PpoConfig(ModelFreeConfig):
     final_std: float = 0.03
     """Standard deviation at the end. It falls geometrically."""
     std_distance: float = 0.0
-    """Distance to the goal, m, within which the standard deviation falls in proportion to it, down to a tenth, on a task that
-    has a `goal_distance`, as turn; 0: off. Where the goal is small, noise close before it decides whether it is hit, and the
-    way there is chosen farther away."""
+    """Distance to the goal, m, within which the standard deviation falls in proportion to it, down to 0.3 of it, on a task
+    that has a `goal_distance`, as turn; 0: off. Where the goal is small, noise close before it decides whether it is hit, and
+    the way there is chosen farther away."""
     demo_std: float = 0.05
     """In place of `std` if there are demonstrations."""
 
