@@ -370,39 +370,16 @@ def test_the_goal_narrows_only_where_enough_episodes_on_optima_succeed_too_and_b
     assert (made.difficulty["goal_factor"] < 2) == narrows
 
 
-def test_where_all_episodes_begin_on_optima_the_goal_narrows_with_their_success_and_own_starts_come_last(monkeypatch):
-    easier = Curriculum(
-        goal_factor=1.1, starts_on_optima=1.0, starts_goal_factor=1.0, starts_seconds=0.06, starts_step=0.04, episodes=1
-    )
-    made = given(batch(curriculum=replace(easier, success=0.0), num_envs=50), some_starts(make_task("turn")))
-    made._kind[:] = curricula._ON_OPTIMUM  # the first ones, which are the task's own, narrow the goal too
-    factors = []
-    while made.difficulty["goal_factor"] > 1:
-        run(made, 1)
-        factors.append((made.difficulty["starts_seconds"], made.difficulty["goal_factor"]))
-        assert len(factors) < 100
-    begun = [factor for _, factor in factors]
-    assert begun == sorted(begun, reverse=True)
-    assert all(factor == 1.1 for seconds, factor in factors if seconds < 0.1)  # the longest optimum
-    run(made, 3 * made.task.steps)
-    assert (made._kind == curricula._OWN).all()
-
-
-def test_episodes_begin_where_the_goal_was_missed_and_their_clocks_start_anew():
-    made = given(
-        batch(curriculum=Curriculum(starts_missed=1.0, retries=1.0), num_envs=50), some_starts(make_task("turn"))
-    )
-    run(made, made.task.steps)
-    last = made._starts.x[:, made._starts.left == 1]
-    x, c = made.state.x, made.state.c
-    assert (made._kind == curricula._MISSED).all()
-    assert not made._again.any()
-    assert (made.state.steps == 0).all()
-    assert torch.isin(x[0], last[0]).all()  # they move along y
-    assert ((x[1] > -0.5) & (x[1] <= -0.5 + 0.6 * 3.0)).all()
-    assert x[1].unique().numel() > 40
-    excess = torch.stack(made.task.goal(tuple(x), tuple(c)))
-    assert (excess.max(0).values > 0).all()
+@pytest.mark.parametrize(
+    ("easier", "price"), [({}, 40.0), ({"goal_factor": 2.0}, 300.0), ({"ramp": "max_speed"}, 300.0)]
+)
+def test_a_failure_has_its_last_price_once_the_task_is_its_own(easier, price):
+    easier = Curriculum(last_failure_price=40.0, ramp_start=3.0, **easier)
+    made = batch(curriculum=easier, duration=2.0, pay=False, failure_price=300.0)
+    results = [made.step(torch.ones(made.num_envs, 2)) for _ in range(made.task.steps - 1)]
+    fell = torch.cat([result.reward[result.failure] for result in results])
+    assert len(fell) >= made.num_envs
+    assert fell == pytest.approx(-price, abs=10.0)  # besides the cost of the step
 
 
 @pytest.mark.parametrize("name", ["rsl_ppo", "ppo", "sac"])
@@ -411,7 +388,7 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
     easier = Curriculum(
         goal_factor=3.0, ramp="max_speed", ramp_start=3.0, starts_on_optima=0.5, shaping=1.0, episodes=2, success=0.0
     )
-    easier = replace(easier, starts_seconds=0.04, retries=0.5, starts_missed=0.2, gap_low=2.2, gap_high=2.6)
+    easier = replace(easier, starts_seconds=0.04, retries=0.5, gap_low=2.2, gap_high=2.6)
     settings = replace(LEARNERS[name].settings("turn"), hidden=(8,), curriculum=easier, **TINY[name])
 
     def make(seed):

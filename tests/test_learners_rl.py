@@ -603,42 +603,6 @@ def test_sac_in_a_frame_goes_on_from_a_state_as_if_never_stopped():
     assert torch.equal(parameters(run(resumed)), parameters(whole))
 
 
-def near_goal(name="turn", **settings):
-    settings = replace(TINY["ppo"], std_distance=2.0, pay=False, **settings)
-    return LEARNERS["ppo"].make(make_task(name), default_params(), settings, 0, None)
-
-
-@pytest.mark.parametrize("symmetry", ["none", "frame"])
-def test_the_deviation_of_ppo_falls_near_the_goal(symmetry):
-    learner = near_goal(symmetry=symmetry)
-    policy, env = learner._model.policy, learner._env
-    state = env.batch.state
-    distance = env.batch.task.goal_distance(tuple(state.x), tuple(state.c))
-    shares = (distance / 2).clamp(0.3, 1).numpy()
-    assert learner._model._last_obs[:, -1] == pytest.approx(shares)
-    seen = torch.as_tensor(learner._model._last_obs).repeat(3, 1)
-    seen[:, -1] = torch.linspace(0.3, 1, len(seen))
-    noise = policy.get_distribution(seen).distribution
-    torch.testing.assert_close(noise.stddev, policy.log_std.exp() * seen[:, -1:])
-    torch.testing.assert_close(noise.mean, policy.branches.actor(seen[:, :-1]))
-    assert noise.mean.std() > 0
-    assert policy.predict_values(seen).shape == (len(seen), 1)
-
-
-def test_ppo_with_a_deviation_that_falls_near_the_goal_goes_on_from_a_state_as_if_never_stopped():
-    whole, begun = run(near_goal()), run(near_goal(), 1)
-    resumed = near_goal()
-    resumed.load_state_dict(through_a_file(begun.state_dict()))
-    assert torch.equal(parameters(run(resumed)), parameters(whole))
-
-
-def test_a_deviation_that_falls_near_the_goal_needs_a_distance_to_it_and_an_actor_of_ours():
-    with pytest.raises(ValueError, match="BallbotStabilize-v0 has no goal_distance for std_distance"):
-        near_goal("stabilize")
-    with pytest.raises(ValueError, match="std_distance needs products, or a symmetry"):
-        near_goal(symmetry="none", products=False)
-
-
 def test_training_envs_never_end_together():
     env = TrainingEnv(make_task("stabilize", max_tilt=1.5), default_params(), 5, 0.4, 0.1)
     env.seed(0)  # no robot falls with this seed

@@ -9,9 +9,6 @@ A curriculum changes training alone. What is evaluated is always the task itself
   episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them. These
   episodes can begin shortly before the end of their optimum at first, and ever earlier as enough of them succeed (Florensa et
   al., "Reverse curriculum generation for reinforcement learning", 2017).
-- A share of the episodes begins where the goal has just been missed: at the ends of these optima, carried on beyond the goal.
-  A robot that has learnt to come back from there need not fear a miss, which else ends in a fall and costs so much that it
-  turns ever more carefully.
 - A share of the episodes, also of those on optima, repeats starts from which recent ones failed or missed their goal. So what
   is hard is met more often, as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized
   level replay", 2021).
@@ -44,9 +41,8 @@ from ballbot_train.evaluation import fresh
 
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
-_OWN, _ON_OPTIMUM, _ABOVE_GAP, _MISSED = 0, 1, 2, 3  # how an episode began
+_OWN, _ON_OPTIMUM, _ABOVE_GAP = 0, 1, 2  # how an episode began
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
-_MISSED_SECONDS = 0.6  # s: how far beyond the goal an episode begins at most that has just missed it
 _CANDIDATES = 100_000  # constants, of which those outside of the gap are taken
 
 
@@ -76,9 +72,7 @@ class Curriculum:
     """Number of ended training episodes after which that share is looked at; then they are counted anew."""
     starts_on_optima: float = 0.0
     """Share of the training episodes that begin in a state along an optimum, drawn from all values of the task; 0: off.
-    They are states of optima that the run finds first; of rsl_ppo with --demos, of the successful demonstrations. With 1
-    and a `starts_goal_factor` the goal narrows with their success, once they begin anywhere, and the task's own starts come
-    afterwards. So no start is learnt with a goal so wide that another way hits it."""
+    They are states of optima that the run finds first; of rsl_ppo with --demos, of the successful demonstrations."""
     optima: int = 64
     """Number of optima that the run finds for them, of about a second each."""
     starts_seconds: float = 0.0
@@ -91,9 +85,6 @@ class Curriculum:
     starts_reserve: float = 0.0
     """Share of the goal's tolerances that these optima leave unused. Without one, slow optima touch the goal where no noise
     is allowed, and loops, which are safer, begin at higher speeds."""
-    starts_missed: float = 0.0
-    """Share of the training episodes that begin beyond the goal: at the end of such an optimum, carried on by up to 0.6 s,
-    with all the time of an episode; 0: off. They do not count for `success`, and go on after `starts_goal_factor`."""
     starts_goal_factor: float = 0.0
     """No more episodes begin on optima when the goal's tolerances have narrowed to so many times the task's own; 0: they do
     to the end. Where the goal is narrow, many such episodes begin too close before it for a policy that comes otherwise."""
@@ -103,6 +94,9 @@ class Curriculum:
     retries_goal_factor: float = 0.0
     """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to
     the end. A failure costs so much more than all else that where many are repeated, cost is hardly learnt."""
+    last_failure_price: float = 0.0
+    """Price of a failure, where living does not pay, from when the goal and `ramp` are the task's own; 0: as before. A high
+    one teaches not to fail, and beside a low one cost is learnt too."""
     gap_low: float = 0.0
     """No episode has a first constant, as Turn's speed, between this value and `gap_high` at the start of training."""
     gap_high: float = 0.0
@@ -133,10 +127,10 @@ class Curriculum:
             ("starts_step", 1e-9, 1e6),
             ("starts_success", 0.0, 1.0),
             ("starts_reserve", 0.0, 1 - 1e-6),
-            ("starts_missed", 0.0, 1.0),
             ("starts_goal_factor", 0.0, 1e3),
             ("retries", 0.0, 1.0),
             ("retries_goal_factor", 0.0, 1e3),
+            ("last_failure_price", 0.0, 1e9),
             ("gap_low", -1e6, 1e6),
             ("gap_high", -1e6, 1e6),
             ("gap_step", 1e-9, 1e6),
@@ -156,7 +150,6 @@ class Curriculum:
             self.goal_factor > 1
             or self.ramp != ""
             or self.starts_on_optima > 0
-            or self.starts_missed > 0
             or self.retries > 0
             or self.has_gap
             or self.short_episodes > 0
@@ -182,8 +175,6 @@ class Curriculum:
             raise ValueError("curriculum.starts_seconds needs curriculum.starts_on_optima above 0")
         if self.starts_seconds and not task.first_exit:
             raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_seconds must be 0")
-        if self.starts_missed and not task.first_exit:
-            raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_missed must be 0")
         if self.starts_on_optima and self.starts_goal_factor and self.starts_goal_factor >= self.goal_factor:
             raise ValueError(
                 f"curriculum.starts_goal_factor must be less than curriculum.goal_factor {self.goal_factor:g}, "
@@ -287,7 +278,7 @@ class CurriculumBatch(BallbotBatch):
         self._hard = [torch.zeros(rows, 0)] * 3  # those of the last episodes of each kind that went wrong
         self._demos, self._full = demos, task if full is None else full
         self._starts: Starts | None = None
-        if demos is not None and (curriculum.starts_on_optima or curriculum.starts_missed):
+        if demos is not None and curriculum.starts_on_optima:
             self._starts = demonstrated_starts(demos, self._full, task.steps)
         self._set_difficulty()
 
@@ -327,7 +318,7 @@ class CurriculumBatch(BallbotBatch):
         reward = result.reward
         if not self._pay:
             survive = task.survival_reward * task.control_dt
-            reward = reward - survive - self._failure_price * result.failure
+            reward = reward - survive - self._present_failure_price * result.failure
             if task.first_exit:
                 reward = reward - survive * (task.steps - before.steps - 1) * result.success
         if self.curriculum.shaping:
@@ -350,8 +341,6 @@ class CurriculumBatch(BallbotBatch):
             self._leave_gap(ended)
         if self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor:
             self._start_on_optima(ended)
-        if self.curriculum.starts_missed:
-            self._start_beyond_goal(ended)
         if self.curriculum.retries and self._goal_factor > self.curriculum.retries_goal_factor:
             self._retry(ended)
         if self.state is not began:  # some were moved
@@ -402,18 +391,9 @@ class CurriculumBatch(BallbotBatch):
 
     def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began on optima, and lets them begin earlier if enough of them succeeded."""
-        if not self._enough(self._on_optima, ended, success):
-            return
-        if 0 < self._reach < self._own.duration and not (self._optima_alone and self._reach >= self._longest):
+        if self._enough(self._on_optima, ended, success) and 0 < self._reach < self._own.duration:
             self._reach = min(self._reach + self.curriculum.starts_step, self._own.duration)
             self._eligible = None
-        elif self._optima_alone:
-            self._harden()
-
-    @property
-    def _optima_alone(self) -> bool:
-        """Whether the task's own starts come only after those on optima."""
-        return self.curriculum.starts_on_optima == 1 and self.curriculum.starts_goal_factor > 0
 
     @property
     def _longest(self) -> float:
@@ -449,6 +429,12 @@ class CurriculumBatch(BallbotBatch):
         tally.share = tally.succeeded / tally.ended
         tally.ended = tally.succeeded = 0
         return tally.share >= self.curriculum.success
+
+    @property
+    def _present_failure_price(self) -> float:
+        curriculum = self.curriculum
+        easy = self._goal_factor > 1 or (curriculum.ramp and self._ramp != getattr(self._own, curriculum.ramp))
+        return self._failure_price if easy or not curriculum.last_failure_price else curriculum.last_failure_price
 
     def _harden(self) -> None:
         """Takes a step towards the task itself."""
@@ -506,7 +492,10 @@ class CurriculumBatch(BallbotBatch):
 
     def _start_on_optima(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun into states along optima."""
-        self._starts = self._found_starts()
+        if self._starts is None:
+            self._starts = optimal_starts(
+                self._full, self.params, self.curriculum.optima, self._own.steps, self.curriculum.starts_reserve
+            )
         if self._eligible is None:  # states outside of the goal, which may be wide
             inside = self.task.goal(self._starts.x.unbind(0), self._starts.c.unbind(0))
             reached = torch.stack([excess <= 0 for excess in inside]).all(0)
@@ -523,27 +512,6 @@ class CurriculumBatch(BallbotBatch):
         lengths = (starts.steps + starts.left)[self._eligible]  # so that every optimum is met as often as any other
         chosen = self._eligible[torch.multinomial(1.0 / lengths, count, replacement=True)]
         self._move(moved, starts.x[:, chosen], starts.c[:, chosen], starts.steps[chosen])
-
-    def _start_beyond_goal(self, ended: torch.Tensor) -> None:
-        """Moves a share of the episodes that have just begun to where the goal has just been missed."""
-        moved = ended & (torch.rand(self.num_envs) < self.curriculum.starts_missed)
-        self._kind = torch.where(moved, _MISSED, self._kind)
-        self._starts, count = self._found_starts(), int(moved.sum())
-        ends = (self._starts.left == 1).nonzero()[:, 0]
-        chosen = ends[torch.randint(len(ends), (count,))]
-        x, c = self._starts.x[:, chosen], self._starts.c[:, chosen]
-        seconds = _MISSED_SECONDS * torch.rand(count, dtype=x.dtype)
-        beyond = torch.cat([x[:2] + seconds * x[4:6], x[2:]])
-        inside = torch.stack([excess <= 0 for excess in self.task.goal(beyond.unbind(0), c.unbind(0))]).all(0)
-        farthest = torch.cat([x[:2] + _MISSED_SECONDS * x[4:6], x[2:]])
-        self._move(moved, torch.where(inside, farthest, beyond), c, torch.zeros(count, dtype=torch.long))
-
-    def _found_starts(self) -> Starts:
-        """The states along optima, which are found when they are first needed."""
-        if self._starts is not None:
-            return self._starts
-        curriculum = self.curriculum
-        return optimal_starts(self._full, self.params, curriculum.optima, self._own.steps, curriculum.starts_reserve)
 
     def _keep_hard(self, result: BatchStep) -> None:
         """Remembers the starts of the episodes that have just gone wrong."""

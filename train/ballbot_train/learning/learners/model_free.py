@@ -27,8 +27,6 @@ from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
-_LEAST_STD_SHARE = 0.3
-
 
 @dataclass(frozen=True)
 class ModelFreeConfig:
@@ -103,10 +101,8 @@ class ModelFree(ABC):
         config: ModelFreeConfig,
         demos: Demos | None,
         frame: Frame | None = None,
-        std_distance: float = 0.0,
     ):
-        """Args: frame: in which the envs show observations and take actions; demos must be of it already; std_distance: as of
-        `TrainingEnv`.
+        """Args: frame: in which the envs show observations and take actions; demos must be of it already.
 
         Raises:
             ValueError: forces are held for longer than in the optima on which episodes begin.
@@ -133,7 +129,6 @@ class ModelFree(ABC):
             frame,
             pay=config.pay,
             failure_price=config.failure_price,
-            std_distance=std_distance,
         )
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
@@ -306,7 +301,6 @@ class TrainingEnv(VecEnvWrapper):
         frame: Frame | None = None,
         pay: bool = True,
         failure_price: float = 0.0,
-        std_distance: float = 0.0,
     ):
         """Makes the envs.
 
@@ -320,11 +314,9 @@ class TrainingEnv(VecEnvWrapper):
             gamma: the learner's discount factor, for the curriculum's shaping.
             frame: in which observations are shown and actions taken; default, the task's own.
             pay, failure_price: as of `CurriculumBatch`.
-            std_distance: distance to the goal, m, within which the share of the actions' deviation falls that the last of the
-                observed quantities then is, from 1 down to 0.3; 0: no such quantity.
 
         Raises:
-            ValueError: the task has not what the curriculum or `std_distance` asks for.
+            ValueError: the task has not what the curriculum asks for.
         """
         shorter = replace(task, duration=episode_seconds)
         self._vector = BallbotVectorEnv(num_envs, shorter, params=params, compile=False, engine="torch")
@@ -333,12 +325,9 @@ class TrainingEnv(VecEnvWrapper):
         )
         self._vector.batch = self.batch
         self._scale = np.float32(reward_scale)
-        self._frame, self._axes, self._std_distance = frame, np.zeros(0), std_distance
-        if std_distance and task.goal_distance((0.0,) * 8, (1.0,) * len(task.constant_names)) is None:
-            raise ValueError(f"{task.id} has no goal_distance for std_distance; only tasks that define it have")
-        size = (len(task.observation_scale) if frame is None else frame.size) + (std_distance > 0)
-        seen = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        super().__init__(BallbotVecEnv(self._vector), seen if frame is not None or std_distance else None)
+        self._frame, self._axes = frame, np.zeros(0)
+        seen = None if frame is None else gymnasium.spaces.Box(-np.inf, np.inf, (frame.size,), np.float32)
+        super().__init__(BallbotVecEnv(self._vector), seen)
 
     def reset(self) -> np.ndarray:
         """Starts an episode in every env, with step counts that differ so that the episodes never end together."""
@@ -359,9 +348,6 @@ class TrainingEnv(VecEnvWrapper):
             for i in np.flatnonzero(done).tolist():
                 last, _ = seen_in(self._frame, infos[i]["terminal_observation"][np.newaxis])
                 infos[i]["terminal_observation"] = last[0]
-        if self._std_distance:  # no action is taken in a last state, so any share will do
-            for i in np.flatnonzero(done).tolist():
-                infos[i]["terminal_observation"] = np.append(infos[i]["terminal_observation"], np.float32(1))
         return self._seen(cast(np.ndarray, observation)), self._scale * reward, done, infos
 
     def state_dict(self) -> dict[str, Any]:
@@ -377,15 +363,10 @@ class TrainingEnv(VecEnvWrapper):
 
     def _seen(self, observation: np.ndarray) -> np.ndarray:
         """What the learner sees of observations (num_envs, no); notes where the frame's axes are."""
-        if self._frame is not None:
-            observation, self._axes = seen_in(self._frame, observation)
-        if not self._std_distance:
+        if self._frame is None:
             return observation
-        state, task = self.batch.state, self.batch.task
-        assert state is not None
-        distance = task.goal_distance(state.x.unbind(0), state.c.unbind(0))
-        share = (distance / self._std_distance).clamp(_LEAST_STD_SHARE, 1)
-        return np.concatenate([observation, share.float().numpy()[:, np.newaxis]], 1)
+        features, self._axes = seen_in(self._frame, observation)
+        return features
 
 
 class Imitation:

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
@@ -69,10 +68,6 @@ class PpoConfig(ModelFreeConfig):
     """Standard deviation of the actions at the start, in units of the force limit."""
     final_std: float = 0.03
     """Standard deviation at the end. It falls geometrically."""
-    std_distance: float = 0.0
-    """Distance to the goal, m, within which the standard deviation falls in proportion to it, down to 0.3 of it, on a task
-    that has a `goal_distance`, as turn; 0: off. Where the goal is small, noise close before it decides whether it is hit, and
-    the way there is chosen farther away."""
     demo_std: float = 0.05
     """In place of `std` if there are demonstrations."""
 
@@ -206,44 +201,33 @@ class Branches(torch.nn.Module):
 
     latent_dim_pi, latent_dim_vf = 2, 1
 
-    def __init__(self, actor: MeanAction, critic: QuadraticCritic, std_share: bool):
-        """Args: std_share: whether the last feature is a share of the deviation. It is passed on behind the mean actions."""
+    def __init__(self, actor: MeanAction, critic: QuadraticCritic):
         super().__init__()
-        self.actor, self.critic, self._std_share = actor, critic, std_share
+        self.actor, self.critic = actor, critic
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.forward_actor(features), self.forward_critic(features)
+        return self.actor(features), self.critic(features)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        if not self._std_share:
-            return self.actor(features)
-        return torch.cat([self.actor(features[:, :-1]), features[:, -1:]], 1)
+        return self.actor(features)
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
-        return self.critic(features[:, :-1] if self._std_share else features)
+        return self.critic(features)
 
 
 class BranchedPolicy(ActorCriticPolicy):
     """SB3's policy around an actor that respects a symmetry and a critic that sees products."""
 
-    def __init__(
-        self, *args: Any, spec: PolicySpec, products: bool, value: float, std_share: bool = False, **kwargs: Any
-    ):
-        """Makes the policy.
-
-        Args:
-            spec: of the actor.
-            products: whether the critic sees them.
-            value: of every state at the start.
-            std_share: whether the last feature is a share of the deviation.
-        """
-        self._spec, self._products, self._value, self._std_share = spec, products, value, std_share
+    def __init__(self, *args: Any, spec: PolicySpec, products: bool, value: float, **kwargs: Any):
+        """Args: spec: of the actor; products: whether the critic sees them; value: of every state at the start."""
+        self._spec, self._products, self._value = spec, products, value
         super().__init__(*args, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
-        inputs = CriticInputs(self.features_dim - self._std_share, self._products, self._spec.frame)
-        critic = QuadraticCritic(inputs, self._spec.hidden, torch.nn.Tanh)
-        self.branches = Branches(MeanAction(PolicyNetwork(self._spec)), critic, self._std_share)
+        inputs = CriticInputs(self.features_dim, self._products, self._spec.frame)
+        self.branches = Branches(
+            MeanAction(PolicyNetwork(self._spec)), QuadraticCritic(inputs, self._spec.hidden, torch.nn.Tanh)
+        )
         self.mlp_extractor = cast(MlpExtractor, self.branches)
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -256,12 +240,6 @@ class BranchedPolicy(ActorCriticPolicy):
         rate: dict[str, Any] = {"lr": lr_schedule(1)}
         self.optimizer = self.optimizer_class(self.parameters(), **rate, **self.optimizer_kwargs)
 
-    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Distribution:
-        if not self._std_share:
-            return super()._get_action_dist_from_latent(latent_pi)
-        noise = cast(DiagGaussianDistribution, self.action_dist)
-        return noise.proba_distribution(latent_pi[:, :-1], self.log_std + latent_pi[:, -1:].log())
-
 
 class Ppo(ModelFree):
     """The learner; see `training.Learner`."""
@@ -273,14 +251,12 @@ class Ppo(ModelFree):
             ValueError: the task does not have the symmetry that the settings ask for.
         """
         spec = spec_for(task, config.symmetry, config.hidden)
-        plain = config.symmetry == "none" and not config.products
-        if plain and config.std_distance:
-            raise ValueError("std_distance needs products, or a symmetry")
-        super().__init__(task, params, config, demos, std_distance=config.std_distance)
+        super().__init__(task, params, config, demos)
         self.config = config
         self._std = config.std if demos is None else config.demo_std
         rate = config.learning_rate if demos is None else config.demo_learning_rate
         value = self._value_of_living(self._gamma)
+        plain = config.symmetry == "none" and not config.products
         model = PPO(
             "MlpPolicy" if plain else BranchedPolicy,
             self._env,
@@ -295,12 +271,7 @@ class Ppo(ModelFree):
             policy_kwargs=(
                 {"net_arch": list(config.hidden)}
                 if plain
-                else {
-                    "spec": spec,
-                    "products": config.products,
-                    "value": value,
-                    "std_share": config.std_distance > 0,
-                }
+                else {"spec": spec, "products": config.products, "value": value}
             ),
             rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
             rollout_buffer_kwargs=(
