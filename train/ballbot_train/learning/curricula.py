@@ -94,6 +94,9 @@ class Curriculum:
     retries_goal_factor: float = 0.0
     """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to
     the end. A failure costs so much more than all else that where many are repeated, cost is hardly learnt."""
+    retries_per_failure: float = 0.0
+    """The share that repeats starts is at most so many times the share of the task's own episodes that went wrong lately; 0:
+    it is `retries` in any case."""
     last_failure_price: float = 0.0
     """Price of a failure, where living does not pay, from when the goal and `ramp` are the task's own; 0: as before. A high
     one teaches not to fail, and beside a low one cost is learnt too."""
@@ -130,6 +133,7 @@ class Curriculum:
             ("starts_goal_factor", 0.0, 1e3),
             ("retries", 0.0, 1.0),
             ("retries_goal_factor", 0.0, 1e3),
+            ("retries_per_failure", 0.0, 1e6),
             ("last_failure_price", 0.0, 1e9),
             ("gap_low", -1e6, 1e6),
             ("gap_high", -1e6, 1e6),
@@ -516,7 +520,7 @@ class CurriculumBatch(BallbotBatch):
 
     def _retry(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun to starts from which others of their kind went wrong."""
-        drawn = ended & (torch.rand(self.num_envs) < self.curriculum.retries)
+        drawn = ended & (torch.rand(self.num_envs) < self._retried_share)
         for kind, hard in enumerate(self._hard):
             again = drawn & (self._kind == kind)
             if not hard.shape[1]:
@@ -524,6 +528,13 @@ class CurriculumBatch(BallbotBatch):
             self._again = self._again | again
             chosen = hard[:, torch.randint(hard.shape[1], (int(again.sum()),))]
             self._move(again, chosen[:8], chosen[8:-1], chosen[-1].long())
+
+    @property
+    def _retried_share(self) -> float:
+        """The share of the episodes that repeats starts."""
+        retries, most = self.curriculum.retries, self.curriculum.retries_per_failure
+        wrong = 1 - self._own_episodes.share
+        return min(retries, most * wrong) if most and math.isfinite(wrong) else retries
 
     def _begin(self, begun: torch.Tensor) -> None:
         """Remembers the starts of the episodes that have just begun, if any may be repeated."""
