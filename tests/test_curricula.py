@@ -368,6 +368,16 @@ def test_the_goal_narrows_only_where_enough_episodes_on_optima_succeed_too(share
 
 
 @pytest.mark.parametrize(
+    ("most", "share", "retried"), [(0.0, 0.9, 0.4), (2.0, 0.9, 0.2), (2.0, 0.5, 0.4), (2.0, 1.0, 0.0)]
+)
+def test_fewer_starts_are_repeated_as_fewer_go_wrong(most, share, retried):
+    made = batch(curriculum=Curriculum(retries=0.4, retries_per_failure=most))
+    assert made._retried_share == 0.4  # nothing is known yet
+    made._own_episodes.share = share
+    assert made._retried_share == pytest.approx(retried)
+
+
+@pytest.mark.parametrize(
     ("easier", "price"), [({}, 40.0), ({"goal_factor": 2.0}, 300.0), ({"ramp": "max_speed"}, 300.0)]
 )
 def test_a_failure_has_its_last_price_once_the_task_is_its_own(easier, price):
