@@ -358,10 +358,13 @@ def test_optima_with_a_reserve_end_deeper_in_the_goal():
     assert last_excess(0.5) < last_excess(0.0)
 
 
-@pytest.mark.parametrize(("share", "narrows"), [(0.5, False), (0.7, True), (float("nan"), True)])
-def test_the_goal_narrows_only_where_enough_episodes_on_optima_succeed_too(share, narrows):
+@pytest.mark.parametrize(
+    ("share", "seconds", "narrows"),
+    [(0.5, 0.0, False), (0.7, 0.0, True), (float("nan"), 0.0, False), (0.7, 0.1, True), (0.7, 0.08, False)],
+)
+def test_the_goal_narrows_only_where_enough_episodes_on_optima_succeed_too_and_begin_anywhere(share, seconds, narrows):
     easier = Curriculum(goal_factor=2.0, starts_on_optima=0.5, starts_success=0.6, episodes=1, success=0.0)
-    made = given(batch(curriculum=easier), some_starts(make_task("turn")))
+    made = given(batch(curriculum=replace(easier, starts_seconds=seconds)), some_starts(make_task("turn")))
     made._on_optima.share = share
     made._count(torch.ones(6, dtype=torch.bool), torch.ones(6, dtype=torch.bool))
     assert (made.difficulty["goal_factor"] < 2) == narrows

@@ -80,8 +80,8 @@ class Curriculum:
     starts_step: float = 0.1
     """How much longer that gets whenever enough of these episodes succeed, s."""
     starts_success: float = 0.0
-    """Share of these episodes that has to succeed besides those that begin as the task's own do, before the goal narrows;
-    0: it does in any case."""
+    """Share of these episodes that has to succeed besides those that begin as the task's own do, before the goal narrows. It
+    does not narrow either before they begin anywhere. 0: it does in any case."""
     starts_reserve: float = 0.0
     """Share of the goal's tolerances that these optima leave unused. Without one, slow optima touch the goal where no noise
     is allowed, and loops, which are safer, begin at higher speeds."""
@@ -404,7 +404,15 @@ class CurriculumBatch(BallbotBatch):
         """Whether enough of the episodes on optima succeed for a narrower goal."""
         curriculum = self.curriculum
         used = curriculum.starts_on_optima and self._goal_factor > curriculum.starts_goal_factor
-        return not used or not self._on_optima.share < curriculum.starts_success
+        if not used or not curriculum.starts_success:
+            return True
+        anywhere = not self._reach or self._reach >= self._longest
+        return anywhere and self._on_optima.share >= curriculum.starts_success
+
+    @property
+    def _longest(self) -> float:
+        """Duration of the longest optimum, s."""
+        return math.inf if self._starts is None else float(self._starts.left.max()) * self.task.control_dt
 
     def _count_above_gap(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began just above the gap, and narrows it if enough of them succeeded."""
