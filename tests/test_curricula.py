@@ -370,6 +370,14 @@ def test_the_goal_narrows_only_where_enough_episodes_on_optima_succeed_too_and_b
     assert (made.difficulty["goal_factor"] < 2) == narrows
 
 
+def test_starts_on_optima_longer_than_an_episode_are_anywhere_where_an_episode_may_begin():
+    easier = Curriculum(goal_factor=2.0, starts_on_optima=0.5, starts_success=0.6, starts_seconds=0.06)
+    made = given(batch(curriculum=easier, duration=0.06), some_starts(make_task("turn")))
+    made._on_optima.share = 1.0
+    assert made._longest > made.task.duration
+    assert made._optima_succeed
+
+
 @pytest.mark.parametrize(
     ("most", "share", "retried"), [(0.0, 0.9, 0.4), (2.0, 0.9, 0.2), (2.0, 0.5, 0.4), (2.0, 1.0, 0.0)]
 )

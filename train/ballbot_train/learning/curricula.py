@@ -343,7 +343,7 @@ class CurriculumBatch(BallbotBatch):
         began = self.state
         if self._gap_is_open:
             self._leave_gap(ended)
-        if self.curriculum.starts_on_optima and self._goal_factor > self.curriculum.starts_goal_factor:
+        if self._some_start_on_optima:
             self._start_on_optima(ended)
         if self.curriculum.retries and self._goal_factor > self.curriculum.retries_goal_factor:
             self._retry(ended)
@@ -402,12 +402,16 @@ class CurriculumBatch(BallbotBatch):
     @property
     def _optima_succeed(self) -> bool:
         """Whether enough of the episodes on optima succeed for a narrower goal."""
-        curriculum = self.curriculum
-        used = curriculum.starts_on_optima and self._goal_factor > curriculum.starts_goal_factor
-        if not used or not curriculum.starts_success:
+        enough = self.curriculum.starts_success
+        if not self._some_start_on_optima or not enough:
             return True
-        anywhere = not self._reach or self._reach >= self._longest
-        return anywhere and self._on_optima.share >= curriculum.starts_success
+        anywhere = not self._reach or self._reach >= min(self._longest, self._own.duration)
+        return anywhere and self._on_optima.share >= enough
+
+    @property
+    def _some_start_on_optima(self) -> bool:
+        """Whether a share of the episodes begins on optima at present."""
+        return self.curriculum.starts_on_optima > 0 and self._goal_factor > self.curriculum.starts_goal_factor
 
     @property
     def _longest(self) -> float:
@@ -436,15 +440,25 @@ class CurriculumBatch(BallbotBatch):
 
     @property
     def _present_failure_price(self) -> float:
-        curriculum = self.curriculum
-        easy = self._goal_factor > 1 or (curriculum.ramp and self._ramp != getattr(self._own, curriculum.ramp))
-        return self._failure_price if easy or not curriculum.last_failure_price else curriculum.last_failure_price
+        last = self.curriculum.last_failure_price
+        return last if last and not (self._is_wide or self._is_ramping) else self._failure_price
+
+    @property
+    def _is_wide(self) -> bool:
+        """Whether the goal is wider than the task's own."""
+        return self._goal_factor > 1
+
+    @property
+    def _is_ramping(self) -> bool:
+        """Whether the field `ramp` is not the task's own yet."""
+        ramp = self.curriculum.ramp
+        return bool(ramp) and self._ramp != getattr(self._own, ramp)
 
     def _harden(self) -> None:
         """Takes a step towards the task itself."""
         curriculum = self.curriculum
         own = getattr(self._own, curriculum.ramp) if curriculum.ramp else 0.0
-        wide, easy = self._goal_factor > 1, bool(curriculum.ramp) and self._ramp != own
+        wide, easy = self._is_wide, self._is_ramping
         if wide and not (curriculum.order == "ramp" and easy):
             self._goal_factor = max(1.0, self._goal_factor * curriculum.goal_step)
         if easy and not (curriculum.order == "goal" and wide):
@@ -601,7 +615,7 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int, re
     from ballbot_baselines.optimum import Backoff, find_optimum  # it imports CasADi
 
     console.print(f"finding {count} optima on which training episodes begin")
-    found, backoff = [], replace(Backoff(), goal=max(Backoff().goal, reserve))
+    found, backoff = [], Backoff(goal=max(Backoff.goal, reserve))
     for x, c in zip(*fresh.draw(task, range(count), 0, "training"), strict=True):
         try:
             states = find_optimum(task, params, x, c, backoff).trajectory.x
