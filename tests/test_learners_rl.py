@@ -176,6 +176,35 @@ def test_the_learning_rate_falls_as_its_schedule_says(name, schedule, second):
     assert rates == pytest.approx([1e-3, 1e-3 * second], rel=1e-3)
 
 
+def test_schedules_wait_until_the_task_is_its_own(name):
+    settings = {"rl_iterations": 8, "gamma": 0.9, "final_gamma": 0.99, "curriculum_progress": 0.25}
+    settings |= {"learning_rate": 1e-3, "final_learning_rate_fraction": 0.1, "last_learning_rate": 4e-4}
+    learner = make(name, **settings, learning_rate_schedule="linear", curriculum=Curriculum(goal_factor=2.0))
+
+    def gone(whole):  # shares of the schedule of the discount, by iteration
+        figures = [whole.iterate() for _ in range(4)]
+        return [-math.log10((1 - each["train/gamma"]) / 0.1) for each in figures], [
+            each["train/learning_rate"] for each in figures
+        ]
+
+    shares, rates = gone(learner)
+    assert shares == pytest.approx([0, 0.125, 0.25, 0.25])
+    assert rates == pytest.approx([1e-3, 1e-3 * (1 - 0.9 / 8), 1e-3 * (1 - 0.9 / 4), 1e-3 * (1 - 0.9 / 4)])
+    learner._env.batch._goal_factor = 1.0
+    resumed = make(name, **settings, learning_rate_schedule="linear", curriculum=Curriculum(goal_factor=2.0))
+    resumed.load_state_dict(learner.state_dict())
+    shares, rates = gone(resumed)
+    assert shares == pytest.approx([0.25, 0.4375, 0.625, 0.8125])
+    assert rates == pytest.approx([4e-4 * (1e-4 / 4e-4) ** (k / 4) for k in range(4)])
+
+
+@pytest.mark.parametrize("waits", [0.25, 1.0])
+def test_schedules_do_not_wait_without_a_curriculum(name, waits):
+    learner = make(name, gamma=0.9, final_gamma=0.99, curriculum_progress=waits)
+    logged = [1 - learner.iterate()["train/gamma"] for _ in range(3)]
+    assert logged == pytest.approx([0.1 * 10 ** (-k / 3) for k in range(3)])
+
+
 def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
     learner = make("ppo", relative_advantages=1.0)
     learner.iterate()

@@ -441,7 +441,12 @@ class CurriculumBatch(BallbotBatch):
     @property
     def _present_failure_price(self) -> float:
         last = self.curriculum.last_failure_price
-        return last if last and not (self._is_wide or self._is_ramping) else self._failure_price
+        return last if last and self.is_settled else self._failure_price
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the goal and the field `ramp` are the task's own."""
+        return not (self._is_wide or self._is_ramping)
 
     @property
     def _is_wide(self) -> bool:

@@ -78,7 +78,7 @@ _MAY_BE_ZERO = {
     "tube_samples",
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
-_SHARES = {"batch_dear_share", "beta", "dear_share", "final_gamma", "gae_lambda", "gamma", "tau"}
+_SHARES = {"batch_dear_share", "beta", "curriculum_progress", "dear_share", "final_gamma", "gae_lambda", "gamma", "tau"}
 _POSITIVE = {
     "demo_critic_learning_rate",
     "demo_std",
@@ -87,6 +87,7 @@ _POSITIVE = {
     "finetune_critic_learning_rate",
     "finetune_learning_rate",
     "finetune_std",
+    "last_learning_rate",
     "learning_rate",
     "reward_scale",
     "std",

@@ -67,6 +67,12 @@ class ModelFreeConfig:
     """What a failure costs at once in training where living does not pay."""
     learning_rate_schedule: Literal["linear", "geometric"] = "linear"
     """How the learning rate falls: along a straight line, or by the same factor in every iteration."""
+    curriculum_progress: float = 1.0
+    """All schedules wait at this share of their course until the curriculum's goal and ramp are the task's own, and then go
+    on to their end in the iterations that are left; 1: they do not wait. What is learnt then needs the noise of before."""
+    last_learning_rate: float | None = None
+    """Learning rate from when the goal and ramp are the task's own, falling by the same factor in every iteration; default,
+    as scheduled. What is learnt before needs large steps, and small ones then bring costs down."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
@@ -115,6 +121,7 @@ class ModelFree(ABC):
         self._trained = task
         self._relative_values = config.relative_values if demos is None else 0.0
         self._gamma = self._per_step(config.gamma)
+        self._settled: float | None = None  # share of the iterations after which the task was its own
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
         self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
@@ -214,6 +221,7 @@ class ModelFree(ABC):
             "imitation": self._imitation and self._imitation.state_dict(),
             "env_steps": model.num_timesteps,
             "gamma": model.gamma,
+            "settled": self._settled,
             "env": self._env.state_dict(),
             "observations": torch.as_tensor(model._last_obs),
             "starts": torch.as_tensor(model._last_episode_starts),
@@ -231,17 +239,35 @@ class ModelFree(ABC):
             self._imitation.load_state_dict(state["imitation"])
         model.num_timesteps = state["env_steps"]
         self._take_gamma(state["gamma"])
+        self._settled = state["settled"]
         self._env.load_state_dict(state["env"])
         model._last_obs, model._last_episode_starts = state["observations"].numpy(), state["starts"].numpy()
         self._random.load_state_dict(state["random"])
 
     @property
-    def _progress(self) -> float:
+    def _share_done(self) -> float:
         """Share of the iterations of reinforcement learning that are done."""
         return (self.iteration - self._clone_iterations) / self._settings.rl_iterations
 
+    @property
+    def _progress(self) -> float:
+        """Share of their course that the schedules are through: that of the iterations, unless they wait."""
+        waits = self._settings.curriculum_progress
+        if self._settled is None or waits == 1:
+            return min(self._share_done, waits)
+        begun = min(self._settled, waits)
+        return begun + (1 - begun) * self._since_settled
+
+    @property
+    def _since_settled(self) -> float:
+        """Share that is done of the iterations since the task was its own."""
+        return 0.0 if self._settled is None else (self._share_done - self._settled) / (1 - self._settled)
+
     def _annealed(self, rate: float, final_fraction: float) -> float:
         """A learning rate in the present iteration."""
+        last = self._settings.last_learning_rate
+        if last is not None and self._settled is not None:
+            return schedules.geometric(last, final_fraction * rate, self._since_settled)
         if self._settings.learning_rate_schedule == "linear":
             return schedules.linear(rate, final_fraction, self._progress)
         return schedules.geometric(rate, final_fraction * rate, self._progress)
@@ -260,6 +286,8 @@ class ModelFree(ABC):
     def _improve(self) -> dict[str, float]:
         """One iteration of reinforcement learning."""
         settings, model = self._settings, self._model
+        if self._settled is None and self._env.batch.is_settled:
+            self._settled = self._share_done
         if settings.final_gamma is not None:
             self._raise_gamma(self._per_step(schedules.discount(settings.gamma, settings.final_gamma, self._progress)))
         self._actor.requires_grad_(not self._critic_only)
