@@ -400,6 +400,24 @@ def test_a_failure_has_its_last_price_once_the_task_is_its_own(easier, price):
     assert fell == pytest.approx(-price, abs=10.0)  # besides the cost of the step
 
 
+def test_the_curriculum_is_over_once_enough_episodes_of_the_task_itself_succeed():
+    made = batch(curriculum=Curriculum(goal_factor=1.01, success=0.5, settled_success=0.75, episodes=4))
+    all_ended = torch.ones(made.num_envs, dtype=torch.bool)[:4]
+
+    def look(successes):
+        made._count(all_ended, torch.arange(4) < successes)
+        return made.difficulty["goal_factor"], made.is_settled
+
+    assert look(1) == (1.01, False)
+    assert look(4) == (1.0, False)  # that was with a wider goal
+    assert look(2) == (1.0, False)
+    assert look(3) == (1.0, True)
+    assert look(0) == (1.0, True)
+    resumed = batch(curriculum=made.curriculum)
+    resumed.load_curriculum_state(made.curriculum_state())
+    assert resumed.is_settled
+
+
 @pytest.mark.parametrize("name", ["rsl_ppo", "ppo", "sac"])
 def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(name, monkeypatch):
     monkeypatch.setattr(curricula, "optimal_starts", lambda task, params, count, steps, reserve: some_starts(task))

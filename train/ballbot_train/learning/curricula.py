@@ -68,6 +68,9 @@ class Curriculum:
     """What comes first, narrowing the goal or the steps of `ramp`; or both together."""
     success: float = 0.7
     """Share of the training episodes that is enough. Episodes that begin on optima do not count."""
+    settled_success: float = 0.0
+    """Share that is enough, once the goal and `ramp` are the task's own, for what comes after the curriculum: the settings
+    that begin with last_, and the rest of the schedules that wait for it. 0: it comes at once."""
     episodes: int = 256
     """Number of ended training episodes after which that share is looked at; then they are counted anew."""
     starts_on_optima: float = 0.0
@@ -98,8 +101,8 @@ class Curriculum:
     """The share that repeats starts is at most so many times the share of the task's own episodes that went wrong lately; 0:
     it is `retries` in any case."""
     last_failure_price: float = 0.0
-    """Price of a failure, where living does not pay, from when the goal and `ramp` are the task's own; 0: as before. A high
-    one teaches not to fail, and beside a low one cost is learnt too."""
+    """Price of a failure, where living does not pay, once the curriculum is over; 0: as before. A high one teaches not to
+    fail, and beside a low one cost is learnt too."""
     gap_low: float = 0.0
     """No episode has a first constant, as Turn's speed, between this value and `gap_high` at the start of training."""
     gap_high: float = 0.0
@@ -123,6 +126,7 @@ class Curriculum:
             ("ramp_start", 0.0, 1e6),
             ("ramp_step", 1e-9, 1e6),
             ("success", 0.0, 1.0),
+            ("settled_success", 0.0, 1.0),
             ("episodes", 1, 10**9),
             ("starts_on_optima", 0.0, 1.0),
             ("optima", 1, 10**6),
@@ -271,6 +275,7 @@ class CurriculumBatch(BallbotBatch):
             _Tally(),
             _Tally(),
         )  # that ended, by how they began
+        self._has_settled = False  # whether enough of the episodes of the task itself have succeeded
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
         rows = 8 + len(task.constant_names) + 1
@@ -364,6 +369,7 @@ class CurriculumBatch(BallbotBatch):
             "ramp": self._ramp,
             "reach": self._reach,
             "gap_high": self._gap_high,
+            "settled": self._has_settled,
             "own_episodes": self._own_episodes.state(),
             "on_optima": self._on_optima.state(),
             "above_gap": self._above_gap.state(),
@@ -377,7 +383,7 @@ class CurriculumBatch(BallbotBatch):
     def load_curriculum_state(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
         self._goal_factor, self._ramp, self._reach = state["goal_factor"], state["ramp"], state["reach"]
-        self._gap_high = state["gap_high"]
+        self._gap_high, self._has_settled = state["gap_high"], state["settled"]
         self._own_episodes, self._on_optima = _Tally(*state["own_episodes"]), _Tally(*state["on_optima"])
         self._above_gap = _Tally(*state["above_gap"])
         self._kind, self._again = state["kind"], state["again"]
@@ -390,12 +396,17 @@ class CurriculumBatch(BallbotBatch):
 
     def _count(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the episodes that ended, and makes the task harder if enough of them succeeded."""
-        if self._enough(self._own_episodes, ended, success) and self._optima_succeed:
+        if not self._complete(self._own_episodes, ended, success):
+            return
+        if self._is_own:
+            self._has_settled |= self._own_episodes.share >= self.curriculum.settled_success
+        if self._enough(self._own_episodes) and self._optima_succeed:
             self._harden()
 
     def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began on optima, and lets them begin earlier if enough of them succeeded."""
-        if self._enough(self._on_optima, ended, success) and 0 < self._reach < self._own.duration:
+        complete = self._complete(self._on_optima, ended, success)
+        if complete and self._enough(self._on_optima) and 0 < self._reach < self._own.duration:
             self._reach = min(self._reach + self.curriculum.starts_step, self._own.duration)
             self._eligible = None
 
@@ -420,7 +431,7 @@ class CurriculumBatch(BallbotBatch):
 
     def _count_above_gap(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began just above the gap, and narrows it if enough of them succeeded."""
-        if self._enough(self._above_gap, ended, success):
+        if self._complete(self._above_gap, ended, success) and self._enough(self._above_gap):
             self._gap_high = max(self._gap_high - self.curriculum.gap_step, self.curriculum.gap_low)
             self._set_difficulty()
 
@@ -428,14 +439,18 @@ class CurriculumBatch(BallbotBatch):
     def _gap_is_open(self) -> bool:
         return self._gap_high > self.curriculum.gap_low
 
-    def _enough(self, tally: "_Tally", ended: torch.Tensor, success: torch.Tensor) -> bool:
-        """Counts the episodes that ended. True where `episodes` are complete now, and enough of them succeeded."""
+    def _complete(self, tally: "_Tally", ended: torch.Tensor, success: torch.Tensor) -> bool:
+        """Counts the episodes that ended. True where `episodes` are complete now; their share of successes is then new."""
         tally.ended += int(ended.sum())
         tally.succeeded += int((ended & success).sum())
         if tally.ended < self.curriculum.episodes:
             return False
         tally.share = tally.succeeded / tally.ended
         tally.ended = tally.succeeded = 0
+        return True
+
+    def _enough(self, tally: "_Tally") -> bool:
+        """Whether enough of the episodes succeeded, when they were last looked at."""
         return tally.share >= self.curriculum.success
 
     @property
@@ -445,6 +460,11 @@ class CurriculumBatch(BallbotBatch):
 
     @property
     def is_settled(self) -> bool:
+        """Whether the curriculum is over: the goal and the field `ramp` are the task's own, and enough episodes succeed."""
+        return self._is_own and (self._has_settled or not self.curriculum.settled_success)
+
+    @property
+    def _is_own(self) -> bool:
         """Whether the goal and the field `ramp` are the task's own."""
         return not (self._is_wide or self._is_ramping)
 

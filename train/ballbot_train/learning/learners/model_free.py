@@ -68,11 +68,11 @@ class ModelFreeConfig:
     learning_rate_schedule: Literal["linear", "geometric"] = "linear"
     """How the learning rate falls: along a straight line, or by the same factor in every iteration."""
     curriculum_progress: float = 1.0
-    """All schedules wait at this share of their course until the curriculum's goal and ramp are the task's own, and then go
-    on to their end in the iterations that are left; 1: they do not wait. What is learnt then needs the noise of before."""
+    """All schedules wait at this share of their course until the curriculum is over, and then go on to their end in the
+    iterations that are left; 1: they do not wait. All that is learnt until then needs the noise of before."""
     last_learning_rate: float | None = None
-    """Learning rate from when the goal and ramp are the task's own, falling by the same factor in every iteration; default,
-    as scheduled. What is learnt before needs large steps, and small ones then bring costs down."""
+    """Learning rate once the curriculum is over, falling by the same factor in every iteration; default, as scheduled. Large
+    steps find the way, and small ones then bring costs down."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
