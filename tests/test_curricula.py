@@ -211,16 +211,17 @@ def test_episodes_on_optima_begin_ever_earlier_as_they_succeed():
         assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * (steps_left + 1))
 
 
-def test_no_episode_begins_on_an_optimum_when_the_goal_has_narrowed_enough():
+@pytest.mark.parametrize(("easier", "kind"), [({}, curricula._OWN), ({"ramp": "max_speed"}, curricula._ON_OPTIMUM)])
+def test_no_episode_begins_on_an_optimum_when_the_goal_has_narrowed_enough_and_all_are_drawn(easier, kind):
     settings = Curriculum(starts_on_optima=1.0, goal_factor=2.0, goal_step=0.7, starts_goal_factor=1.5)
-    made = batch(curriculum=settings, num_envs=50)
+    made = batch(curriculum=replace(settings, ramp_start=4.0, **easier), num_envs=50)
     given(made, some_starts(made.task))
     run(made, made.task.steps)
     assert (made._kind == curricula._ON_OPTIMUM).all()
     made._harden()
     run(made, made.task.steps)
     assert made.difficulty["goal_factor"] == pytest.approx(1.4)
-    assert (made._kind == curricula._OWN).all()
+    assert (made._kind == kind).all()
 
 
 def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
@@ -376,6 +377,14 @@ def test_starts_on_optima_longer_than_an_episode_are_anywhere_where_an_episode_m
     made._on_optima.share = 1.0
     assert made._longest > made.task.duration
     assert made._optima_succeed
+
+
+def test_what_is_drawn_widens_whatever_starts_on_optima_achieve():
+    easier = Curriculum(ramp="max_speed", ramp_start=4.0, ramp_step=1.0, starts_on_optima=0.5, starts_success=0.6)
+    made = given(batch(curriculum=replace(easier, episodes=1, success=0.0)), some_starts(make_task("turn")))
+    made._on_optima.share = 0.5
+    made._count(torch.ones(6, dtype=torch.bool), torch.ones(6, dtype=torch.bool))
+    assert made.difficulty["max_speed"] == 5.0
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,9 @@ class Curriculum:
     """Share of the goal's tolerances that these optima leave unused. Without one, slow optima touch the goal where no noise
     is allowed, and loops, which are safer, begin at higher speeds."""
     starts_goal_factor: float = 0.0
-    """No more episodes begin on optima when the goal's tolerances have narrowed to so many times the task's own; 0: they do
-    to the end. Where the goal is narrow, many such episodes begin too close before it for a policy that comes otherwise."""
+    """No more episodes begin on optima when the goal's tolerances have narrowed to so many times the task's own, and `ramp`
+    has ended; 0: they do to the end. Where the goal is narrow, many such episodes begin too close before it for a policy that
+    comes otherwise."""
     retries: float = 0.0
     """Share of the training episodes, of the task's own and of those on optima, that repeat the start of one of the last such
     episodes that failed or, on a task that ends at its goal, missed it; 0: off. They do not count for `success`."""
@@ -400,7 +401,7 @@ class CurriculumBatch(BallbotBatch):
             return
         if self._is_own:
             self._has_settled |= self._own_episodes.share >= self.curriculum.settled_success
-        if self._enough(self._own_episodes) and self._optima_succeed:
+        if self._enough(self._own_episodes) and (self._optima_succeed or not self._is_wide):
             self._harden()
 
     def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
@@ -422,7 +423,8 @@ class CurriculumBatch(BallbotBatch):
     @property
     def _some_start_on_optima(self) -> bool:
         """Whether a share of the episodes begins on optima at present."""
-        return self.curriculum.starts_on_optima > 0 and self._goal_factor > self.curriculum.starts_goal_factor
+        ends = self._goal_factor <= self.curriculum.starts_goal_factor and not self._is_ramping
+        return self.curriculum.starts_on_optima > 0 and not ends
 
     @property
     def _longest(self) -> float:
