@@ -388,10 +388,11 @@ def test_what_is_drawn_widens_whatever_starts_on_optima_achieve():
 
 
 @pytest.mark.parametrize(
-    ("most", "share", "retried"), [(0.0, 0.9, 0.4), (2.0, 0.9, 0.2), (2.0, 0.5, 0.4), (2.0, 1.0, 0.0)]
+    ("most", "share", "factor", "retried"),
+    [(0.0, 0.9, 1.0, 0.4), (2.0, 0.9, 1.0, 0.2), (2.0, 0.9, 2.0, 0.4), (2.0, 0.5, 1.0, 0.4), (2.0, 1.0, 1.0, 0.0)],
 )
-def test_fewer_starts_are_repeated_as_fewer_go_wrong(most, share, retried):
-    made = batch(curriculum=Curriculum(retries=0.4, retries_per_failure=most))
+def test_fewer_starts_are_repeated_as_fewer_go_wrong(most, share, factor, retried):
+    made = batch(curriculum=Curriculum(retries=0.4, retries_per_failure=most, goal_factor=factor))
     assert made._retried_share == 0.4  # nothing is known yet
     made._own_episodes.share = share
     assert made._retried_share == pytest.approx(retried)

@@ -99,8 +99,8 @@ class Curriculum:
     """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to
     the end. A failure costs so much more than all else that where many are repeated, cost is hardly learnt."""
     retries_per_failure: float = 0.0
-    """The share that repeats starts is at most so many times the share of the task's own episodes that went wrong lately; 0:
-    it is `retries` in any case."""
+    """Once the curriculum is over, the share that repeats starts is at most so many times the share of the task's own episodes
+    that went wrong lately; 0: it is `retries` in any case."""
     last_failure_price: float = 0.0
     """Price of a failure, where living does not pay, once the curriculum is over; 0: as before. A high one teaches not to
     fail, and beside a low one cost is learnt too."""
@@ -583,7 +583,7 @@ class CurriculumBatch(BallbotBatch):
         """The share of the episodes that repeats starts."""
         retries, most = self.curriculum.retries, self.curriculum.retries_per_failure
         wrong = 1 - self._own_episodes.share
-        return min(retries, most * wrong) if most and math.isfinite(wrong) else retries
+        return min(retries, most * wrong) if most and self.is_settled and math.isfinite(wrong) else retries
 
     def _begin(self, begun: torch.Tensor) -> None:
         """Remembers the starts of the episodes that have just begun, if any may be repeated."""
