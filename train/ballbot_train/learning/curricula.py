@@ -99,7 +99,7 @@ class Curriculum:
     """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to
     the end. A failure costs so much more than all else that where many are repeated, cost is hardly learnt."""
     retries_per_failure: float = 0.0
-    """Once the curriculum is over, the share that repeats starts is at most so many times the share of the task's own episodes
+    """Once the curriculum is over, the share that repeats starts is at most so many times that of the task's own episodes
     that went wrong lately; 0: it is `retries` in any case."""
     last_failure_price: float = 0.0
     """Price of a failure, where living does not pay, once the curriculum is over; 0: as before. A high one teaches not to
