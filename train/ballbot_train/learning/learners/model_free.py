@@ -71,7 +71,7 @@ class ModelFreeConfig:
     """All schedules wait at this share of their course until the curriculum is over, and then go on to their end in the
     iterations that are left; 1: they do not wait. All that is learnt until then needs the noise of before."""
     last_learning_rate: float | None = None
-    """Learning rate when the curriculum is over, from where it falls to the same end by the same factor in every iteration, as
+    """Learning rate when the curriculum is over, from where it falls to the same end by the same factor in each iteration, as
     the deviation does; default, as scheduled. Large steps find the way, and small ones then bring costs down."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
