@@ -195,7 +195,7 @@ def test_schedules_wait_until_the_task_is_its_own(name):
     resumed.load_state_dict(learner.state_dict())
     shares, rates = gone(resumed)
     assert shares == pytest.approx([0.25, 0.4375, 0.625, 0.8125])
-    assert rates == pytest.approx([4e-4 * (1e-4 / 4e-4) ** (k / 4) for k in range(4)])
+    assert rates == pytest.approx([4e-4 - 3e-4 * k / 4 for k in range(4)])
 
 
 @pytest.mark.parametrize("waits", [0.25, 1.0])

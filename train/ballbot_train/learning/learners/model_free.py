@@ -71,8 +71,8 @@ class ModelFreeConfig:
     """All schedules wait at this share of their course until the curriculum is over, and then go on to their end in the
     iterations that are left; 1: they do not wait. All that is learnt until then needs the noise of before."""
     last_learning_rate: float | None = None
-    """Learning rate when the curriculum is over, from where it falls to the same end by the same factor in each iteration, as
-    the deviation does; default, as scheduled. Large steps find the way, and small ones then bring costs down."""
+    """Learning rate when the curriculum is over, from where it falls to the same end in the iterations left; default,
+    as scheduled. Large steps find the way, and small ones then bring costs down."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
@@ -265,12 +265,12 @@ class ModelFree(ABC):
 
     def _annealed(self, rate: float, final_fraction: float) -> float:
         """A learning rate in the present iteration."""
-        last = self._settings.last_learning_rate
+        progress, last = self._progress, self._settings.last_learning_rate
         if last is not None and self._settled is not None:
-            return schedules.geometric(last, final_fraction * rate, self._since_settled)
+            rate, final_fraction, progress = last, final_fraction * rate / last, self._since_settled
         if self._settings.learning_rate_schedule == "linear":
-            return schedules.linear(rate, final_fraction, self._progress)
-        return schedules.geometric(rate, final_fraction * rate, self._progress)
+            return schedules.linear(rate, final_fraction, progress)
+        return schedules.geometric(rate, final_fraction * rate, progress)
 
     @property
     def _critic_only(self) -> bool:
