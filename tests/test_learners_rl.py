@@ -198,6 +198,12 @@ def test_schedules_wait_until_the_task_is_its_own(name):
     assert rates == pytest.approx([4e-4 - 3e-4 * k / 4 for k in range(4)])
 
 
+def test_demonstrations_have_their_own_learning_rate_to_the_end(name, demos):
+    settings = {"clone_iterations": 0, "critic_warmup_iterations": 0, "learning_rate": 1e-4, "last_learning_rate": 1e-3}
+    learner = make(name, demos, **settings)
+    assert learner.iterate()["train/learning_rate"] == pytest.approx(1e-4)
+
+
 @pytest.mark.parametrize("waits", [0.25, 1.0])
 def test_schedules_do_not_wait_without_a_curriculum(name, waits):
     learner = make(name, gamma=0.9, final_gamma=0.99, curriculum_progress=waits)

@@ -71,8 +71,8 @@ class ModelFreeConfig:
     """All schedules wait at this share of their course until the curriculum is over, and then go on to their end in the
     iterations that are left; 1: they do not wait. All that is learnt until then needs the noise of before."""
     last_learning_rate: float | None = None
-    """Learning rate when the curriculum is over, from where it falls to the same end in the iterations left; default,
-    as scheduled. Large steps find the way, and small ones then bring costs down."""
+    """Learning rate when the curriculum is over, from where it falls to the same end in the iterations left; default, or with
+    demonstrations, as scheduled. Large steps find the way, and small ones then bring costs down."""
     clone_iterations: int = 20
     """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
     clone_gradient_steps: int = 300
@@ -266,7 +266,7 @@ class ModelFree(ABC):
     def _annealed(self, rate: float, final_fraction: float) -> float:
         """A learning rate in the present iteration."""
         progress, last = self._progress, self._settings.last_learning_rate
-        if last is not None and self._settled is not None:
+        if last is not None and self._settled is not None and self._demos is None:
             rate, final_fraction, progress = last, final_fraction * rate / last, self._since_settled
         if self._settings.learning_rate_schedule == "linear":
             return schedules.linear(rate, final_fraction, progress)
