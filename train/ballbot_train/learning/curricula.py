@@ -12,6 +12,8 @@ A curriculum changes training alone. What is evaluated is always the task itself
 - A share of the episodes, also of those on optima, repeats starts from which recent ones failed or missed their goal. So what
   is hard is met more often, as the narrow band of speeds where Turn's best way switches (after Jiang et al., "Prioritized
   level replay", 2021).
+- A curriculum is over when the goal and that field are the task's own and enough episodes succeed. From then on a failure can
+  cost less, fewer starts are repeated, and schedules of the learner that waited go on.
 - Values of the first constant, as Turn's speed, can be left out at first. This gap closes from above, by a step whenever
   enough of the episodes just above it succeed. So the way of the episodes above it, as Turn's loop, is carried on into the
   gap, where a policy that begins with all of them averages two ways.
