@@ -428,14 +428,14 @@ def test_products_change_nothing_about_what_an_actor_sees(name):
     assert make(name, products=True).network.spec == make(name, products=False).network.spec
 
 
-SYMMETRIES = {"stabilize": "odd", "turn": "frame", "orbit": "centred", "weave": "centred"}
+SYMMETRIES = {"stabilize": "odd", "turn": "fine_frame", "orbit": "centred", "weave": "centred"}
 
 
 def test_ppo_uses_the_symmetry_of_every_task():
     assert {task: LEARNERS["ppo"].settings(task).symmetry for task in SYMMETRIES} == SYMMETRIES
 
 
-@pytest.mark.parametrize(("task", "symmetry"), [*SYMMETRIES.items(), ("weave", "mirrors")])
+@pytest.mark.parametrize(("task", "symmetry"), [*SYMMETRIES.items(), ("turn", "frame"), ("weave", "mirrors")])
 def test_the_actor_of_ppo_has_the_symmetry_of_its_task(task, symmetry):
     settings = replace(TINY["ppo"], symmetry=symmetry, rl_iterations=1)
     learner = LEARNERS["ppo"].make(make_task(task), default_params(), settings, 0, None)
