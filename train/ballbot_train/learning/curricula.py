@@ -278,7 +278,7 @@ class CurriculumBatch(BallbotBatch):
             _Tally(),
             _Tally(),
         )  # that ended, by how they began
-        self._has_settled = False  # whether enough of the episodes of the task itself have succeeded
+        self._has_settled = not curriculum.settled_success  # whether enough episodes of the task itself have succeeded
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
         rows = 8 + len(task.constant_names) + 1
@@ -465,7 +465,7 @@ class CurriculumBatch(BallbotBatch):
     @property
     def is_settled(self) -> bool:
         """Whether the curriculum is over: the goal and the field `ramp` are the task's own, and enough episodes succeed."""
-        return self._is_own and (self._has_settled or not self.curriculum.settled_success)
+        return self._is_own and self._has_settled
 
     @property
     def _is_own(self) -> bool:

@@ -121,7 +121,7 @@ class ModelFree(ABC):
         self._trained = task
         self._relative_values = config.relative_values if demos is None else 0.0
         self._gamma = self._per_step(config.gamma)
-        self._settled: float | None = None  # share of the iterations after which the task was its own
+        self._settled: float | None = None  # share of the iterations after which the curriculum was over
         self._clone_iterations = 0 if demos is None else config.clone_iterations
         self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
         self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
@@ -260,7 +260,7 @@ class ModelFree(ABC):
 
     @property
     def _since_settled(self) -> float:
-        """Share that is done of the iterations since the task was its own."""
+        """Share that is done of the iterations since the curriculum was over."""
         return 0.0 if self._settled is None else (self._share_done - self._settled) / (1 - self._settled)
 
     def _annealed(self, rate: float, final_fraction: float) -> float:
