@@ -1,6 +1,8 @@
 """What README and documentation say runs as it stands, as a reader would paste it, page by page."""
 
+import dataclasses
 import json
+import math
 import re
 import shlex
 import subprocess
@@ -9,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from ballbot_gym import BallbotEnv
+from ballbot_gym.tasks import TASKS
 from ballbot_train.executors import Workers
 from ballbot_train.policy import SHIPPED
 
@@ -16,6 +20,12 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where the clients are installed
+SHORTER = {  # a training that a page calls `# minutes` runs with these too
+    "dagger": "--total-iterations 1 --episodes-per-iteration 4 --candidate-episodes 4 --batch-episodes 0 --gradient-steps 5",
+    "ppo": "--rl-iterations 1 --clone-iterations 1 --critic-warmup-iterations 0",
+    "shac": "--total-iterations 1 --num-envs 8 --horizon 4 --no-compile",
+}
+MEASURED = "--evaluations 1 --test-episodes 2 --validation-episodes 2"
 
 
 def blocks(page, language):
@@ -40,6 +50,9 @@ def test_commands_run(page, typed, monkeypatch):
         command = shlex.split(line, comments=True)
         if not command:
             continue
+        if line.endswith("# minutes"):
+            assert command[:2] == ["ballbot", "train"], line
+            command += shlex.split(f"{SHORTER[command[2]]} {MEASURED}")
         if command[0] == "make":  # what CI runs, this test within it
             assert re.search(rf"^{command[1]}:", makefile, flags=re.MULTILINE), line
             continue
@@ -95,6 +108,25 @@ def table(page, header):
     _, _, rest = page.read_text().partition(header)
     rows = rest.partition("\n\n")[0].splitlines()[2:]
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_the_page_of_a_task_says_what_its_env_has(name):
+    page, env = ROOT / "docs" / "tasks" / f"{name}.md", BallbotEnv(name, physics="rk4")
+    rows = table(page, "| number | quantity |")
+    bounds = {int(number): float(largest) for numbers, *_, largest in rows for number in numbers.split(",")}
+    assert [bounds[i] for i in range(len(bounds))] == pytest.approx(env.observation_space.high.tolist(), rel=1e-3)
+    scales = {int(number): float(row[2]) for row in rows for number in row[0].split(",")}
+    assert tuple(scales[i] for i in range(len(scales))) == env.task.observation_scale
+    assert (env.observation_space.low == -env.observation_space.high).all()
+    shared = table(ROOT / "docs" / "tasks" / "index.md", "| name | meaning |")
+    arguments = {row[0]: row[3] for row in (*table(page, "| name | meaning |"), *shared)}
+    told = {
+        argument: math.radians(float(default[:-1])) if default.endswith("°") else float(default)
+        for argument, default in arguments.items()
+    }
+    assert told == pytest.approx({field.name: field.default for field in dataclasses.fields(env.task)})
+    assert str(env.task.reward_threshold) in page.read_text()
 
 
 def test_the_readme_s_leaderboard_is_that_of_the_documentation():
