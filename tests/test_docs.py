@@ -22,7 +22,7 @@ NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where the clients are installed
 SHORTER = {  # a training that a page calls `# minutes` runs with these too
     "dagger": "--total-iterations 1 --episodes-per-iteration 4 --candidate-episodes 4 --batch-episodes 0 --gradient-steps 5",
-    "ppo": "--rl-iterations 1 --clone-iterations 1 --critic-warmup-iterations 0",
+    "ppo": "--rl-iterations 1 --num-envs 64 --num-steps 48 --clone-iterations 1 --critic-warmup-iterations 0",
     "shac": "--total-iterations 1 --num-envs 8 --horizon 4 --no-compile",
 }
 MEASURED = "--evaluations 1 --test-episodes 2 --validation-episodes 2"
@@ -130,10 +130,35 @@ def test_the_page_of_a_task_says_what_its_env_has(name):
 
 
 def test_the_readme_s_leaderboard_is_that_of_the_documentation():
-    full = table(ROOT / "docs" / "leaderboard.md", "| task | controller |")
-    short = table(ROOT / "README.md", "| task | controller |")
-    assert len(short) > 10
-    assert short == [[*row[:4], row[4].partition(" (")[0]] for row in full]
+    header = "| controller | Stabilize | Turn | Orbit | Weave |"
+    tasks = [task.strip().lower() for task in header.strip("| ").split("|")[1:]]
+    rows = table(ROOT / "README.md", header)
+    short = {
+        (task, controller): cell for controller, *cells in rows for task, cell in zip(tasks, cells, strict=True) if cell
+    }
+    expected = {}
+    for task, controller, success, failures, regret, *_ in table(ROOT / "docs" / "leaderboard.md", "| task | controller |"):
+        failed, of = map(int, failures.split("/"))
+        parts = [] if regret == "–" else [regret.partition(" (")[0].replace("%", " %")]
+        parts += [f"{failed} fail"] if failed else []
+        misses = round(of * (1 - float(success.rstrip(" %")) / 100)) - failed
+        expected[task, controller] = ", ".join(parts + ([f"{misses} miss"] if misses else []))
+    assert len(expected) > 10
+    assert short == expected
+
+
+def test_every_page_of_experiments_answers_its_question_at_once_and_all_its_data_are_linked():
+    folder = ROOT / "docs" / "experiments"
+    pages = [page for page in folder.glob("*.md") if page.name != "index.md"]
+    index = (folder / "index.md").read_text()
+    for page in pages:
+        title, _, answer, *_ = page.read_text().splitlines()
+        assert title.endswith("?"), page
+        assert answer.startswith("**"), page
+        assert re.search(r"\*\* \*\w+ 20\d\d\*\n", " ".join(page.read_text().split("\n\n")[1].split()) + "\n"), page
+        assert f"]({page.name})" in index, page
+    linked = {name for page in pages for name in re.findall(r"\]\(([\w-]+\.csv)\)", page.read_text())}
+    assert linked == {data.name for data in folder.glob("*.csv")}
 
 
 def layout():
