@@ -137,7 +137,9 @@ def test_the_readme_s_leaderboard_is_that_of_the_documentation():
         (task, controller): cell for controller, *cells in rows for task, cell in zip(tasks, cells, strict=True) if cell
     }
     expected = {}
-    for task, controller, success, failures, regret, *_ in table(ROOT / "docs" / "leaderboard.md", "| task | controller |"):
+    for task, controller, success, failures, regret, *_ in table(
+        ROOT / "docs" / "leaderboard.md", "| task | controller |"
+    ):
         failed, of = map(int, failures.split("/"))
         parts = [] if regret == "–" else [regret.partition(" (")[0].replace("%", " %")]
         parts += [f"{failed} fail"] if failed else []
