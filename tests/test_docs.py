@@ -1,6 +1,8 @@
 """What README and documentation say runs as it stands, as a reader would paste it, page by page."""
 
+import dataclasses
 import json
+import math
 import re
 import shlex
 import subprocess
@@ -9,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from ballbot_gym import BallbotEnv
+from ballbot_gym.tasks import TASKS
 from ballbot_train.executors import Workers
 from ballbot_train.policy import SHIPPED
 
@@ -16,6 +20,12 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where the clients are installed
+SHORTER = {  # a training that a page calls `# minutes` runs with these too
+    "dagger": "--total-iterations 1 --episodes-per-iteration 4 --candidate-episodes 4 --batch-episodes 0 --gradient-steps 5",
+    "ppo": "--rl-iterations 1 --num-envs 64 --num-steps 48 --clone-iterations 1 --critic-warmup-iterations 0",
+    "shac": "--total-iterations 1 --num-envs 8 --horizon 4 --no-compile",
+}
+MEASURED = "--evaluations 1 --test-episodes 2 --validation-episodes 2"
 
 
 def blocks(page, language):
@@ -40,6 +50,9 @@ def test_commands_run(page, typed, monkeypatch):
         command = shlex.split(line, comments=True)
         if not command:
             continue
+        if line.endswith("# minutes"):
+            assert command[:2] == ["ballbot", "train"], line
+            command += shlex.split(f"{SHORTER[command[2]]} {MEASURED}")
         if command[0] == "make":  # what CI runs, this test within it
             assert re.search(rf"^{command[1]}:", makefile, flags=re.MULTILINE), line
             continue
@@ -97,11 +110,57 @@ def table(page, header):
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
 
 
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_the_page_of_a_task_says_what_its_env_has(name):
+    page, env = ROOT / "docs" / "tasks" / f"{name}.md", BallbotEnv(name, physics="rk4")
+    rows = table(page, "| number | quantity |")
+    bounds = {int(number): float(largest) for numbers, *_, largest in rows for number in numbers.split(",")}
+    assert [bounds[i] for i in range(len(bounds))] == pytest.approx(env.observation_space.high.tolist(), rel=1e-3)
+    scales = {int(number): float(row[2]) for row in rows for number in row[0].split(",")}
+    assert tuple(scales[i] for i in range(len(scales))) == env.task.observation_scale
+    assert (env.observation_space.low == -env.observation_space.high).all()
+    shared = table(ROOT / "docs" / "tasks" / "index.md", "| name | meaning |")
+    arguments = {row[0]: row[3] for row in (*table(page, "| name | meaning |"), *shared)}
+    told = {
+        argument: math.radians(float(default[:-1])) if default.endswith("°") else float(default)
+        for argument, default in arguments.items()
+    }
+    assert told == pytest.approx({field.name: field.default for field in dataclasses.fields(env.task)})
+    assert str(env.task.reward_threshold) in page.read_text()
+
+
 def test_the_readme_s_leaderboard_is_that_of_the_documentation():
-    full = table(ROOT / "docs" / "leaderboard.md", "| task | controller |")
-    short = table(ROOT / "README.md", "| task | controller |")
-    assert len(short) > 10
-    assert short == [[*row[:4], row[4].partition(" (")[0]] for row in full]
+    header = "| controller | Stabilize | Turn | Orbit | Weave |"
+    tasks = [task.strip().lower() for task in header.strip("| ").split("|")[1:]]
+    rows = table(ROOT / "README.md", header)
+    short = {
+        (task, controller): cell for controller, *cells in rows for task, cell in zip(tasks, cells, strict=True) if cell
+    }
+    expected = {}
+    for task, controller, success, failures, regret, *_ in table(
+        ROOT / "docs" / "leaderboard.md", "| task | controller |"
+    ):
+        failed, of = map(int, failures.split("/"))
+        parts = [] if regret == "–" else [regret.partition(" (")[0].replace("%", " %")]
+        parts += [f"{failed} fail"] if failed else []
+        misses = round(of * (1 - float(success.rstrip(" %")) / 100)) - failed
+        expected[task, controller] = ", ".join(parts + ([f"{misses} miss"] if misses else []))
+    assert len(expected) > 10
+    assert short == expected
+
+
+def test_every_page_of_experiments_answers_its_question_at_once_and_all_its_data_are_linked():
+    folder = ROOT / "docs" / "experiments"
+    pages = [page for page in folder.glob("*.md") if page.name != "index.md"]
+    index = (folder / "index.md").read_text()
+    for page in pages:
+        title, _, answer, *_ = page.read_text().splitlines()
+        assert title.endswith("?"), page
+        assert answer.startswith("**"), page
+        assert re.search(r"\*\* \*\w+ 20\d\d\*\n", " ".join(page.read_text().split("\n\n")[1].split()) + "\n"), page
+        assert f"]({page.name})" in index, page
+    linked = {name for page in pages for name in re.findall(r"\]\(([\w-]+\.csv)\)", page.read_text())}
+    assert linked == {data.name for data in folder.glob("*.csv")}
 
 
 def layout():
