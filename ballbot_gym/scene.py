@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import State, connect, import_pybullet, load_robot
+from ballbot_gym.simulator import State, connect, import_pybullet, load_robot, load_urdf
 from ballbot_gym.tasks.marker import Marker
 
 CAMERA_YAW = -55.0
@@ -92,11 +92,7 @@ class Scene:
         import pybullet_data
 
         bullet = self._bullet
-        floor = bullet.loadURDF(
-            str(Path(pybullet_data.getDataPath()) / "plane100.urdf"),
-            useFixedBase=True,
-            physicsClientId=self._client,
-        )
+        floor = load_urdf(bullet, self._client, Path(pybullet_data.getDataPath()) / "plane100.urdf")
         bullet.changeVisualShape(floor, -1, rgbaColor=(1, 1, 1, 1), physicsClientId=self._client)
 
     def _add_marker(self, marker: Marker) -> list[int]:
