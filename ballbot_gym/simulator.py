@@ -245,7 +245,7 @@ PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": Bull
 
 def default_physics() -> str:
     """What `physics` is by default: "bullet" where PyBullet is installed; else "rk4", with one warning per process."""
-    if importlib.util.find_spec("pybullet") is not None:
+    if has_pybullet():
         return "bullet"
     if not _noticed:
         _noticed.append(True)
@@ -269,18 +269,21 @@ PHYSICS_NAMES = {"bullet": "PyBullet", "rk4": "the closed-form model"}
 _noticed: list[bool] = []
 _loading = threading.Lock()
 
-_HOW_TO_GET_IT = 'Get it with "pip install pybullet" (wheels exist up to Python 3.11).'
+_HOW_TO_GET_IT = 'Get it with "pip install pybullet", under Python 3.11 or older: newer ones have no wheel.'
 
 
-def import_pybullet() -> ModuleType:
-    """PyBullet, or an ImportError that says what to do."""
+def has_pybullet() -> bool:
+    """Whether PyBullet is installed."""
+    return importlib.util.find_spec("pybullet") is not None
+
+
+def import_pybullet(otherwise: str = 'Or use physics="rk4", which needs only NumPy.') -> ModuleType:
+    """PyBullet, or an ImportError that says how to get it, and what to do otherwise."""
     try:
         with _silenced() if "pybullet" not in sys.modules else nullcontext():  # it prints when it was built
             import pybullet
     except ImportError as error:
-        raise ImportError(
-            f'PyBullet is not installed. {_HOW_TO_GET_IT} Or use physics="rk4", which needs only NumPy.'
-        ) from error
+        raise ImportError(f"PyBullet is not installed. {_HOW_TO_GET_IT} {otherwise}") from error
     if not pybullet.isNumpyEnabled():
         raise ImportError(
             "This PyBullet was built without NumPy. Reinstall its wheel with "
@@ -312,7 +315,12 @@ def _silenced() -> Iterator[None]:
 
 def connect(bullet: ModuleType, mode: int) -> int:
     """A new physics client."""
-    client = bullet.connect(mode)
+    try:
+        client = bullet.connect(mode)
+    except bullet.error as error:
+        raise RuntimeError(
+            'PyBullet opens one window per process; close() the environment that has it, or take render_mode="rgb_array"'
+        ) from error
     if client < 0:
         raise RuntimeError("PyBullet has no free physics client; close() environments that are no longer used")
     return client
