@@ -39,7 +39,7 @@ _Kind = TypeVar("_Kind", bound=type)
 
 
 def fixed(*names: str) -> Callable[[_Kind], _Kind]:
-    """Makes attributes of the decorated class read-only once they are set: more is computed from them, and would not follow."""
+    """Makes attributes of the decorated class read-only once they are set: what is computed from them would not follow."""
 
     def decorate(kind: _Kind) -> _Kind:
         for name in names:

@@ -394,7 +394,7 @@ def _check_loaded(bullet: ModuleType, client: int, robot: int, index: dict[str, 
     ]
     if wrong:
         raise RuntimeError(
-            f"PyBullet took another robot than the one given: {', '.join(wrong)}. It takes no inertias that no body can have, "
+            f"PyBullet took another robot than the one given: {', '.join(wrong)}. It refuses inertias that no body can have, "
             "as axial_inertia of more than twice inertia; and no other thread may set LC_NUMERIC while an environment is made"
         )
 

@@ -113,14 +113,10 @@ def load(task: str | Task, path: str | Path | None = None, robot: str | BallbotP
         if missing:
             raise ValueError(f"it has no array {', '.join(missing)}")
         if str(arrays["task"]) != task.problem():
-            raise CertificateError(
-                f"{path} was computed for {arrays['task']}, not for {task.problem()}; {remedy}"
-            )
+            raise CertificateError(f"{path} was computed for {arrays['task']}, not for {task.problem()}; {remedy}")
         made_for = str(arrays.get("robot", repr(named_robot(PAPER))))
         if made_for != repr(named_robot(robot)):
-            raise CertificateError(
-                f"{path} was computed for {made_for}, not for {named_robot(robot)!r}; {remedy}"
-            )
+            raise CertificateError(f"{path} was computed for {made_for}, not for {named_robot(robot)!r}; {remedy}")
         _check(task, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])
