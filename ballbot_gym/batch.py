@@ -23,7 +23,7 @@ except ImportError as error:
     raise ImportError('batches of environments need torch: pip install "ballbot-gym[train]"') from error
 
 from ballbot_gym import counter_rng, dynamics
-from ballbot_gym.env import LARGEST, limit_names, make_task
+from ballbot_gym.env import LARGEST, fixed_error, limit_names, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
@@ -46,6 +46,10 @@ COMPILE_OPTIONS: dict[str, Any] = {
 
 _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The fields of `BatchStep` that are bools."""
+
+
+_FIXED = ("task", "params", "randomization", "num_envs", "device", "dtype", "limit_names")
+"""Attributes of a batch that cannot be set once it is made: more is computed from them."""
 
 
 class BatchState(NamedTuple):
@@ -257,6 +261,12 @@ class BallbotBatch:
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
         self._run = _compiled(self._compilable) if wanted else self.transition
         self._proven = not wanted
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # not by `env.fixed`, through which torch.compile cannot see
+        if name in _FIXED and name in vars(self):
+            raise fixed_error(self, name)
+        super().__setattr__(name, value)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_run": self.compiled}

@@ -2,8 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeVar
 
 import gymnasium
 import numpy as np
@@ -14,7 +16,7 @@ from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
-from ballbot_gym.scene import CAMERA_YAW, Scene, no_display
+from ballbot_gym.scene import CAMERA_YAW, Scene, check_render_mode, window_trouble
 from ballbot_gym.simulator import (
     PHYSICS,
     BulletContactSimulator,
@@ -31,6 +33,34 @@ LARGEST = 1e6
 """Of any number that `reset` takes."""
 _VIEW = math.radians(-CAMERA_YAW)
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
+
+
+_Kind = TypeVar("_Kind", bound=type)
+
+
+def fixed(*names: str) -> Callable[[_Kind], _Kind]:
+    """Makes attributes of the decorated class read-only once they are set: what is computed from them would not follow."""
+
+    def decorate(kind: _Kind) -> _Kind:
+        for name in names:
+            setter = partial(_set_once, name=name)
+            # read in C, because an env reads some in every step
+            setattr(kind, name, property(attrgetter(f"_{name}"), setter))
+        return kind
+
+    return decorate
+
+
+def _set_once(instance: Any, value: Any, name: str) -> None:
+    if hasattr(instance, f"_{name}"):
+        raise fixed_error(instance, name)
+    setattr(instance, f"_{name}", value)
+
+
+def fixed_error(instance: Any, name: str) -> AttributeError:
+    """What setting an attribute raises that is fixed."""
+    instead = "take a wrapper" if name.endswith("_space") else f"make a new {type(instance).__name__}"
+    return AttributeError(f"{name!r} cannot be set: {instead} instead")
 
 
 class EnvState(NamedTuple):
@@ -69,6 +99,7 @@ class Outcome(NamedTuple):
     """(no) float32 observation without noise, (8,) state after the step and (2,) force, if they are known already."""
 
 
+@fixed("task", "params", "randomization", "physics", "render_mode", "action_space", "observation_space")
 class BallbotEnv(gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
@@ -99,6 +130,8 @@ class BallbotEnv(gymnasium.Env):
     failure, and `violated` is "grip". PyBullet simulates the contact of a rolling ball: it slips or leaves the floor, and
     that by itself is no failure. `grip` is then the force at the end of the step.
 
+    Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
+
     `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
     copy of a Bullet env has a physics client of its own. The window is not copied.
     """
@@ -122,7 +155,8 @@ class BallbotEnv(gymnasium.Env):
             task: a name in `TASKS`, or a Task.
             physics: "bullet", the URDF in PyBullet, or "rk4", the closed-form model; default, "bullet" where PyBullet is
                 installed, else "rk4" with a warning.
-            render_mode: None, "rgb_array" or "human": PyBullet's window, or a page in the browser where there is no display.
+            render_mode: None; "rgb_array", which PyBullet draws; or "human": PyBullet's window, or a page in the browser
+                where none can open.
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
             randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
@@ -133,7 +167,8 @@ class BallbotEnv(gymnasium.Env):
         Raises:
             ValueError: an unknown task, physics or render mode, or a task field out of its range.
             TypeError: a keyword that is no field of the task.
-            ImportError: physics="bullet" without a usable PyBullet.
+            ImportError: physics="bullet" or render_mode="rgb_array" without a usable PyBullet.
+            RuntimeError: render_mode="human" where neither a window nor a page can open.
         """
         self._spec: EnvSpec | None = None
         self._scene: Scene | PageScene | None = None
@@ -143,6 +178,7 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
+        check_render_mode(render_mode)
         self.params = checked_robot(robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
@@ -328,14 +364,8 @@ class BallbotEnv(gymnasium.Env):
     def _make_scene(self) -> "Scene | PageScene":
         """A picture, a window, or a page in the browser where no window can open."""
         human = self.render_mode == "human"
-        if human and no_display():
-            try:
-                return PageScene(self.params, self.task.control_dt)
-            except ImportError as error:
-                raise RuntimeError(
-                    f'render_mode="human" opens a window, and DISPLAY is not set; it shows a page instead where viser is '
-                    f'installed: {error}. "rgb_array" needs neither'
-                ) from error
+        if human and (reason := window_trouble()):
+            return PageScene(self.params, self.task.control_dt, reason)
         return Scene(self.params, human=human)
 
     def _check_open(self) -> None:

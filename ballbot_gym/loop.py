@@ -13,7 +13,7 @@ import numpy as np
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BatchState, BatchStep, check_num_envs, seeds_of
-from ballbot_gym.env import BallbotEnv, Outcome, limit_names
+from ballbot_gym.env import BallbotEnv, Outcome, fixed, limit_names
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import DisturbanceState, Randomization
 from ballbot_gym.simulator import State
@@ -26,6 +26,7 @@ _NOMINAL = (1.0, 1.0, 1.0, 1.0, 1.0, 0.0)
 """What `Randomization.draw` draws where neither robot nor actuator varies."""
 
 
+@fixed("task", "params", "randomization", "num_envs", "dtype")
 class BallbotLoop:
     """B ballbots that do one task, with `state`, `initial_state`, `step` and `robot` as of `BallbotBatch`.
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from ballbot_gym import codegen, machine_code
 from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_finite, check_num_envs, seeds_of
+from ballbot_gym.env import fixed
 from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -46,6 +47,7 @@ class _Code(NamedTuple):
     observe: Callable[..., None]
 
 
+@fixed("task", "params", "randomization", "num_envs", "dtype")
 class BallbotNative:
     """B ballbots that do one task, with `state`, `initial_state`, `step` and `robot` as of `BallbotBatch`.
 

@@ -5,15 +5,18 @@ It has its own physics client, so that drawing never changes a trajectory.
 
 import math
 import os
+import subprocess
 import sys
 import weakref
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import State, connect, import_pybullet, load_robot
+from ballbot_gym.simulator import State, connect, has_pybullet, import_pybullet, load_robot, load_urdf
 from ballbot_gym.tasks.marker import Marker
+from ballbot_gym.viewer import import_viser
 
 CAMERA_YAW = -55.0
 """Direction in which pictures look, degrees from the y axis, positive to the left: from behind a robot that moves along x."""
@@ -21,9 +24,56 @@ CAMERA_YAW = -55.0
 _CAMERA = (4.0, CAMERA_YAW, -22.0)  # distance, m, yaw and pitch, deg
 
 
-def no_display() -> bool:
-    """Whether no window can open, because Linux has no X here."""
-    return sys.platform.startswith("linux") and not os.environ.get("DISPLAY")
+_NO_PICTURES = (
+    'render_mode="rgb_array" draws with it. Without it, render_mode="human" shows the robot on a page in the browser, '
+    "where viser is installed."
+)
+_OPEN_WINDOW = "import os, pybullet; pybullet.connect(pybullet.GUI); print('a window', flush=True); os._exit(0)"
+_OPENING_SECONDS = 60.0
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Raises an error that says what to do where a render mode cannot draw on this machine.
+
+    Raises:
+        ImportError: "rgb_array" without PyBullet.
+        RuntimeError: "human" where neither a window nor a page can open.
+    """
+    if render_mode == "rgb_array":
+        import_pybullet(_NO_PICTURES)
+    elif render_mode == "human" and (trouble := window_trouble()):
+        try:
+            import_viser()
+        except ImportError as error:
+            modest = 'render_mode="rgb_array"' if has_pybullet() else "an environment without a render mode"
+            raise RuntimeError(
+                f'render_mode="human" opens a window, and {trouble}; it shows a page instead where viser is installed: '
+                f"{error}. Or take {modest}, which needs neither"
+            ) from error
+
+
+def window_trouble() -> str:
+    """Why no window can open; "" where one can."""
+    if not has_pybullet():
+        return "PyBullet is not installed"
+    if not sys.platform.startswith("linux"):
+        return ""
+    return _trouble_of(os.environ.get("DISPLAY", ""))
+
+
+@cache
+def _trouble_of(display: str) -> str:
+    """The same on an X server. PyBullet ends its process where it cannot open a window, so another one tries it first."""
+    if not display:
+        return "DISPLAY is not set"
+    command = [sys.executable, "-c", _OPEN_WINDOW]
+    try:
+        tried = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, timeout=_OPENING_SECONDS)
+    except (OSError, subprocess.TimeoutExpired):
+        opened = False
+    else:
+        opened = b"a window" in tried.stdout
+    return "" if opened else f"PyBullet can open none on DISPLAY={display}"
 
 
 class Scene:
@@ -37,11 +87,11 @@ class Scene:
 
         Raises:
             ImportError: PyBullet is missing or was built without NumPy.
-            RuntimeError: human without a display.
+            RuntimeError: human where no window can open.
         """
-        bullet = import_pybullet()
-        if human and no_display():
-            raise RuntimeError('render_mode="human" needs a display, and DISPLAY is not set; use "rgb_array"')
+        bullet = import_pybullet(_NO_PICTURES)
+        if human and (trouble := window_trouble()):
+            raise RuntimeError(f"no window can open: {trouble}")
         self._client = connect(bullet, bullet.GUI if human else bullet.DIRECT)
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
         self._bullet, self._human, self._size = bullet, human, (width, height)
@@ -92,11 +142,7 @@ class Scene:
         import pybullet_data
 
         bullet = self._bullet
-        floor = bullet.loadURDF(
-            str(Path(pybullet_data.getDataPath()) / "plane100.urdf"),
-            useFixedBase=True,
-            physicsClientId=self._client,
-        )
+        floor = load_urdf(bullet, self._client, Path(pybullet_data.getDataPath()) / "plane100.urdf")
         bullet.changeVisualShape(floor, -1, rgbaColor=(1, 1, 1, 1), physicsClientId=self._client)
 
     def _add_marker(self, marker: Marker) -> list[int]:

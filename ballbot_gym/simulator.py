@@ -5,10 +5,12 @@
 
 import ctypes
 import importlib.util
+import locale
 import math
 import os
 import sys
 import tempfile
+import threading
 import warnings
 import weakref
 from collections.abc import Iterator
@@ -39,7 +41,7 @@ class Simulator(Protocol):
         """Puts the robot into state x."""
 
     def set_params(self, params: BallbotParams) -> None:
-        """Replaces the robot; call `reset` after it."""
+        """Replaces the robot by one whose ball rolls as well, or as little; call `reset` after it."""
 
     def step(self, u: tuple[float, float]) -> State:
         """Holds force u, N, for one control step and returns the state after it."""
@@ -70,6 +72,7 @@ class Rk4Simulator:
         self._x = x
 
     def set_params(self, params: BallbotParams) -> None:
+        _check_rolling(params, self._params.rolls)
         self._params = params
         if self._motion is not None:
             self._motion.set_params(params)
@@ -105,17 +108,17 @@ class BulletSimulator:
 
         Raises:
             ImportError: PyBullet is missing or was built without NumPy.
-            RuntimeError: PyBullet has no client left.
+            RuntimeError: PyBullet has no client left, or holds another robot than that of params.
         """
         substeps = _whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
         bullet = import_pybullet()
         self._client = connect(bullet, bullet.DIRECT)
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
         self._robot, self._joints = load_robot(bullet, self._client, params)
+        self._params = params
         # Substeps run in C++ with the force held. Results are bit-identical to single steps, a third faster.
         bullet.setPhysicsEngineParameter(fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client)
-        bullet.setGravity(0, 0, -params.gravity, physicsClientId=self._client)
-        self._bullet, self._com_height = bullet, params.com_height
+        self._bullet = bullet
 
     def reset(self, x: State) -> None:
         # Joints are reset in place: reloading the URDF takes a hundred times longer.
@@ -123,13 +126,11 @@ class BulletSimulator:
             self._bullet.resetJointState(self._robot, joint, x[i], x[i + 4], self._client)
 
     def set_params(self, params: BallbotParams) -> None:
-        bullet, client = self._bullet, self._client
-        if params.com_height != self._com_height:
-            # The URDF is loaded again, because changeDynamics cannot move a link's centre of mass.
-            bullet.removeBody(self._robot, physicsClientId=client)
-            self._robot, self._joints = load_robot(bullet, client, params)
-            self._com_height = params.com_height
+        bullet, client, old = self._bullet, self._client, self._params
+        if (params.com_height, params.gravity, params.rolls) != (old.com_height, old.gravity, old.rolls):
+            self._reload(params)  # changeDynamics cannot move a link's centre of mass
             return
+        self._params = params
         ball, body = self._joints[1], self._joints[3]  # a link has the index of the joint that carries it
         inertia = (params.inertia, params.inertia, params.axial_inertia)
         bullet.changeDynamics(self._robot, ball, mass=params.ball_mass, physicsClientId=client)
@@ -151,6 +152,12 @@ class BulletSimulator:
     def close(self) -> None:
         self._release()
 
+    def _reload(self, params: BallbotParams) -> None:
+        _check_rolling(params, self._params.rolls)
+        self._bullet.removeBody(self._robot, physicsClientId=self._client)
+        self._robot, self._joints = load_robot(self._bullet, self._client, params)
+        self._params = params
+
 
 class BulletContactSimulator(BulletSimulator):
     """The URDF of a robot whose ball rolls in PyBullet, on a floor: the ball may slip, and leave the floor.
@@ -162,7 +169,6 @@ class BulletContactSimulator(BulletSimulator):
         """Args: as for `BulletSimulator`. It is of first order too: 5 mm after 0.5 s at 1 ms."""
         super().__init__(params, control_dt, physics_dt)
         bullet, client = self._bullet, self._client
-        self._params = params
         self._substeps = _whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
         self._floor = bullet.createMultiBody(
             0, bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client), physicsClientId=client
@@ -180,10 +186,7 @@ class BulletContactSimulator(BulletSimulator):
         bullet.resetJointStateMultiDof(self._robot, self._ball, (0, 0, 0, 1), spin, physicsClientId=client)
 
     def set_params(self, params: BallbotParams) -> None:
-        # The URDF is loaded again, so that nothing of the contact's settings is lost; see `_set_surface`.
-        self._bullet.removeBody(self._robot, physicsClientId=self._client)
-        self._robot, self._joints = load_robot(self._bullet, self._client, params)
-        self._params = params
+        self._reload(params)  # in any case, so that nothing of the contact's settings is lost; see `_set_surface`
         self._set_ball()
 
     def step(self, u: tuple[float, float]) -> State:
@@ -242,7 +245,7 @@ PHYSICS: dict[str, type[BulletSimulator] | type[Rk4Simulator]] = {"bullet": Bull
 
 def default_physics() -> str:
     """What `physics` is by default: "bullet" where PyBullet is installed; else "rk4", with one warning per process."""
-    if importlib.util.find_spec("pybullet") is not None:
+    if has_pybullet():
         return "bullet"
     if not _noticed:
         _noticed.append(True)
@@ -264,19 +267,23 @@ PHYSICS_NAMES = {"bullet": "PyBullet", "rk4": "the closed-form model"}
 """What people call each physics."""
 
 _noticed: list[bool] = []
+_loading = threading.Lock()
 
-_HOW_TO_GET_IT = 'Get it with "pip install pybullet" (wheels exist up to Python 3.11).'
+_HOW_TO_GET_IT = 'Get it with "pip install pybullet", under Python 3.11 or older: newer ones have no wheel.'
 
 
-def import_pybullet() -> ModuleType:
-    """PyBullet, or an ImportError that says what to do."""
+def has_pybullet() -> bool:
+    """Whether PyBullet is installed."""
+    return importlib.util.find_spec("pybullet") is not None
+
+
+def import_pybullet(otherwise: str = 'Or use physics="rk4", which needs only NumPy.') -> ModuleType:
+    """PyBullet, or an ImportError that says how to get it, and what to do otherwise."""
     try:
         with _silenced() if "pybullet" not in sys.modules else nullcontext():  # it prints when it was built
             import pybullet
     except ImportError as error:
-        raise ImportError(
-            f'PyBullet is not installed. {_HOW_TO_GET_IT} Or use physics="rk4", which needs only NumPy.'
-        ) from error
+        raise ImportError(f"PyBullet is not installed. {_HOW_TO_GET_IT} {otherwise}") from error
     if not pybullet.isNumpyEnabled():
         raise ImportError(
             "This PyBullet was built without NumPy. Reinstall its wheel with "
@@ -308,25 +315,31 @@ def _silenced() -> Iterator[None]:
 
 def connect(bullet: ModuleType, mode: int) -> int:
     """A new physics client."""
-    client = bullet.connect(mode)
+    try:
+        client = bullet.connect(mode)
+    except bullet.error as error:
+        raise RuntimeError(
+            'PyBullet opens one window per process; close() the environment that has it, or take render_mode="rgb_array"'
+        ) from error
     if client < 0:
         raise RuntimeError("PyBullet has no free physics client; close() environments that are no longer used")
     return client
 
 
 def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[int, tuple[int, ...]]:
-    """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order."""
+    """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order.
+
+    Raises:
+        RuntimeError: Bullet holds another robot.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "ballbot.urdf"
-        path.write_text(params.to_urdf())
-        robot = bullet.loadURDF(
-            str(path),
-            useFixedBase=True,
-            # Without this flag Bullet recomputes inertias from collision shapes.
-            flags=bullet.URDF_USE_INERTIA_FROM_FILE,
-            physicsClientId=client,
-        )
+        path.write_text(params.to_urdf(), encoding="utf-8")
+        # Without this flag Bullet recomputes inertias from collision shapes.
+        robot = load_urdf(bullet, client, path, bullet.URDF_USE_INERTIA_FROM_FILE)
+    bullet.setGravity(0, 0, -params.gravity, physicsClientId=client)
     index = joint_indices(bullet, client, robot)
+    _check_loaded(bullet, client, robot, index, params)
     joints = tuple(index[name] for name in _JOINTS)
     for joint in range(-1, len(index)):
         bullet.changeDynamics(
@@ -343,6 +356,47 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
         robot, joints, bullet.VELOCITY_CONTROL, forces=[0] * len(joints), physicsClientId=client
     )
     return robot, joints
+
+
+def load_urdf(bullet: ModuleType, client: int, path: Path, flags: int = 0) -> int:
+    """Loads a URDF whose base is fixed; returns its body.
+
+    Bullet reads numbers by C's locale: with decimal commas it would take "0.5" for 0 without a word. The locale is that of
+    the whole process, because the thread of a window may be the one that reads.
+    """
+    with _loading:
+        found = locale.setlocale(locale.LC_NUMERIC)
+        locale.setlocale(locale.LC_NUMERIC, "C")
+        try:
+            return bullet.loadURDF(str(path), useFixedBase=True, flags=flags, physicsClientId=client)
+        finally:
+            locale.setlocale(locale.LC_NUMERIC, found)
+
+
+def _check_loaded(bullet: ModuleType, client: int, robot: int, index: dict[str, int], params: BallbotParams) -> None:
+    """Raises a RuntimeError if Bullet holds another robot than that of params."""
+    ball_mass, _, ball_inertias, *_ = bullet.getDynamicsInfo(robot, index["roll" if params.rolls else "y"], client)
+    body_mass, _, inertias, centre, *_ = bullet.getDynamicsInfo(robot, index["theta"], client)
+    held = {
+        "ball_mass": ball_mass,
+        "ball_radius": bullet.getJointInfo(robot, index["x"], client)[14][2],  # where the chain begins
+        "body_mass": body_mass,
+        "com_height": centre[2],
+        "inertia": inertias[0],
+        "axial_inertia": inertias[2],
+    }
+    if params.rolls:
+        held["ball_inertia"] = ball_inertias[0]
+    wrong = [
+        f"{name} {value:g} in place of {getattr(params, name):g}"
+        for name, value in held.items()
+        if not math.isclose(value, getattr(params, name), rel_tol=1e-9)
+    ]
+    if wrong:
+        raise RuntimeError(
+            f"PyBullet took another robot than the one given: {', '.join(wrong)}. It refuses inertias that no body can have, "
+            "as axial_inertia of more than twice inertia; and no other thread may set LC_NUMERIC while an environment is made"
+        )
 
 
 def joint_indices(bullet: ModuleType, client: int, robot: int) -> dict[str, int]:
@@ -366,6 +420,11 @@ def _set_surface(bullet: ModuleType, client: int, body: int, link: int, friction
     found = bullet.getDynamicsInfo(body, link, physicsClientId=client)[1]
     if not math.isclose(found, friction, rel_tol=1e-6):
         raise RuntimeError(f"PyBullet took {found} for a friction of {friction}")
+
+
+def _check_rolling(params: BallbotParams, rolls: bool) -> None:
+    if params.rolls != rolls:
+        raise ValueError(f"this simulator is of a ball with rolls={rolls}; make another with make_simulator()")
 
 
 def _whole_substeps(control_dt: float, physics_dt: float) -> int:

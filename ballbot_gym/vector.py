@@ -18,6 +18,7 @@ from ballbot_gym.env import (
     LARGEST,
     REWARD_PARTS,
     check_constant_names,
+    fixed,
     limit_names,
     make_task,
     observation_space,
@@ -26,7 +27,7 @@ from ballbot_gym.env import (
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
-from ballbot_gym.scene import Scene
+from ballbot_gym.scene import Scene, check_render_mode
 from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.spares import fill, sparse_objects
 from ballbot_gym.tasks import Task
@@ -86,6 +87,8 @@ class VectorState(NamedTuple):
     """(B,) bool: the episode has ended, and the next one has not begun."""
 
 
+@fixed("task", "params", "randomization", "batch", "num_envs", "render_mode", "autoreset_mode")
+@fixed("action_space", "observation_space", "single_action_space", "single_observation_space")
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.
 
@@ -146,6 +149,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'rgb_array'")
+        check_render_mode(render_mode)
         if engine not in _ENGINES:
             raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
         self._spec: EnvSpec | None = None

@@ -278,12 +278,13 @@ class Viewer:
 class PageScene:
     """Shows an environment in a page instead of a window, in real time. It has the methods of `Scene`."""
 
-    def __init__(self, params: BallbotParams, frame_seconds: float):
+    def __init__(self, params: BallbotParams, frame_seconds: float, reason: str):
         """Starts the page and says its address on stderr.
 
         Args:
             params: the robot.
             frame_seconds: s, between two drawings.
+            reason: why there is no window.
 
         Raises:
             ImportError: viser is missing.
@@ -293,7 +294,7 @@ class PageScene:
         self._markers: tuple[Marker, ...] = ()
         self._trace: list[np.ndarray] = []
         self._next = 0.0
-        sys.stderr.write(f"no display: the robot is shown at {self._viewer.address}\n")
+        sys.stderr.write(f"no window, because {reason}: the robot is shown at {self._viewer.address}\n")
 
     @property
     def address(self) -> str:

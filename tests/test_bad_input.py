@@ -350,7 +350,7 @@ def evaluation_set(**changes):
 SETS = [
     (lambda f: certified.load("dance"), "unknown task 'dance'; known"),
     (lambda f: certified.load(None), "unknown task None"),
-    (lambda f: certified.load("turn", f / "none.npz"), 'compute it with "ballbot certify"'),
+    (lambda f: certified.load("turn", f / "none.npz"), 'compute it with "ballbot certify --tasks turn"'),
     (lambda f: certified.load(make_task("turn", duration=4.0)), "was computed for Turn("),
     (lambda f: certified.load("stabilize", certified.path_of(make_task("turn"))), "was computed for Turn("),
     (lambda f: certified.load("turn", f), "is no evaluation set"),

@@ -1,5 +1,6 @@
 import json
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.stabilize import Stabilize
 
 SHIPPED = [(robot, name) for robot in (PAPER, "rolling") for name in TASKS]
 """Robots and tasks whose sets come with the package."""
@@ -171,6 +173,32 @@ def test_set_of_other_fields_is_refused(task, robot):
 def test_missing_set_says_how_to_make_one(task, tmp_path):
     with pytest.raises(certified.CertificateError, match=r"no evaluation set.*ballbot certify"):
         certified.load(task, tmp_path / "none.npz")
+
+
+@dataclass(frozen=True)
+class OneOfMine(Stabilize):
+    id = "BallbotMine-v0"
+
+
+@pytest.mark.parametrize(
+    ("task", "robot", "advice"),
+    [
+        (Stabilize(), "kugle", '"ballbot certify --robot kugle --tasks stabilize --install"'),
+        (OneOfMine(), PAPER, "add OneOfMine, as docs/extending.md says"),
+        (Stabilize(duration=4.0), PAPER, "default fields alone; ballbot_baselines.find_optimum"),
+    ],
+    ids=["no set", "a task of one's own", "other fields"],
+)
+def test_what_is_advised_where_there_is_no_set_makes_one(task, robot, advice):
+    task = make_task("stabilize", robot) if robot != PAPER else task
+    with pytest.raises(certified.CertificateError, match=re.escape(advice)):
+        certified.load(task, robot=robot)
+
+
+def test_a_task_of_ones_own_is_advised_how_to_get_a_set(monkeypatch):
+    monkeypatch.setitem(TASKS, "mine", OneOfMine)
+    with pytest.raises(certified.CertificateError, match='"ballbot certify --tasks mine --install"'):
+        certified.load("mine")
 
 
 def test_all_sets_together_are_under_5_megabytes():

@@ -42,6 +42,18 @@ def test_python_runs(page, tmp_path, monkeypatch):
         exec(compile(block, str(page), "exec", dont_inherit=True), namespace)
 
 
+def test_the_task_that_is_added_can_be_certified(interpreted):
+    from ballbot_baselines.certification import episode
+    from ballbot_baselines.optimum import find_optimum
+
+    names = {"__name__": "sprint"}
+    code = blocks(next(page for page in PAGES if page.name == "extending.md"), "python")[0]
+    exec(code.partition("env = ")[0], names)
+    task, robot = names["Sprint"](), names["default_params"]()
+    # from a guess that stops at the line this one had no optimum
+    assert find_optimum(task, robot, *episode(task, robot, 14)).is_optimal
+
+
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers

@@ -1,7 +1,9 @@
+import copy
 import hashlib
 import itertools
 import json
 import math
+import os
 import subprocess
 import sys
 import warnings
@@ -478,9 +480,37 @@ def test_without_a_display_and_without_viser_the_window_is_refused(monkeypatch, 
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setitem(sys.modules, "viser", None)
-    env = make_env(render_mode="human")
-    with pytest.raises(RuntimeError, match=r"DISPLAY is not set.*ballbot-gym\[play\]"):
-        env.reset(seed=0)
+    with pytest.raises(RuntimeError, match=r'DISPLAY is not set.*ballbot-gym\[play\].*take render_mode="rgb_array"'):
+        make_env(render_mode="human")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X needs a DISPLAY")
+def test_a_display_that_does_not_answer_does_not_end_the_process():
+    code = (
+        "import sys\nsys.modules['viser'] = None\nfrom ballbot_gym import BallbotEnv\n"
+        "try:\n    BallbotEnv(render_mode='human').reset()\n"
+        "except RuntimeError as error:\n    print('refused', error)\n"
+    )
+    environment = {**os.environ, "DISPLAY": ":9876"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "refused" in done.stdout
+    assert "PyBullet can open none on DISPLAY=:9876" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "name", ["task", "params", "randomization", "physics", "render_mode", "action_space", "observation_space"]
+)
+def test_what_an_env_is_made_of_cannot_be_set(name, make_env):
+    env = make_env(physics="rk4")
+    env.reset(seed=0)
+    before = getattr(env, name)
+    for set_it in (lambda: setattr(env, name, before), lambda: env.set_wrapper_attr(name, before)):
+        with pytest.raises(
+            AttributeError, match=f"'{name}' cannot be set: (make a new BallbotEnv|take a wrapper) instead"
+        ):
+            set_it()
+    assert getattr(copy.deepcopy(env), name) == before
 
 
 def test_keys_push_in_the_directions_of_the_picture(make_env):

@@ -1,5 +1,7 @@
 import gc
 import json
+import locale
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,8 +11,11 @@ import pybullet
 import pytest
 
 from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import ROBOTS, named_robot
 from ballbot_gym.scene import Scene
-from ballbot_gym.simulator import PHYSICS, BulletSimulator, Rk4Simulator, import_pybullet
+from ballbot_gym.simulator import PHYSICS, BulletSimulator, Rk4Simulator, import_pybullet, make_simulator
+from ballbot_gym.vector import BallbotVectorEnv
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
 FORCE = (60.0, -40.0)
@@ -39,6 +44,85 @@ def test_bullet_converges_to_the_closed_form_at_first_order(params):
     assert errors[0] == pytest.approx(2.0e-2, rel=0.05)
     assert 1.7 < errors[0] / errors[1] < 2.3
     assert 1.7 < errors[1] / errors[2] < 2.3
+
+
+COMMAS = """\
+LC_CTYPE
+copy "POSIX"
+END LC_CTYPE
+LC_NUMERIC
+decimal_point ","
+thousands_sep "."
+grouping 3;3
+END LC_NUMERIC
+"""
+"""The source of a locale, because few containers have one with decimal commas."""
+
+
+@pytest.fixture
+def decimal_commas(tmp_path, monkeypatch):
+    """A call after which C's decimals have commas."""
+    if shutil.which("localedef") is None:
+        pytest.skip("no localedef makes a locale here")
+    (tmp_path / "source").write_text(COMMAS)
+    # it leaves out, with a warning and exit status 1, what the source does not have
+    subprocess.run(["localedef", "-c", "-i", tmp_path / "source", tmp_path / "commas"], capture_output=True)
+    monkeypatch.setenv("LOCPATH", str(tmp_path))
+    found = locale.setlocale(locale.LC_NUMERIC)
+    yield lambda: locale.setlocale(locale.LC_NUMERIC, "commas")
+    locale.setlocale(locale.LC_NUMERIC, found)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_robots_move_the_same_bit_for_bit_where_decimals_have_commas(name, decimal_commas):
+    robot, varied = named_robot(name), replace(named_robot(name), com_height=0.55)
+    ends = []
+    for changes in (lambda: None, decimal_commas):
+        changes()
+        simulator = make_simulator("bullet", robot, 0.02)
+        for params in (robot, varied):  # the second one loads a URDF again
+            simulator.set_params(params)
+            simulator.reset(GENTLE)
+            ends.append([simulator.step((5.0, -3.0)) for _ in range(5)])
+        simulator.close()
+    assert ends[:2] == ends[2:]
+    assert locale.localeconv()["decimal_point"] == ","  # as it was
+
+
+def test_pictures_are_the_same_where_decimals_have_commas(params, decimal_commas):
+    pictures = []
+    for changes in (lambda: None, decimal_commas):
+        changes()
+        scene = Scene(params, width=80, height=60)
+        pictures.append(scene.draw(GENTLE))
+        scene.close()
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_another_robot_than_the_one_given_is_refused(params, monkeypatch):
+    with pytest.raises(RuntimeError, match=r"inertia 0 in place of 1\.2875, axial_inertia 0 in place of 3"):
+        BulletSimulator(replace(params, axial_inertia=3.0), 0.02)  # no body has it, and Bullet makes it 0
+    heavy = replace(params, body_mass=20.0).to_urdf()
+    monkeypatch.setattr(BallbotParams, "to_urdf", lambda self: heavy)
+    with pytest.raises(RuntimeError, match="body_mass 20 in place of 15"):
+        BulletSimulator(params, 0.02)
+
+
+@pytest.mark.parametrize("change", [{"gravity": 3.7}, {"body_mass": 9.0}, {"com_height": 0.4, "gravity": 3.7}], ids=str)
+@pytest.mark.parametrize("name", ["paper", "rolling"])
+def test_a_robot_that_is_replaced_moves_as_one_made_anew(name, change, physics):
+    other = replace(named_robot(name), **change)
+    simulators = [make_simulator(physics, robot, 0.02) for robot in (named_robot(name), other)]
+    simulators[0].set_params(other)
+    ends = []
+    for simulator in simulators:
+        simulator.reset(GENTLE)
+        ends.append([simulator.step((5.0, -3.0)) for _ in range(5)])
+    assert ends[0] == ends[1]
+    with pytest.raises(ValueError, match="rolls"):
+        simulators[0].set_params(named_robot("rolling" if name == "paper" else "paper"))
+    for simulator in simulators:
+        simulator.close()
 
 
 def test_bullet_conserves_energy_to_first_order(params):
@@ -141,6 +225,17 @@ def test_missing_pybullet_names_the_remedy(monkeypatch, make_env):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(ImportError, match=r'pip install pybullet.*physics="rk4"'):
         make_env(physics="bullet")
+
+
+def test_without_pybullet_pictures_are_refused_at_once_and_the_advice_works(monkeypatch, make_env, capsys):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    for make in (make_env, BallbotVectorEnv):
+        with pytest.raises(ImportError, match=r'pip install pybullet", under Python 3\.11.*render_mode="human" shows'):
+            make(task="turn", render_mode="rgb_array", physics="rk4")
+    env = make_env(physics="rk4", render_mode="human")
+    env.reset(seed=0)
+    env.step([0.0, 0.0])
+    assert "no window, because PyBullet is not installed: the robot is shown at http://" in capsys.readouterr().err
 
 
 def test_rk4_needs_no_pybullet(monkeypatch, make_env):

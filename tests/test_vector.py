@@ -404,6 +404,17 @@ def test_attributes_are_given_per_env(make_vec):
         vec.set_attr("task", None)
 
 
+def test_what_envs_are_made_of_cannot_be_set(make_vec):
+    vec = make_vec(3)
+    of_vec = ("batch", "render_mode", "autoreset_mode", "action_space", "single_observation_space")
+    for face, names in ((vec, of_vec), (vec.batch, ("dtype",))):
+        for name in ("task", "params", "randomization", "num_envs", *names):
+            with pytest.raises(AttributeError, match=f"'{name}' cannot be set"):
+                setattr(face, name, getattr(face, name))
+    with pytest.raises(AttributeError, match="'params' cannot be set"):
+        gymnasium.make_vec("BallbotTurn-v0", 2, "sync", physics="rk4").set_attr("params", vec.params)
+
+
 def test_every_env_is_drawn(make_vec):
     vec = make_vec(2, "weave", render_mode="rgb_array")
     vec.reset(seed=0)

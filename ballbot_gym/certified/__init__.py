@@ -14,7 +14,7 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_name
-from ballbot_gym.tasks import Task
+from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.trajectory import Trajectory
 
 EPISODES = 200
@@ -103,24 +103,20 @@ def load(task: str | Task, path: str | Path | None = None, robot: str | BallbotP
     """
     robot = robot if isinstance(robot, str) else robot_name(robot)
     task = make_task(task, robot)
+    remedy = _remedy(task, robot, install=path is None)
     path = path_of(task, robot) if path is None else Path(path)
-    again = '"ballbot certify"' if robot == PAPER else f'"ballbot certify --robot {robot}"'
     if not path.exists():
-        raise CertificateError(f"{path}: no evaluation set of {task.id}; compute it with {again}")
+        raise CertificateError(f"{path}: no evaluation set of {task.id}; {remedy}")
     try:
         arrays = files.read_npz(path)
         missing = [name for name in ("task", "lengths", "x", "u", *_PER_EPISODE) if name not in arrays]
         if missing:
             raise ValueError(f"it has no array {', '.join(missing)}")
         if str(arrays["task"]) != task.problem():
-            raise CertificateError(
-                f"{path} was computed for {arrays['task']}, not for {task.problem()}; compute another with {again}"
-            )
+            raise CertificateError(f"{path} was computed for {arrays['task']}, not for {task.problem()}; {remedy}")
         made_for = str(arrays.get("robot", repr(named_robot(PAPER))))
         if made_for != repr(named_robot(robot)):
-            raise CertificateError(
-                f"{path} was computed for {made_for}, not for {named_robot(robot)!r}; compute another with {again}"
-            )
+            raise CertificateError(f"{path} was computed for {made_for}, not for {named_robot(robot)!r}; {remedy}")
         _check(task, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])
@@ -130,8 +126,19 @@ def load(task: str | Task, path: str | Path | None = None, robot: str | BallbotP
     except CertificateError:
         raise
     except ValueError as error:
-        raise CertificateError(f"{path} is no evaluation set: {error}; compute it with {again}") from error
+        raise CertificateError(f"{path} is no evaluation set: {error}; {remedy}") from error
     return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
+
+
+def _remedy(task: Task, robot: str, install: bool) -> str:
+    """What makes the evaluation set of a task and a robot, in the package where it is to be installed."""
+    name = next((name for name, kind in TASKS.items() if kind is type(task)), None)
+    if name is None:
+        return f"there are sets of the tasks in TASKS alone: add {type(task).__name__}, as docs/extending.md says"
+    if task.problem() != make_task(name, robot).problem():
+        return "there are sets of a task's default fields alone; ballbot_baselines.find_optimum finds any episode's optimum"
+    options = "" if robot == PAPER else f"--robot {robot} "
+    return f'compute it with "ballbot certify {options}--tasks {name}{" --install" * install}"'
 
 
 def _check(task: Task, arrays: Mapping[str, np.ndarray]) -> None:
