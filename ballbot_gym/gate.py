@@ -13,7 +13,6 @@ import secrets
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
-from http.cookies import CookieError, SimpleCookie
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qs, urlsplit
 
@@ -23,7 +22,7 @@ _COOKIE = "ballbot"
 _MOST_CONNECTIONS = 50
 _LARGEST_MESSAGE = 2**16  # bytes
 _RATE, _BURST = 200.0, 200.0  # messages of one browser per second, and how many may come at once
-_LARGEST_NUMBER = 1e9  # in a control; viser's messages hold no integers of more than 64 bits
+_LARGEST_NUMBER = 1e9  # in a control without bounds; viser can send no integers of more than 64 bits
 _STARTING = threading.Lock()
 
 _Text = Annotated[str, msgspec.Meta(max_length=1000)]
@@ -32,7 +31,7 @@ _Vector = tuple[float, float, float]
 
 
 class _Message(msgspec.Struct, tag_field="type"):
-    """What viser's page sends. Its own scene's names of fields and types are kept."""
+    """What viser's page sends, with the names of viser. Fields that viser checks itself are left out."""
 
 
 class _Camera(_Message, tag="ViewerCameraMessage"):
@@ -40,11 +39,6 @@ class _Camera(_Message, tag="ViewerCameraMessage"):
     position: _Vector
     look_at: _Vector
     up_direction: _Vector
-    fov: float
-    near: float
-    far: float
-    image_height: float
-    image_width: float
 
 
 class _Drag(_Message, tag="SceneNodeDragMessage"):
@@ -58,7 +52,6 @@ class _Drag(_Message, tag="SceneNodeDragMessage"):
 
 class _Hold(_Message, tag="GuiButtonHoldMessage"):
     uuid: _Text
-    frequency: float
 
 
 class _Command(_Message, tag="CommandTriggerMessage"):
@@ -78,7 +71,7 @@ _DECODER = msgspec.msgpack.Decoder(_Camera | _Drag | _Hold | _Command | _Update)
 
 
 class Gate:
-    """Decides which connections a page answers. One that listens on more than this machine asks for its `token`."""
+    """Decides which requests a page answers. One that listens on more than this machine asks for its `token`."""
 
     def __init__(self, host: str):
         """For a server that is bound to the address `host`."""
@@ -86,17 +79,21 @@ class Gate:
 
     def refusal(self, path: str, headers: Any) -> tuple[int, str, dict[str, str]] | None:
         """How a request that may not pass is answered, by status, text and headers; None for one that may pass."""
-        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or not (self.token or _is_local(_split("//" + hosts[0]).hostname)):
+        hosts, cookies = headers.get_all("Host"), "; ".join(headers.get_all("Cookie")).split("; ")
+        try:
+            name = urlsplit("//" + "".join(hosts)).hostname
+            origins = [urlsplit(origin).netloc for origin in headers.get_all("Origin")]
+            given = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        except ValueError:  # brackets without an address of version 6
+            return 400, "not an address", {}
+        if len(hosts) != 1 or not (self.token or _is_local(name)):
             return 403, "open the address that was printed: the page has no other name", {}
-        if any(_split(origin).netloc != hosts[0] for origin in origins):
+        if any(origin != hosts[0] for origin in origins):
             return 403, "another page may not connect", {}
-        if not self.token:
-            return None
-        if self._is_token(parse_qs(_split(path).query).get("token", [""])[0]):
+        if self.token and self._is_token(given):
             cookie = f"{_COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Strict"
             return 303, "", {"Location": "/", "Set-Cookie": cookie}
-        if not self._is_token(_cookie("; ".join(headers.get_all("Cookie")))):
+        if self.token and not any(self._is_token(cookie.removeprefix(f"{_COOKIE}=")) for cookie in cookies):
             return 401, "open the address that was printed, with its token", {}
         return None
 
@@ -119,14 +116,14 @@ class Visitor:
         self._next = max(self._next, now - _BURST / _RATE) + 1 / _RATE
         await asyncio.sleep(max(0.0, self._next - now))
 
-    def may_send(self, raw: bytes | str) -> bool:
+    def may_send(self, raw: Any) -> bool:
         """Whether viser gets a message. Its first one says where the camera is: until then viser knows no client."""
         try:
-            message = _DECODER.decode(raw)  # pyright: ignore[reportArgumentType] text is refused too
+            message = _DECODER.decode(raw)
         except (msgspec.DecodeError, TypeError):
             return False
         self._arrived |= isinstance(message, _Camera)
-        return self._arrived and not (isinstance(message, _Update) and not self._fits(message))
+        return self._arrived and (not isinstance(message, _Update) or self._fits(message))
 
     def _fits(self, message: _Update) -> bool:
         control, value = self._control(message.uuid), message.updates.value
@@ -150,69 +147,46 @@ def guard(gate: Gate, control: Callable[[str], Any]) -> Iterator[None]:
     """
     from websockets.asyncio import server
 
-    started = []
+    guarded = False
 
     def serve(handler: Callable[[Any], Awaitable[None]], host: str, port: int, **settings: Any) -> Any:
-        started.append(port)
-        settings |= {
-            "process_request": _checked_request(gate, settings["process_request"]),
-            "max_size": _LARGEST_MESSAGE,
-        }
-        return start(_checked_handler(handler, control), host, port, **settings)
+        nonlocal guarded
+        guarded, answer = True, settings["process_request"]
+
+        def process_request(connection: Any, request: Any) -> Any:
+            refusal = gate.refusal(request.path, request.headers)
+            status, text, headers = refusal or (0, "", {"Content-Security-Policy": "frame-ancestors 'self'"})
+            response = connection.respond(status, text) if refusal else answer(connection, request)
+            if response is not None:
+                response.headers.update(headers)
+            return response
+
+        async def handle(connection: Any) -> None:
+            visitor, receive = Visitor(control), connection.recv
+
+            async def recv() -> Any:
+                while True:
+                    message = await receive()
+                    await visitor.wait()
+                    if visitor.may_send(message):
+                        return message
+
+            connection.recv = recv
+            if len(connection.server.connections) <= _MOST_CONNECTIONS:
+                await handler(connection)
+
+        settings |= {"process_request": process_request, "max_size": _LARGEST_MESSAGE}
+        return start(handle, host, port, **settings)
 
     with _STARTING:
         start = server.serve
-        server.serve = serve  # pyright: ignore[reportAttributeAccessIssue] viser offers no way to give it one
+        server.serve = serve  # pyright: ignore[reportAttributeAccessIssue] viser takes no other
         try:
             yield
         finally:
             server.serve = start
-    if not started:
+    if not guarded:
         raise RuntimeError("this version of viser cannot be guarded; install the one that constraints.txt names")
-
-
-def _checked_request(gate: Gate, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """`answer`, for requests that pass the gate."""
-
-    def checked(connection: Any, request: Any) -> Any:
-        refusal = gate.refusal(request.path, request.headers)
-        if refusal is None:
-            response = answer(connection, request)
-            if response is not None:
-                response.headers["Content-Security-Policy"] = (
-                    "frame-ancestors 'self'"  # no page may hide it under its own
-                )
-            return response
-        status, text, headers = refusal
-        response = connection.respond(status, text)
-        response.headers.update(headers)
-        return response
-
-    return checked
-
-
-def _checked_handler(
-    handler: Callable[[Any], Awaitable[None]], control: Callable[[str], Any]
-) -> Callable[[Any], Awaitable[None]]:
-    """`handler`, which receives only what a visitor may send."""
-
-    async def checked(connection: Any) -> None:
-        if len(connection.server.connections) > _MOST_CONNECTIONS:
-            await connection.close(1013, "too many browsers show this page")
-            return
-        visitor, receive = Visitor(control), connection.recv
-
-        async def recv() -> bytes | str:
-            while True:
-                message = await receive()
-                await visitor.wait()
-                if visitor.may_send(message):
-                    return message
-
-        connection.recv = recv
-        await handler(connection)
-
-    return checked
 
 
 def _is_local(host: str | None) -> bool:
@@ -220,18 +194,3 @@ def _is_local(host: str | None) -> bool:
     with contextlib.suppress(ValueError):
         return host == "localhost" or ipaddress.ip_address(host or "").is_loopback
     return False
-
-
-def _split(address: str) -> Any:
-    try:
-        return urlsplit(address)
-    except ValueError:  # brackets without an address of version 6
-        return urlsplit("")
-
-
-def _cookie(text: str) -> str:
-    try:
-        found = SimpleCookie(text).get(_COOKIE)
-    except CookieError:
-        return ""
-    return "" if found is None else found.value

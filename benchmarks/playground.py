@@ -57,7 +57,7 @@ class Result:
 
 def memory(playground: Playground) -> float:
     """Memory that the simulation and the process that plans take now, MiB."""
-    processes = ("self", playground.crew.other_pid)
+    processes = ("self", playground.crew.background.other_pid)
     pages = sum(int(Path(f"/proc/{process}/statm").read_text().split()[1]) for process in processes)
     return pages * resource.getpagesize() / 2**20
 

@@ -17,13 +17,13 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.play import views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.driving import DRIVE_SPEED, Stick
-from ballbot_train.play import views
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
-from ballbot_train.play.plant import PLANT, randomization
 from ballbot_train.play.tunable import Tunable, weight_names
+from ballbot_train.play.world import PLANT, randomization
 from ballbot_train.policy_files import PolicyError
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s

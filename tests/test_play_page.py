@@ -203,7 +203,7 @@ def test_files_are_saved_and_handed_to_the_browser(opened, visitor, tmp_path):
     assert len(Trajectory.load(tmp_path / "stabilize-lqr-1.npz").u) > 3
 
 
-@pytest.mark.parametrize(("name", "most"), [("_MOST_FILES", 3), ("_MOST_BYTES", 1)])
+@pytest.mark.parametrize(("name", "most"), [("MOST_FILES", 3), ("MOST_BYTES", 1)])
 def test_only_so_much_can_be_saved(opened, visitor, tmp_path, monkeypatch, name, most):
     monkeypatch.setattr(saving, name, most)
     opened.goes_on()
@@ -444,7 +444,7 @@ def asked(port, path="/", **headers):
         ({"Host": "evil.example"}, "no other name"),
         ({"Host": "localhost.evil.example", "Origin": "http://localhost.evil.example"}, "no other name"),
         ({"Host": "192.168.0.1"}, "no other name"),
-        ({"Host": "["}, "no other name"),
+        ({"Host": "["}, "not an address"),
         ({"Host": ""}, "no other name"),
     ],
 )
@@ -458,7 +458,7 @@ def test_pages_of_others_and_names_of_others_are_refused(opened, headers, messag
         "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
     }
     answer, text = asked(opened.viewer.port, **headers, **(upgrade if live else {}))
-    assert answer.status == 403
+    assert answer.status in (400, 403)
     assert message in text.decode()
 
 
@@ -498,7 +498,9 @@ def test_others_need_the_token_which_becomes_a_cookie():
         viewer.close()
 
 
-@pytest.mark.parametrize("sent", [b"\x16\x03\x01 tls?", b"GET\r\n\r\n", b"x" * 70_000, b"GET /../../etc/passwd HTTP/1.1\r\n\r\n"])
+@pytest.mark.parametrize(
+    "sent", [b"\x16\x03\x01 tls?", b"GET\r\n\r\n", b"x" * 70_000, b"GET /../../etc/passwd HTTP/1.1\r\n\r\n"]
+)
 def test_what_is_no_request_is_dropped(quiet, opened, sent):
     with socket.create_connection(("127.0.0.1", opened.viewer.port), timeout=5) as plain, contextlib.suppress(OSError):
         plain.sendall(sent)

@@ -5,11 +5,10 @@ import threading
 import time
 
 import msgspec
+import viser
 import zstandard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
-
-import viser
 
 CAMERA = {
     "type": "ViewerCameraMessage",

@@ -1,8 +1,11 @@
 """The controls of the live page. Each shows what holds in the playground, and changes it for the browser that drives."""
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
@@ -10,10 +13,10 @@ from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play import views
 from ballbot_train.play.driving import DRIVERS
-from ballbot_train.play.plant import PLANT
 from ballbot_train.play.plots import MOST_GHOSTS
 from ballbot_train.play.simulation import AT_END, LARGEST_PUSH
 from ballbot_train.play.tunable import weight_names
+from ballbot_train.play.world import PLANT
 from ballbot_train.report import labels
 
 if TYPE_CHECKING:
@@ -25,6 +28,24 @@ SPEEDS = (0.1, 2.0)
 _EXPONENTS = (-1.5, 1.5)  # of 10, by which a weight's slider multiplies the task's own
 _FILMS = {"Film (WebP)": ".webp", "Film (MP4)": ".mp4"}
 _FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip) or rsl_rl (.pt), where the simulation runs"
+
+
+_IMPULSE_PER_METRE = 10.0  # N·s of a push by dragging the robot
+_STICK_METRES = 1.0  # of a drag that puts the stick fully out
+_HELD = 0.25  # s, after which a button of the pad counts as let go
+_KEY_HELD = 0.6  # s, the same for a key: keyboards repeat a held key only after half a second
+_DRAG_HELD = 5.0  # s, the same for a drag
+_DIRECTIONS = {"forward": (1.0, 0.0), "left": (0.0, 1.0), "back": (-1.0, 0.0), "right": (0.0, -1.0)}
+_KEYS = {
+    "forward": ("W", "arrowup"),
+    "left": ("A", "arrowleft"),
+    "back": ("S", "arrowdown"),
+    "right": ("D", "arrowright"),
+}
+_LEAD = (
+    "Choose **you** as the controller. The stick then commands a speed, and the robot keeps its balance. "
+    "**you (force)** commands the force itself: how long can you balance? Try it at speed 0.3."
+)
 
 
 class Controls:
@@ -71,16 +92,8 @@ class Controls:
     # --- building blocks ---
 
     def _bind(self, control: Any, apply: Callable[[Any], None], read: Callable[[], Any]) -> Any:
-        """Lets a control change the playground. What a watcher changes, and what is refused, goes back to what holds.
-
-        As coroutines of viser's loop, callbacks come in the order of the changes, each with the value that its browser sent.
-        """
-
-        async def changed(event: Any) -> None:
-            value = event.target.value
-            self._page.ask(event.client_id, lambda: apply(value))
-
-        control.on_update(changed)
+        """Lets a control change the playground. What a watcher changes, and what is refused, goes back to what holds."""
+        control.on_update(self._page.asking(lambda _, value: apply(value)))
         self._bound.append((control, read))
         return control
 
@@ -89,23 +102,14 @@ class Controls:
 
     def _button(self, label: str, action: Callable[[Any], None], hint: str | None = None) -> None:
         """A button that does something for viser's client who presses it."""
-
-        async def clicked(event: Any) -> None:
-            self._page.ask(event.client_id, lambda: action(event.client))
-
-        self._gui.add_button(label, hint=hint).on_click(clicked)
+        self._gui.add_button(label, hint=hint).on_click(self._page.asking(lambda client, _: action(client)))
 
     def _button_group(self, label: str, actions: dict[str, Callable[[], None]], hint: str) -> None:
-        async def clicked(event: Any) -> None:
-            self._page.ask(event.client_id, actions[event.target.value])
-
-        self._gui.add_button_group(label, tuple(actions), hint=hint).on_click(clicked)
+        group = self._gui.add_button_group(label, tuple(actions), hint=hint)
+        group.on_click(self._page.asking(lambda _, button: actions[button]()))
 
     def _key(self, label: str, key: Any, action: Callable[[], None]) -> None:
-        async def pressed(event: Any) -> None:
-            self._page.ask(event.client_id, action)
-
-        self._gui.add_command(label, hotkey=key).on_trigger(pressed)
+        self._gui.add_command(label, hotkey=key).on_trigger(self._page.asking(lambda *_: action()))
 
     # --- the tabs ---
 
@@ -259,3 +263,55 @@ class Controls:
     def _show_optimize(self) -> None:
         self._optimize_text.content = f"```\n{views.optimize_command(self._playground)}\n```"
         self._optimize_text.visible = True
+
+
+class Steering:
+    """Moves the playground's stick for a page."""
+
+    def __init__(self, page: "PlayPage"):
+        self._page, self._playground = page, page.playground
+        self._until = 0.0
+        page.viewer.on_grab = self._grab
+
+    def build(self) -> None:
+        """Adds the buttons of the pad, and the keys."""
+        gui = self._page.viewer.server.gui
+        gui.add_markdown(_LEAD)
+        for direction, keys in _KEYS.items():
+            gui.add_button(direction.capitalize()).on_hold(self._steered(direction, _HELD), callback_hz=20.0)
+            for key in keys:
+                command = gui.add_command(f"drive {direction} ({key})", hotkey=key)  # pyright: ignore[reportArgumentType]
+                command.on_trigger(self._steered(direction, _KEY_HELD))
+        gui.add_markdown("Or hold W A S D or the arrow keys, or drag the robot.")
+
+    def let_go(self) -> None:
+        """Centres the stick when nothing holds it any more."""
+        if time.perf_counter() > self._until:
+            self._playground.stick.move(0.0, 0.0)
+
+    def _steered(self, direction: str, seconds: float) -> Any:
+        """Moves the stick as seen by the browser that asks, for a while."""
+
+        async def steered(event: Any) -> None:
+            camera = event.client.camera
+            ahead = np.array(camera.look_at, np.float64)[:2] - np.array(camera.position, np.float64)[:2]
+            length = float(np.hypot(*ahead))
+            cosine, sine = (ahead / length).tolist() if math.isfinite(length) and length > 0 else (1.0, 0.0)
+            x, y = _DIRECTIONS[direction]
+            self._page.ask(event.client_id, lambda: self._move(cosine * x - sine * y, sine * x + cosine * y, seconds))
+
+        return steered
+
+    def _move(self, x: float, y: float, seconds: float) -> None:
+        self._playground.stick.move(x, y)
+        self._until = time.perf_counter() + seconds
+
+    def _grab(self, client_id: int, phase: str, vector: np.ndarray) -> None:
+        """Dragging steers where a human drives, and pushes when it ends everywhere else."""
+        x, y = vector.tolist()
+        ended = phase == "end"
+        if self._playground.is_driven:
+            held = 0.0 if ended else _DRAG_HELD
+            self._page.ask(client_id, lambda: self._move(x / _STICK_METRES, y / _STICK_METRES, held))
+        elif ended:
+            self._page.ask(client_id, lambda: self._playground.push(_IMPULSE_PER_METRE * x, _IMPULSE_PER_METRE * y))

@@ -1,32 +1,27 @@
 """The robots of a playground under their controllers: the main one, which counts, and its ghosts."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, wait
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
+from ballbot_baselines import CONTROLLERS
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import Controller
 from ballbot_gym.simulator import State
-from ballbot_train.evaluation.controllers import is_expert, is_file
+from ballbot_train.evaluation.controllers import is_expert, is_file, make_controller
 from ballbot_train.play.background import Background
-from ballbot_train.play.driving import Stick
-from ballbot_train.play.making import make, optimum_costs
+from ballbot_train.play.driving import DRIVERS, DriveController, Stick
 from ballbot_train.play.runner import Runner
+from ballbot_train.play.tunable import Tunable
 from ballbot_train.play.world import World
 from ballbot_train.report import labels
 
 _SETTLE = 900.0  # s: the first time in a task, solvers are compiled
-
-
-class _Made(NamedTuple):
-    """A controller that was reset for a control step, counted from the opening of the playground."""
-
-    name: str
-    step: int
-    controller: Controller
+_FROM_ELSEWHERE = ("lqr", "trajopt")  # controllers that are data, so that they can come from another process
 
 
 class Crew:
@@ -40,7 +35,7 @@ class Crew:
         """Control steps since the playground was opened."""
         self.notice = ""
         """What went wrong last, in words."""
-        self._physics, self._stick, self._background = physics, stick, Background(other_process)
+        self._physics, self._stick, self.background = physics, stick, Background(other_process)
         self._randomization = Randomization()
         self._optimum: Future | None = None
 
@@ -69,11 +64,6 @@ class Crew:
         """(n + 1,) what the optimum of the episode has cost after each control step; None while it is not known."""
         made = self._optimum
         return made.result() if made is not None and made.done() and made.exception() is None else None
-
-    @property
-    def other_pid(self) -> int | None:
-        """The number of the process that plans; None if there is none."""
-        return self._background.other_pid
 
     # --- who is there ---
 
@@ -106,7 +96,7 @@ class Crew:
 
     def close(self) -> None:
         """Releases the simulators and the background; may be called again."""
-        self._background.close()
+        self.background.close()
         for runner in self.runners:
             runner.close()
 
@@ -142,8 +132,8 @@ class Crew:
                 runner.place(self._x)
             runner.restart_cost()
             planned = not failed and ahead is not None and ahead.done() and ahead.exception() is None
-            if ahead is not None and planned and ahead.result().name == runner.wanted == runner.name:
-                runner.take_controller(ahead.result().controller, self.steps)
+            if ahead is not None and planned and ahead.result()[0] == runner.wanted == runner.name:
+                runner.take_controller(ahead.result()[2], self.steps)
             else:
                 self.order(runner)
         self._order_optimum()
@@ -172,10 +162,10 @@ class Crew:
 
     def order(self, runner: Runner, ahead: int = 0) -> None:
         """Asks for the controller that a robot wants, from now on or for an episode that begins some steps ahead."""
-        name, step, compute = runner.wanted, self.steps + ahead, self._background.compute
+        name, step, compute = runner.wanted, self.steps + ahead, self.background.compute
         x = np.array(runner.expected(self.steps, ahead) if ahead else runner.x)
-        made = partial(make, name, self.world.task, self.world.params, x, np.array(self._c), self._stick, compute)
-        future = self._background.submit(lambda: _Made(name, step, made()))
+        made = partial(_make, name, self.world.task, self.world.params, x, np.array(self._c), self._stick, compute)
+        future = self.background.submit(lambda: (name, step, made()))
         _cancel(runner.following)
         if ahead:
             runner.following = future
@@ -186,7 +176,7 @@ class Crew:
     def _order_optimum(self) -> None:
         _cancel(self._optimum)
         problem = self.world.task, self.world.params, np.array(self._x), np.array(self._c)
-        self._optimum = self._background.submit(lambda: self._background.compute(optimum_costs, *problem))
+        self._optimum = self.background.submit(lambda: self.background.compute(_optimum_costs, *problem))
 
     def poll(self) -> None:
         """Hands out the controllers that are made."""
@@ -203,11 +193,7 @@ class Crew:
                 self.world.offer(runner.name)
 
     def wait(self) -> None:
-        """Waits for everything that is being made.
-
-        Raises:
-            TimeoutError: it took too long.
-        """
+        """Waits for everything that is being made; raises a TimeoutError if that takes too long."""
         jobs = [self._optimum, *(job for runner in self.runners for job in (runner.making, runner.following))]
         if wait([job for job in jobs if job is not None], _SETTLE).not_done:
             raise TimeoutError(f"no plan in {_SETTLE:g} s")
@@ -223,7 +209,7 @@ class Crew:
                 self.order(runner)
 
     def _do_without(self, runner: Runner, error: BaseException) -> None:
-        """Leaves a robot under the controller that it has where the wanted one cannot be made. If it has none, it gets LQR."""
+        """Leaves a robot under its controller where the wanted one cannot be made. If it has none, it gets LQR."""
         who = labels.label(runner.wanted)
         self.notice = f"{who}: {error}"
         if runner.controller is not None:
@@ -238,3 +224,50 @@ def _cancel(*jobs: Future | None) -> None:
     for job in jobs:
         if job is not None:
             job.cancel()
+
+
+def _make(
+    name: str,
+    task: Tunable,
+    params: BallbotParams,
+    x: np.ndarray,
+    c: np.ndarray,
+    stick: Stick,
+    compute: Callable[..., Any],
+) -> Controller:
+    """The controller of a name, at the start of an episode in state x (8,) with constants c (nc,) of the tunable task.
+
+    What takes long is called by `compute`, that may have another process do it.
+    """
+    if name in DRIVERS:
+        return DriveController(task, params, stick, DRIVERS[name])
+    if name in _FROM_ELSEWHERE:
+        return compute(_expert, name, task, params, x, c)
+    if not is_expert(name):
+        controller = make_controller(name, task.base, params)
+        controller.reset(0.0, x, c[: len(task.base.constant_names)])
+        return controller
+    from ballbot_baselines.nmpc import NmpcController, prepared_plan  # it imports CasADi
+
+    controller = make_controller(name, task, params)
+    if isinstance(controller, NmpcController):  # its solver stays in this process
+        controller.start(0.0, c, compute(prepared_plan, task, params, x, c, controller.backoff))
+    else:
+        controller.reset(0.0, x, c)
+    return controller
+
+
+def _optimum_costs(task: Tunable, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(n + 1,) what the optimum has cost after each control step."""
+    from ballbot_baselines import find_optimum
+
+    trajectory = find_optimum(task, params, x, c).trajectory
+    rates = task.cost(tuple(trajectory.x[:-1].T), tuple(trajectory.u.T), tuple(c))
+    return np.concatenate([[0.0], np.cumsum(rates * task.control_dt)])
+
+
+def _expert(name: str, task: Tunable, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> Controller:
+    """An expert at the start of an episode."""
+    controller = CONTROLLERS[name](task, params)
+    controller.reset(0.0, x, c)
+    return controller

@@ -1,7 +1,7 @@
 """The page of the live playground: who drives, what is shown when, and the loop that keeps the simulation in real time.
 
-viser calls back in a thread of its own. What a browser asks for goes into a queue, and the loop of the simulation does it between
-two steps. So the playground itself needs no locks.
+viser calls back in a thread of its own. What a browser asks for goes into a queue, and the loop of the simulation does it
+between two steps. So the playground itself needs no locks.
 """
 
 import gc
@@ -19,11 +19,10 @@ from ballbot_gym import dynamics
 from ballbot_gym.viewer import Viewer
 from ballbot_train.play import views
 from ballbot_train.play.clock import Clock
-from ballbot_train.play.controls import Controls
+from ballbot_train.play.controls import Controls, Steering
 from ballbot_train.play.plots import Plots
 from ballbot_train.play.saving import Saver
 from ballbot_train.play.simulation import Playground
-from ballbot_train.play.steering import Steering
 
 _DRAW_HZ, _PLOT_HZ, _TEXT_HZ = 30.0, 5.0, 4.0
 _STARVED = 0.25  # s, after which a moment is drawn even if steps are due
@@ -148,6 +147,18 @@ class PlayPage:
         """Does what a browser asks for, if it drives. What a watcher has changed goes back to what holds."""
         if client_id is not None:  # not set by this program
             self.request(action if self.drives(client_id) else lambda: None)
+
+    def asking(self, action: Callable[[Any, Any], object]) -> Any:
+        """A callback of viser that asks for something, by viser's client and the value that the control has got.
+
+        It is a coroutine of viser's loop, so that callbacks come in the order of the changes.
+        """
+
+        async def asked(event: Any) -> None:
+            value = getattr(event.target, "value", None)
+            self.ask(event.client_id, lambda: action(event.client, value))
+
+        return asked
 
     def drives(self, client_id: int) -> bool:
         """Whether this browser drives. The first one that asks takes a free seat."""

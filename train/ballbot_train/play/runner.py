@@ -68,11 +68,6 @@ class Runner:
         return self.violated != "" or self.arrived
 
     @property
-    def failure(self) -> str:
-        """How it failed, in words, or ""."""
-        return failure_word(self.violated)
-
-    @property
     def trajectory(self) -> Trajectory | None:
         """The episode so far; None before its first step."""
         if not self._forces:

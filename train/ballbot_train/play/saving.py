@@ -9,8 +9,8 @@ from ballbot_train.play.background import OtherProcess
 from ballbot_train.play.simulation import Playground
 from ballbot_train.report.replay import Replay
 
-_MOST_FILES = 200
-_MOST_BYTES = 2**28
+MOST_FILES = 200
+MOST_BYTES = 2**28
 _FILM_WIDTH = 640  # px
 _FILM_FPS = 20
 
@@ -32,7 +32,7 @@ class Saver:
         self._hand_over(client, trajectory.save(self._path(".npz")))
 
     def save_film(self, client: Any, ending: str) -> None:
-        """Begins a film of the episode so far; `poll` hands it to viser's client. Another process draws, which takes all of a core."""
+        """Begins a film of the episode so far in another process: it takes all of a core. `poll` hands it to the client."""
         if self._film is not None:
             raise ValueError("a film is being drawn; wait for it")
         replay, path = views.replay(self._playground), self._path(ending)
@@ -57,7 +57,7 @@ class Saver:
         self._thread.shutdown()
 
     def _path(self, ending: str) -> Path:
-        if self._count >= _MOST_FILES or self._bytes >= _MOST_BYTES:
+        if self._count >= MOST_FILES or self._bytes >= MOST_BYTES:
             raise ValueError(
                 f"{self._count} files of {self._bytes / 2**20:.0f} MiB are saved; start ballbot play again to save more"
             )

@@ -16,9 +16,8 @@ from ballbot_gym.simulator import default_physics
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.crew import Crew
 from ballbot_train.play.driving import DRIVERS, Stick
-from ballbot_train.play.plant import PLANT, randomization, severity
 from ballbot_train.play.runner import Runner, failure_word
-from ballbot_train.play.world import World
+from ballbot_train.play.world import PLANT, World, randomization, severity
 from ballbot_train.report import labels
 
 AtEnd = Literal["go on", "again", "next", "stop"]
@@ -59,8 +58,8 @@ class Score(NamedTuple):
 class Playground:
     """A ballbot, its ghosts and their world. `step` moves everything by one control step; nothing here waits for real time.
 
-    Whatever asks for something unknown, or for a value outside of its bounds, gets a ValueError and changes nothing. Except for
-    `stick`, everything is for one thread.
+    Whatever asks for something unknown, or for a value outside of its bounds, gets a ValueError and changes nothing. Except
+    for `stick`, everything is for one thread.
     """
 
     def __init__(
@@ -185,11 +184,7 @@ class Playground:
         return True
 
     def settle(self) -> None:
-        """Waits until every plan is found; for scripts and tests.
-
-        Raises:
-            TimeoutError: it took too long.
-        """
+        """Waits until every plan is found; for scripts and tests. A TimeoutError says that it took too long."""
         for _ in range(2):  # a plan that is not found asks for another controller
             self.crew.wait()
             self.crew.poll()

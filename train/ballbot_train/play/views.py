@@ -7,7 +7,7 @@ import numpy as np
 
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_train.play.driving import DRIVERS
-from ballbot_train.play.runner import Runner, Sample
+from ballbot_train.play.runner import Runner, Sample, failure_word
 from ballbot_train.play.simulation import Playground
 from ballbot_train.report import labels
 from ballbot_train.report.replay import Replay, Take
@@ -21,8 +21,8 @@ class History(NamedTuple):
     seconds: np.ndarray
     """(n,) since the playground was opened."""
     lines: dict[str, np.ndarray]
-    """(n, 4) tilt, rad, force, N, cost so far and computing time of the controller, s, by the name of the controller. The main
-    robot's comes first."""
+    """(n, 4) tilt, rad, force, N, cost so far and computing time of the controller, s, by the name of the controller, the
+    main robot's first."""
     optimum: np.ndarray
     """(n,) what the optimum has cost so far; 0 where that is not known."""
 
@@ -97,7 +97,7 @@ def replay(playground: Playground) -> Replay:
             labels.label(runner.name),
             runner.trajectory,
             color(runner, i),
-            runner.failure or f"cost {runner.cost:.1f}",
+            failure_word(runner.violated) or f"cost {runner.cost:.1f}",
             runner.violated != "",
         )
         for i, runner in enumerate(playground.crew.runners)

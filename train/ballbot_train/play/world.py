@@ -1,25 +1,49 @@
-"""The task and the robot that are played, with the weights that a user changes and the controllers that can be chosen."""
+"""What is played: a task, a robot and the controllers that can be chosen, and what a user changes of them."""
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ballbot_baselines import VARIANTS
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
 from ballbot_train.evaluation.controllers import is_expert, is_made_for, is_saved_model, made_for, names
+from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play.driving import DRIVERS
 from ballbot_train.play.tunable import Tunable, weight_names
 from ballbot_train.policy_files import PolicyError
 
 WEIGHT_FACTOR = 100.0
 """How far a weight may be from the task's own, as a factor, up and down."""
+
+
+class Span(NamedTuple):
+    """What a slider allows."""
+
+    label: str
+    low: float
+    high: float
+    step: float
+
+
+PLANT: dict[str, Span] = {
+    "mass": Span("Masses, %", -50.0, 100.0, 5.0),
+    "com": Span("Centre of mass, %", -30.0, 50.0, 5.0),
+    "delay": Span("Delay, ms", 0.0, 120.0, 20.0),
+    "lag": Span("Lag, ms", 0.0, 100.0, 5.0),
+    "noise": Span("Sensor noise, ×", 0.0, 5.0, 0.25),
+    "push": Span("Random pushes, N·s", 0.0, 12.0, 0.5),
+}
+"""What the controllers do not know, by the name of the stress in `robustness.STRESSES`. 0 is nothing."""
 
 
 class World:
@@ -100,3 +124,19 @@ class World:
         if self.certified is None or episode is None or self.weights:
             return math.nan
         return float(self.certified.costs[episode])
+
+
+def severity(stress: str, value: float) -> float:
+    """The severity that a slider gives a stress; a ValueError for an unknown one, or a value outside of its `Span`."""
+    check_names("change", [stress], PLANT)
+    span = PLANT[stress]
+    if not span.low <= value <= span.high:
+        raise ValueError(f"{stress} must be {span.low:g} to {span.high:g}, not {value:g}")
+    return span.step * round(value / span.step)
+
+
+def randomization(severities: Mapping[str, float]) -> Randomization:
+    """All hidden changes together: of each stress the fields that it changes."""
+    changes = [STRESSES[stress].at(value) for stress, value in severities.items() if value]
+    changed = {f.name: value for each in changes for f in fields(each) if (value := getattr(each, f.name)) != f.default}
+    return replace(Randomization(), **changed)
