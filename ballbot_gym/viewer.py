@@ -8,6 +8,7 @@ import contextlib
 import io
 import logging
 import math
+import socket
 import sys
 import threading
 import time
@@ -22,6 +23,7 @@ from ballbot_gym.simulator import State
 from ballbot_gym.tasks.marker import Marker
 
 HOST, PORT = "127.0.0.1", 8080
+_TRIED_PORTS = 100
 
 _EYE, _AIM = (-2.6, -1.8, 1.5), (0.0, 0.0, 0.5)  # m: from behind a robot that moves along x
 _SQUARE = 1.0  # m, of the floor
@@ -80,19 +82,25 @@ class Viewer:
         """Starts the server.
 
         Args:
-            host: address to bind.
+            host: address to bind. If others than this machine reach it, the page asks for the token in `address`.
             port: where to listen; the next free one, if it is taken.
             label: title of the page.
             follow: whether the scene moves so that the robot stays in view.
 
         Raises:
             ImportError: viser is missing.
+            OSError: nothing can listen there.
         """
         viser = import_viser()
+        from ballbot_gym.gate import Gate, guard  # it imports what comes with viser
+
+        port, self._gate = _free_port(host, port), Gate(host)
         # Whoever sends garbage, or leaves while the server stops, would get a traceback onto the user's terminal.
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints an address that may not be the one to open
+        # viser prints an address that may not be the one to open.
+        with contextlib.redirect_stdout(io.StringIO()), guard(self._gate, self._control):
             self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui._websock_interface.queue_message(viser._messages.RunJavascriptMessage(source=_CONNECT_AGAIN))
         self.follow = follow
         self.on_grab: Grab | None = None
@@ -126,9 +134,12 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """What to open in a browser on this machine."""
-        host = "localhost" if self._host in ("127.0.0.1", "0.0.0.0") else self._host
-        return f"http://{host}:{self.port}"
+        """What to open in a browser, with the token if it takes one."""
+        host = {HOST: "localhost", "0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(
+            self._host, self._host
+        )
+        token = f"/?token={self._gate.token}" if self._gate.token else ""
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}{token}"
 
     def draw(self, drawing: Drawing) -> None:
         """Shows a moment. What is the same as before is not sent again."""
@@ -148,6 +159,10 @@ class Viewer:
             if not self._closed:
                 self._closed = True
                 self.server.stop()
+
+    def _control(self, uuid: str) -> Any:
+        """viser's control with this id; None if there is none."""
+        return self.server.gui._gui_input_handle_from_uuid.get(uuid)
 
     def _draw(self, drawing: Drawing) -> None:
         goal = drawing.robots[-1].x[:2] if self.follow and drawing.robots else np.zeros(2)
@@ -318,6 +333,18 @@ class PageScene:
     def close(self) -> None:
         """Stops the page; may be called again."""
         self._viewer.close()
+
+
+def _free_port(host: str, port: int) -> int:
+    """The first port from `port` on where a server can listen. viser would wait for ever where there is none."""
+    failure: Exception | None = None
+    for attempt in range(port, port + (_TRIED_PORTS if port else 1)):
+        try:
+            socket.create_server((host, attempt), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+            return attempt
+        except (OSError, OverflowError) as error:
+            failure = error
+    raise OSError(f"cannot listen on {host}, port {port}: {failure}; give another address or port of this machine")
 
 
 def _segments(path: GroundPath) -> np.ndarray:

@@ -24,8 +24,8 @@ import tyro
 from ballbot_gym import files
 from ballbot_gym.viewer import Viewer
 from ballbot_train.play.clock import LATE, Clock, Timing
-from ballbot_train.play.page import PlayPage
-from ballbot_train.play.playground import Playground
+from ballbot_train.play.live_page import PlayPage
+from ballbot_train.play.simulation import Playground
 
 _LEAST_FACTOR = 0.99
 _MOST_LATE = 0.001  # of the steps
@@ -57,7 +57,7 @@ class Result:
 
 def memory(playground: Playground) -> float:
     """Memory that the simulation and the process that plans take now, MiB."""
-    processes = ("self", playground.other_pid)
+    processes = ("self", playground.crew.background.other_pid)
     pages = sum(int(Path(f"/proc/{process}/statm").read_text().split()[1]) for process in processes)
     return pages * resource.getpagesize() / 2**20
 
@@ -111,7 +111,7 @@ def measure(
     page.clock.timing = Timing()
     here, there = multiprocessing.get_context("spawn").Pipe()
     waiter = multiprocessing.get_context("spawn").Process(
-        target=idle, args=(playground.task.control_dt, there), daemon=True
+        target=idle, args=(playground.world.task.control_dt, there), daemon=True
     )
     waiter.start()
     began, cpu = time.perf_counter(), time.process_time()

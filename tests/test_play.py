@@ -2,6 +2,7 @@
 
 import math
 import os
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -16,11 +17,13 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.play import views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.driving import DRIVE_SPEED, Stick
-from ballbot_train.play.playground import LARGEST_PUSH, PLANT, Playground
+from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.play.tunable import Tunable, weight_names
+from ballbot_train.play.world import PLANT, randomization
 from ballbot_train.policy_files import PolicyError
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
@@ -43,7 +46,7 @@ def play():
 
 
 def go(playground, seconds):
-    for _ in range(round(seconds / playground.task.control_dt)):
+    for _ in range(round(seconds / playground.world.task.control_dt)):
         assert playground.step()
 
 
@@ -80,7 +83,7 @@ def test_a_push_makes_the_robot_lean(play):
     go(playground, 0.2)
     assert before < math.radians(0.5)
     assert max(sample.tilt for sample in list(playground.main.samples)[-10:]) > math.radians(5)
-    assert playground.drawing().robots[-1].push is not None
+    assert views.drawing(playground).robots[-1].push is not None
 
 
 def test_ghosts_get_the_same_start_and_the_same_pushes(play):
@@ -89,7 +92,7 @@ def test_ghosts_get_the_same_start_and_the_same_pushes(play):
     for each in (playground, alone):
         each.push(3.0, -2.0)
         go(each, 0.5)
-    ghost, main = playground._runners["lqr"], alone.main
+    ghost, main = playground.crew.runners[1], alone.main
     np.testing.assert_array_equal(ghost.x, main.x)
     assert playground.main.x != ghost.x
 
@@ -99,10 +102,10 @@ def test_a_ghost_that_is_added_begins_where_the_robot_is(play):
     go(playground, 0.5)
     here = playground.main.x
     playground.set_ghosts(["you"])
-    assert playground._runners["you"].x == here
+    assert playground.crew.runners[1].x == here
     playground.settle()
     go(playground, 0.1)
-    assert playground.ghosts == ("you",)
+    assert playground.crew.ghosts == ("you",)
 
 
 def test_controllers_change_without_a_jump(play):
@@ -116,7 +119,7 @@ def test_controllers_change_without_a_jump(play):
         playground.settle()
         go(playground, 0.02)
         states.append(playground.main.x)
-        assert playground.main.name == playground.controller == name
+        assert playground.main.name == playground.main.wanted == name
     steps = np.abs(np.diff([state[:2] for state in states], axis=0)).max()
     assert steps < 0.02 * 8  # m: a control step at less than 8 m/s
     assert len(playground.trajectory().u) > 25  # one episode all along
@@ -136,7 +139,7 @@ def test_after_a_fall_the_same_episode_begins_again(play):
     playground = play(episode=FALLING)
     go(playground, 0.5)
     assert playground.ended
-    assert "fell after 0.4 s" in playground.status()
+    assert "fell after 0.4 s" in views.status(playground)
     fallen = playground.main.x
     go(playground, 1.0)
     assert playground.main.x == fallen
@@ -163,9 +166,9 @@ def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
     for _ in range(1000):
         playground.settle()
         playground.step()
-    assert playground.notice == ""
+    assert playground.crew.notice == ""
     assert all(score.failure == "" for score in playground.scores)
-    assert playground.drawing().paths[-1].name in ("plan", "robot")
+    assert views.drawing(playground).paths[-1].name in ("plan", "robot")
 
 
 # --- what the user changes ---
@@ -178,7 +181,7 @@ def test_lqr_reacts_to_a_weight(play):
     playground.settle()
     after = playground.main.controller.act(0.0, np.ones(8))
     assert np.abs(after).max() < 0.9 * np.abs(before).max()
-    playground.set_weight("effort_weight", playground.base.effort_weight)
+    playground.set_weight("effort_weight", playground.world.base.effort_weight)
     playground.settle()
     np.testing.assert_allclose(playground.main.controller.act(0.0, np.ones(8)), before)
 
@@ -187,8 +190,8 @@ def test_the_cost_so_far_is_counted_with_the_new_weights(play):
     playground = play()
     go(playground, 0.5)
     before = playground.main.cost
-    for name in weight_names(playground.base):
-        playground.set_weight(name, 2 * getattr(playground.base, name))
+    for name in weight_names(playground.world.base):
+        playground.set_weight(name, 2 * getattr(playground.world.base, name))
     assert playground.main.cost == pytest.approx(2 * before)
 
 
@@ -197,7 +200,7 @@ def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     gain = playground.main.controller.act(0.0, np.ones(8))
     playground.set_plant("mass", 50.0)
     playground.set_plant("delay", 40.0)
-    assert playground.main._disturbance.params.body_mass == pytest.approx(1.5 * playground.params.body_mass)
+    assert playground.main.true.body_mass == pytest.approx(1.5 * playground.world.params.body_mass)
     np.testing.assert_array_equal(playground.main.controller.act(0.0, np.ones(8)), gain)
     go(playground, 0.02)
     assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
@@ -209,8 +212,8 @@ def test_every_hidden_change_can_go_to_both_ends_while_the_robot_moves(play):
         for severity in (span.low, span.high, 0.0):
             playground.set_plant(stress, severity)
             go(playground, 0.04)
-    assert playground.notice == ""
-    assert playground._randomization.active is False
+    assert playground.crew.notice == ""
+    assert randomization(playground.plant).active is False
 
 
 def test_a_human_drives_the_robot_that_balances_itself(play):
@@ -244,7 +247,7 @@ def test_another_task_keeps_the_controllers_that_it_has(play):
     playground.set_task("orbit")
     playground.settle()
     assert playground.step()
-    assert (playground.task_name, playground.controller, playground.ghosts) == ("orbit", "lqr", ("you",))
+    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
 
 
 @pytest.mark.parametrize(("robot", "seed"), [("rolling", 0), ("rolling", 1)])
@@ -253,7 +256,7 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, robot, seed, physi
     if physics == "bullet":
         pytest.importorskip("pybullet")
     playground = play(robot=robot, episode=None, seed=seed, physics=physics)
-    (state, constants), env = playground._start, BallbotEnv("stabilize", robot=robot, physics=physics)
+    (state, constants), env = playground.start, BallbotEnv("stabilize", robot=robot, physics=physics)
     controller = CONTROLLERS["lqr"](env.task, env.params)
     expected = rollout(env, controller, options={"state": state, "constants": constants})
     while not playground.scores:
@@ -268,8 +271,8 @@ def test_another_robot_keeps_the_controllers_that_it_has(play, interpreted):
     playground.set_robot("kugle")
     playground.settle()
     assert playground.step()
-    assert (playground.robot, playground.controller, playground.ghosts) == ("kugle", "lqr", ("you",))
-    assert playground.params.total_mass == pytest.approx(1.478 + 16.154)
+    assert (playground.world.robot, playground.main.wanted, playground.crew.ghosts) == ("kugle", "lqr", ("you",))
+    assert playground.world.params.total_mass == pytest.approx(1.478 + 16.154)
 
 
 # --- bad input ---
@@ -289,17 +292,17 @@ def test_no_push_harms(play, push):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda p: p.set_task("dance"), "unknown task 'dance'"),
-        (lambda p: p.set_robot("teapot"), "unknown robot 'teapot'"),
+        (lambda p: p.set_task("dance"), "unknown task dance"),
+        (lambda p: p.set_robot("teapot"), "unknown robot teapot"),
         (lambda p: p.set_controller("nobody"), "unknown controller 'nobody'"),
         (lambda p: p.set_controller("nowhere/policy.json"), "unknown controller"),
         (lambda p: p.set_ghosts(["nobody"]), "unknown controller 'nobody'"),
-        (lambda p: p.set_weight("nothing", 1.0), "unknown weight 'nothing'"),
+        (lambda p: p.set_weight("nothing", 1.0), "unknown weight nothing"),
         (lambda p: p.set_weight("effort_weight", math.nan), "effort_weight must be"),
         (lambda p: p.set_weight("effort_weight", -1.0), "effort_weight must be"),
         (lambda p: p.set_plant("mass", math.nan), "mass must be -50 to 100"),
         (lambda p: p.set_plant("mass", 1e9), "mass must be -50 to 100"),
-        (lambda p: p.set_plant("weather", 1.0), "unknown change 'weather'"),
+        (lambda p: p.set_plant("weather", 1.0), "unknown change weather"),
         (lambda p: p.start_certified(200), "episode must be 0 to 199, not 200"),
     ],
 )
@@ -308,7 +311,7 @@ def test_wrong_input_is_refused_and_the_robot_goes_on(play, change, message):
     with pytest.raises(ValueError, match=message):
         change(playground)
     go(playground, 0.1)
-    assert playground.notice == ""
+    assert playground.crew.notice == ""
 
 
 @pytest.fixture
@@ -327,7 +330,7 @@ def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_m
     playground.settle()
     go(playground, 0.04)
     assert playground.main.name == saved_model
-    assert playground.notice == ""
+    assert playground.crew.notice == ""
     playground.set_task("orbit")  # its observations are others
     assert saved_model not in playground.controllers
 
@@ -350,7 +353,7 @@ def test_a_controller_that_fails_gives_no_force_and_is_named(play):
     playground.main.take_controller(Broken(), 0)
     go(playground, 0.02)
     assert playground.main.force == (0.0, 0.0)
-    assert "LQR" in playground.notice
+    assert "LQR" in playground.crew.notice
 
 
 def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
@@ -358,14 +361,14 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
     monkeypatch.setitem(CONTROLLERS, "trajopt", lambda task, params: (_ for _ in ()).throw(RuntimeError("no way")))
     playground.set_controller("trajopt")
     playground.settle()
-    assert playground.controller == playground.main.name == "lqr"  # the old one stays
-    assert "no way" in playground.notice
-    playground._wanted["main"] = "trajopt"
+    assert playground.main.wanted == playground.main.name == "lqr"  # the old one stays
+    assert "no way" in playground.crew.notice
+    playground.main.wanted = "trajopt"
     playground.restart()
     playground.settle()
     assert playground.step()
     assert playground.main.name == "lqr"
-    assert "LQR does instead" in playground.notice
+    assert "LQR does instead" in playground.crew.notice
 
 
 # --- what is kept ---
@@ -376,9 +379,9 @@ def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
     go(playground, 0.5)
     path = playground.trajectory().save(tmp_path / "played.npz")
     np.testing.assert_array_equal(Trajectory.load(path).x[-1], playground.main.x)
-    replay = playground.replay()
+    replay = views.replay(playground)
     assert [take.label for take in replay.takes] == ["LQR", "you"]
-    command = playground.optimize_command().split()
+    command = views.optimize_command(playground).split()
     assert command[:4] == ["ballbot", "optimize", "stabilize", "--state"]
     assert [float(value) for value in command[4:]] == pytest.approx(playground.main.x, rel=1e-8)
 
@@ -386,7 +389,7 @@ def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
 def test_the_history_that_is_plotted_stays_short(play):
     playground = play(ghosts=["you"])
     go(playground, 9.0)
-    history = playground.history(200)
+    history = views.history(playground, 200)
     assert len(history.seconds) == 200
     assert (np.diff(history.seconds) > 0).all()
     assert all(np.isfinite(line).all() and line.shape == (200, 4) for line in history.lines.values())
@@ -475,32 +478,34 @@ def test_speed_stretches_time_and_a_pause_owes_no_steps():
     assert not clock.take()
 
 
-def test_the_background_does_only_the_last_job_of_a_key():
-    background, started, hold, done = Background(), threading.Event(), threading.Event(), []
-    background.submit("slow", lambda: (started.set(), hold.wait(5)))
-    assert started.wait(5)
-    for i in range(5):
-        background.submit("slider", lambda i=i: done.append(i) or i)
-    background.submit("gone", lambda: done.append("gone"))
-    background.cancel("gone")
-    assert background.pending("slider")
+def test_while_a_slider_moves_only_its_last_value_is_worked_on(play, monkeypatch):
+    playground, hold, made = play(), threading.Event(), []
+
+    def slow(task, params):
+        made.append(task)
+        assert hold.wait(10)
+        return lqr(task, params)
+
+    lqr = CONTROLLERS["lqr"]
+    monkeypatch.setitem(CONTROLLERS, "lqr", slow)
+    for k in range(1, 10):
+        playground.set_weight("effort_weight", k * playground.world.base.effort_weight)
     hold.set()
-    assert background.wait(5)
-    finished = background.finished()
-    assert finished["slider"] == 4
-    assert done == [4]
-    assert background.finished() == {}
-    background.close()
+    playground.settle()
+    assert len(made) <= 2  # the first, which was begun, and the last
+    assert playground.world.weights["effort_weight"] == pytest.approx(9 * playground.world.base.effort_weight)
 
 
 def test_another_process_computes_and_is_started_anew_after_it_was_killed():
     background = Background(other_process=True)
     try:
-        assert background.compute(os.getpid) == background.other_pid != os.getpid()
+        first = background.other_pid
+        assert background.compute(os.getpid) == first != os.getpid()
         with pytest.raises(ValueError, match="math domain"):
             background.compute(math.sqrt, -1.0)
-        background._other._process.kill()
-        background._other._process.join()
+        os.kill(first, signal.SIGKILL)
+        while background.other_pid is not None:
+            time.sleep(0.01)
         assert background.compute(math.sqrt, 4.0) == 2.0
     finally:
         background.close()
@@ -509,16 +514,12 @@ def test_another_process_computes_and_is_started_anew_after_it_was_killed():
 
 def test_a_job_of_another_process_does_not_hold_up_the_end():
     background = Background(other_process=True)
-    background.submit("long", lambda: background.compute(time.sleep, 60.0))
+    job = background.submit(lambda: background.compute(time.sleep, 60.0))
     background.close()
-    assert not background._thread.is_alive()
+    assert job.done()
 
 
 def test_a_job_that_raises_gives_its_error():
     background = Background()
-    background.submit("bad", lambda: 1 / 0)
-    assert background.wait(5)
-    assert isinstance(background.finished()["bad"], ZeroDivisionError)
+    assert isinstance(background.submit(lambda: 1 / 0).exception(5), ZeroDivisionError)
     background.close()
-    background.close()
-    time.sleep(0)

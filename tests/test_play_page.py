@@ -1,13 +1,17 @@
-"""The page of the playground: its controls, who drives, what comes from outside, and how it looks in a browser."""
+"""The page of the live playground: its controls, who drives, what comes from outside, and how it looks in a browser."""
 
 import contextlib
 import http.client
+import math
+import os
+import re
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,12 +19,14 @@ from browser import start_chromium
 
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.viewer import Viewer
-from ballbot_train.play.gate import Gate
-from ballbot_train.play.page import PlayPage, _film
-from ballbot_train.play.playground import Playground
+from ballbot_train.play import saving, views
+from ballbot_train.play.live_page import PlayPage
+from ballbot_train.play.simulation import Playground
 from ballbot_train.policy_files import SHIPPED
 
 viser = pytest.importorskip("viser")
+
+from visitor import CAMERA, Visitor, wait_for  # noqa: E402 it needs what comes with viser
 
 STANDING = 3  # a certified episode of Stabilize in which LQR comes to rest
 
@@ -43,30 +49,16 @@ class Opened:
         self.viewer.close()
         self.playground.close()
 
-    def control(self, label):
-        """The control with this label."""
-        handles = self.viewer.server.gui._gui_input_handle_from_uuid.values()
-        return next(handle for handle in handles if getattr(handle, "label", None) == label)
-
-    def change(self, label, value, client_id=0):
-        """What viser does when a browser changes a control."""
-        control = self.control(label)
-        control._impl.value = value
-        for callback in control._impl.update_cb:
-            callback(SimpleNamespace(client_id=client_id, client=None, target=control))
-
     def do(self, action):
         """Does something between two steps of the loop, and waits for it."""
         done = threading.Event()
-        self.page._requests.put(lambda: (action(), done.set()))
+        self.page.request(lambda: (action(), done.set()))
         assert done.wait(10)
 
-
-def wait_for(condition, seconds=20.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.02)
+    def goes_on(self):
+        """Waits for another tenth of a second of the simulation."""
+        before = self.playground.crew.steps
+        wait_for(lambda: self.playground.crew.steps > before + 5)
 
 
 @pytest.fixture
@@ -76,121 +68,149 @@ def opened(tmp_path):
     page.close()
 
 
+@pytest.fixture
+def visitor(opened):
+    with Visitor(opened.viewer.port) as visitor:
+        yield visitor
+
+
+@pytest.fixture
+def quiet(capfd):
+    """Checks at the end that nothing was written to the terminal, such as a traceback."""
+    yield
+    time.sleep(0.1)
+    said = capfd.readouterr()
+    assert "Traceback" not in said.out + said.err
+    assert "never retrieved" not in said.err
+
+
 # --- controls ---
 
 
-def test_controls_change_the_playground(opened):
-    opened.change("Masses, %", 50.0)
-    opened.change("Speed", 2.0)
-    opened.change("effort × 10^", 1.0)
-    opened.change("Controller", "you")
-    opened.change("Certified episode", 7)
+def test_controls_change_the_playground(opened, visitor):
+    visitor.change("Masses, %", 50.0)
+    visitor.change("Speed", 2.0)
+    visitor.change("effort × 10^", 1.0)
+    visitor.change("Controller", "you")
+    visitor.change("At the end", "again")
+    visitor.change("Certified episode", 7)
     playground = opened.playground
     wait_for(lambda: playground.episode == 7)
     assert playground.plant["mass"] == 50.0
     assert opened.page.clock.speed == 2.0
-    assert playground.weights["effort_weight"] == pytest.approx(10 * playground.base.effort_weight)
-    assert playground.controller == "you"
+    weight = playground.world.base.effort_weight
+    assert playground.world.weights["effort_weight"] == pytest.approx(10 * weight)
+    assert playground.main.wanted == "you"
+    assert playground.at_end == "again"
+    visitor.change("All as the controllers believe")
+    wait_for(lambda: playground.plant["mass"] == 0.0 == visitor.value("Masses, %"))
+    visitor.change("Start", "Random")
+    wait_for(lambda: playground.episode is None)
 
 
-def test_a_policy_file_becomes_a_controller_that_can_be_chosen(opened):
+def test_a_policy_file_becomes_a_controller_that_can_be_chosen(opened, visitor):
     path = str(SHIPPED / "stabilize-shac.json")
-    opened.change("Policy file", path)
+    visitor.change("Policy file", path)
     wait_for(lambda: opened.playground.main.name == path, 60)
-    assert opened.control("Controller").value == "stabilize-shac"
-    opened.change("Controller", "LQR")
-    wait_for(lambda: opened.control("Policy file").value == "")
-    opened.change("Policy file", "nowhere.json")
-    wait_for(lambda: opened.control("Policy file").value == "")
-    assert "unknown controller 'nowhere.json'" in opened.playground.notice
+    wait_for(lambda: visitor.value("Controller") == "stabilize-shac")
+    visitor.change("Controller", "LQR")
+    wait_for(lambda: visitor.value("Policy file") == "")
+    visitor.change("Policy file", "nowhere.json")
+    wait_for(lambda: "unknown controller 'nowhere.json'" in opened.playground.crew.notice)
 
 
-def test_another_task_brings_its_own_controllers_and_weights(opened):
-    opened.change("Task", "orbit")
-    wait_for(lambda: opened.page._task_shown[0] == "orbit")
-    assert opened.control("radius × 10^").value == 0.0
-    assert "DAgger" in opened.control("Controller").options
+def test_what_a_file_is_called_is_shown_as_it_is(opened, visitor):
+    visitor.change("Policy file", "<img src=x onerror=alert(1)>[a](b).json")
+    wait_for(lambda: r"\<img src\=x onerror\=alert\(1\)\>\[a\]\(b\)\.json" in visitor.text())
 
 
-def test_a_push_comes_from_the_sliders(opened):
-    opened.do(lambda: None)
-    wait_for(lambda: len(opened.playground.main.samples) > 1)
-    opened.page._impulse.value, opened.page._bearing.value = 20.0, 90
-    opened.do(opened.page._push)
-    wait_for(lambda: opened.playground.drawing().robots[-1].push is not None)
-    assert opened.playground.drawing().robots[-1].push == pytest.approx([0, 1000.0], abs=1e-9)  # N for 20 ms
+def test_another_task_brings_its_own_controllers_and_weights(opened, visitor):
+    visitor.change("Task", "orbit")
+    wait_for(lambda: visitor.controls.get("radius × 10^", {}).get("value") == 0.0)
+    wait_for(lambda: "DAgger" in visitor.controls["Controller"]["options"])
 
 
-def test_who_watches_changes_nothing_until_he_takes_over(opened):
-    opened.change("Speed", 0.5, client_id=1)  # the first who touches anything drives
-    wait_for(lambda: opened.page.clock.speed == 0.5)
-    opened.change("Speed", 2.0, client_id=2)
-    wait_for(lambda: opened.control("Speed").value == 0.5)  # it goes back
-    assert opened.page.clock.speed == 0.5
-    opened.page._take_over(2)
-    opened.change("Speed", 2.0, client_id=2)
-    wait_for(lambda: opened.page.clock.speed == 2.0)
-    opened.page._on_disconnect(SimpleNamespace(client_id=2))
-    opened.change("Speed", 1.0, client_id=1)
+def test_a_push_comes_from_the_sliders(opened, visitor):
+    opened.goes_on()
+    visitor.change("N·s", 20.0)
+    visitor.change("Direction, °", 90)
+    visitor.change("Push")
+    wait_for(lambda: opened.playground.shown_push is not None)
+    assert views.drawing(opened.playground).robots[-1].push == pytest.approx([0, 1000.0], abs=1e-9)  # N for 20 ms
+
+
+def test_who_watches_changes_nothing_until_he_takes_over(opened, visitor):
+    with Visitor(opened.viewer.port) as watcher:
+        wait_for(lambda: "2 browsers show this page" in watcher.text())
+        visitor.change("Speed", 0.5)  # the first who came drives
+        wait_for(lambda: watcher.value("Speed") == 0.5)
+        watcher.change("Speed", 2.0)
+        wait_for(lambda: visitor.value("Speed") == watcher.value("Speed") == 0.5)  # it goes back
+        assert opened.page.clock.speed == 0.5
+        watcher.change("Take the controls")
+        watcher.change("Speed", 2.0)
+        wait_for(lambda: opened.page.clock.speed == 2.0)
+    wait_for(lambda: opened.page.driver is None)
+    visitor.change("Speed", 1.0)
     wait_for(lambda: opened.page.clock.speed == 1.0)
 
 
-@pytest.mark.parametrize(
-    ("label", "value"),
-    [
-        ("Speed", float("nan")),
-        ("Speed", -1.0),
-        ("Masses, %", float("inf")),
-        ("effort × 10^", 1e9),
-        ("effort × 10^", float("nan")),
-        ("Task", "dance"),
-        ("Controller", "../../etc/passwd"),
-        ("Certified episode", float("nan")),
-        ("Certified episode", -5),
-        ("At the end", "explode"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_and_goes_back(opened, label, value):
-    before = opened.control(label).value
-    opened.change(label, value)
-    wait_for(lambda: opened.control(label).value == before)
-    assert opened.thread.is_alive()
-
-
-def test_dragging_pushes_where_a_controller_acts_and_steers_where_a_human_drives(opened):
-    pushed = []
-    opened.playground.push = lambda x, y: pushed.append((x, y))
+def test_dragging_pushes_where_a_controller_acts_and_steers_where_a_human_drives(opened, visitor):
+    opened.goes_on()
     for phase in ("start", "update", "end"):
-        opened.page._on_grab(0, phase, np.array([0.5, 0.0]))
-    wait_for(lambda: pushed)
-    assert pushed == [(5.0, 0.0)]
-    opened.change("Controller", "you")
+        visitor.drag(phase, 0.5)
+    wait_for(lambda: opened.playground.shown_push is not None)
+    assert opened.playground.shown_push == pytest.approx([5.0 / 0.02, 0.0])
+    visitor.change("Controller", "you")
     wait_for(lambda: opened.playground.is_driven)
-    opened.page._on_grab(0, "update", np.array([0.5, 0.0]))
+    opened.goes_on()  # the robot is drawn in another colour
+    visitor.drag("start", 0.5)
+    visitor.drag("update", 0.5)
     wait_for(lambda: opened.playground.stick.value == (0.5, 0.0))
-    opened.page._on_grab(0, "end", np.array([0.5, 0.0]))
+    visitor.drag("end", 0.5)
     wait_for(lambda: opened.playground.stick.value == (0.0, 0.0))
 
 
-def test_a_pause_holds_everything_and_a_step_moves_once(opened):
-    wait_for(lambda: len(opened.playground.main.samples) > 1)
-    opened.do(opened.page._toggle)
+def test_keys_and_held_buttons_steer_as_the_browser_looks(opened, visitor):
+    visitor.press("drive left (A)")
+    wait_for(lambda: opened.playground.stick.value != (0.0, 0.0))
+    ahead = np.subtract(CAMERA["look_at"], CAMERA["position"])[:2]
+    assert np.dot(opened.playground.stick.value, ahead) == pytest.approx(0.0, abs=1e-9)
+    wait_for(lambda: opened.playground.stick.value == (0.0, 0.0))  # a key that is let go
+    visitor.send(type="GuiButtonHoldMessage", uuid=visitor.uuid("Back"), frequency=20.0)
+    wait_for(lambda: opened.playground.stick.value != (0.0, 0.0))
+    assert np.dot(opened.playground.stick.value, ahead / np.linalg.norm(ahead)) == pytest.approx(-1.0)
+
+
+def test_a_pause_holds_everything_and_a_step_moves_once(opened, visitor):
+    opened.goes_on()
+    visitor.press("pause or play")
+    wait_for(lambda: opened.page.paused)
     time.sleep(0.05)
     before = opened.playground.seconds
     time.sleep(0.1)
     assert opened.playground.seconds == before
-    opened.do(opened.page._one_step)
+    visitor.change(" ", "Step")
     wait_for(lambda: opened.playground.seconds > before)
     assert opened.playground.seconds == pytest.approx(before + 0.02)
 
 
-def test_files_are_saved_and_handed_to_the_browser(opened, tmp_path):
-    wait_for(lambda: len(opened.playground.main.samples) > 3)
-    sent = []
-    client = SimpleNamespace(send_file_download=lambda name, content, **_: sent.append((name, len(content))))
-    opened.do(lambda: opened.page._save_trajectory(client))
-    assert sent[0][0] == "stabilize-lqr-1.npz"
-    assert len(Trajectory.load(tmp_path / sent[0][0]).u) > 3
+def test_files_are_saved_and_handed_to_the_browser(opened, visitor, tmp_path):
+    opened.goes_on()
+    visitor.change("Trajectory file")
+    wait_for(lambda: visitor.files)
+    assert list(visitor.files) == ["stabilize-lqr-1.npz"]
+    assert len(Trajectory.load(tmp_path / "stabilize-lqr-1.npz").u) > 3
+
+
+@pytest.mark.parametrize(("name", "most"), [("MOST_FILES", 3), ("MOST_BYTES", 1)])
+def test_only_so_much_can_be_saved(opened, visitor, tmp_path, monkeypatch, name, most):
+    monkeypatch.setattr(saving, name, most)
+    opened.goes_on()
+    for _ in range(6):
+        visitor.change("Trajectory file")
+    wait_for(lambda: "start ballbot play again to save more" in opened.playground.crew.notice)
+    assert len(list(tmp_path.iterdir())) == most
 
 
 def test_a_film_of_what_happened_is_drawn(tmp_path):
@@ -198,67 +218,216 @@ def test_a_film_of_what_happened_is_drawn(tmp_path):
     playground.settle()
     for _ in range(6):
         playground.step()
-    assert _film(playground.replay(), tmp_path / "film.webp").stat().st_size > 1000
+    assert saving.film(views.replay(playground), tmp_path / "film.webp").stat().st_size > 1000
     playground.close()
 
 
-# --- from outside ---
+# --- what a browser sends ---
 
 
-def raw_client(port):
-    from websockets.sync.client import connect
+@pytest.mark.parametrize(
+    ("label", "value"),
+    [
+        ("Speed", math.nan),
+        ("Speed", -1.0),
+        ("Speed", "fast"),
+        ("Speed", None),
+        ("Speed", [1.0, 2.0]),
+        ("Speed", True),
+        ("Speed", 1e18),
+        ("Masses, %", math.inf),
+        ("Masses, %", -1e300),
+        ("effort × 10^", 1e9),
+        ("effort × 10^", math.nan),
+        ("Task", "dance"),
+        ("Task", 3),
+        ("Controller", "../../etc/passwd"),
+        ("Controller", {"a": 1}),
+        ("Certified episode", math.nan),
+        ("Certified episode", -5),
+        ("Certified episode", 1e18),
+        ("Certified episode", 1e300),
+        ("At the end", "explode"),
+        ("Start", "Nowhere"),
+        ("Policy file", 7),
+        ("Policy file", "x" * 5000),
+        ("Push", "hard"),
+    ],
+)
+def test_what_makes_no_sense_changes_nothing(quiet, opened, visitor, label, value):
+    before, speed = visitor.value(label), visitor.value("Speed")
+    visitor.change(label, value)
+    visitor.change("Masses, %", 50.0)  # it comes after it
+    wait_for(lambda: opened.playground.plant["mass"] == 50.0)
+    with Visitor(opened.viewer.port) as late:
+        assert late.value(label) == before or label == "Masses, %"
+        assert late.value("Speed") == speed
 
-    return connect(f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
+
+@pytest.mark.parametrize(
+    "updates",
+    [
+        {"gui_api": 5},
+        {"value": 0.5, "gui_api": 5},
+        {"update_cb": []},
+        {"removed": True},
+        {"props": None},
+        {"disabled": True},
+        {"label": "<script>"},
+        {"__class__": "int"},
+        {"no_such_field": 1},
+        {},
+    ],
+)
+def test_only_values_of_controls_are_taken(quiet, opened, visitor, updates):
+    visitor.update("Speed", **updates)
+    visitor.change("Speed", 2.0)
+    wait_for(lambda: opened.page.clock.speed == 2.0)
+    opened.goes_on()
+    assert visitor.controls["Speed"]["label"] == "Speed"
 
 
-def test_garbage_from_the_network_harms_nothing(opened):
-    import msgspec
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"type": "NoSuchMessage"},
+        {"type": "GuiUpdateMessage", "uuid": "no", "updates": {"value": 1}},
+        {"type": "GuiFormDirtyMessage", "uuid": "x" * 1000},
+        {"type": "GuiFormSubmitMessage", "uuid": "x"},
+        {"type": "ShareUrlRequest"},
+        {"type": "ShareUrlDisconnect"},
+        {"type": "RunJavascriptMessage", "source": "alert(1)"},
+        {"type": "GetRenderResponseMessage", "payload": b"0"},
+        {"type": "SceneNodeDragMessage", "phase": "sideways", "name": "/world"},
+        CAMERA | {"position": ["a", "b", "c"]},
+        CAMERA | {"look_at": [1.0]},
+        CAMERA | {"wxyz": [math.nan] * 4, "position": [math.inf] * 3},
+        CAMERA | {"image_width": "wide"},
+        CAMERA | {"image_width": math.nan},
+    ],
+)
+def test_no_message_ends_the_simulation(quiet, opened, visitor, message):
+    with Visitor(opened.viewer.port) as other:
+        other.send(**message)
+        other.press("drive left (A)")
+        opened.goes_on()
+    visitor.change("Speed", 2.0)
+    wait_for(lambda: opened.page.clock.speed == 2.0)
 
-    port = opened.viewer.port
-    wait_for(lambda: len(opened.playground.main.samples) > 1)
-    for message in ("text", b"", b"\x00" * 100, msgspec.msgpack.encode({"type": "NoSuchMessage"})):
-        with raw_client(port) as client:
-            client.send(message)
-    speed, mass = opened.control("Speed"), opened.control("Masses, %")
-    with raw_client(port) as client:
-        for uuid, value in ((speed._impl.uuid, "fast"), (mass._impl.uuid, None), (mass._impl.uuid, [1, 2]), ("no", 1)):
-            update = {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
-            client.send(msgspec.msgpack.encode(update))
-    with socket.create_connection(("127.0.0.1", port)) as plain:
-        plain.sendall(b"GET /../../etc/passwd HTTP/1.1\r\n\r\n")
-    before = opened.playground.seconds_in_all
-    wait_for(lambda: opened.playground.seconds_in_all > before + 0.1)
+
+def test_nobody_uploads_files(quiet, opened, visitor):
+    upload = {"source_component_uuid": visitor.uuid("Speed"), "transfer_uuid": "1"}
+    start = {"type": "FileTransferStartUpload", "filename": "a", "mime_type": "b", "part_count": 1, "size_bytes": 3}
+    visitor.send(**start, **upload)
+    visitor.send(type="FileTransferPart", part_index=0, content=b"abc", **upload)
+    visitor.change("Speed", 2.0)
+    wait_for(lambda: opened.page.clock.speed == 2.0)
+
+
+@pytest.mark.parametrize("junk", ["text", b"", b"\x00" * 100, b"\xc1", b"x" * 100_000, b"\x91" * 50_000])
+def test_junk_ends_at_most_its_own_connection(quiet, opened, visitor, junk):
+    with Visitor(opened.viewer.port) as other, contextlib.suppress(Exception):
+        other.connection.send(junk)
+        other.connection.ping().wait(1)
+    visitor.change("Speed", 2.0)
+    wait_for(lambda: opened.page.clock.speed == 2.0)
+
+
+@pytest.mark.parametrize("state", [{"disabled": True}, {"visible": False}])
+def test_hidden_and_disabled_controls_take_nothing(quiet, opened, visitor, state):
+    control = opened.viewer.server.gui.add_slider("Mine", 0.0, 1.0, 0.1, 0.0, **state)
+    wait_for(lambda: "Mine" in visitor.controls)
+    visitor.change("Mine", 1.0)
+    visitor.change("Speed", 2.0)
+    wait_for(lambda: opened.page.clock.speed == 2.0)
+    assert control.value == 0.0
+
+
+def test_who_does_not_say_where_the_camera_is_changes_nothing(quiet, opened, visitor):
+    with Visitor(opened.viewer.port, arrive=False) as silent:
+        wait_for(lambda: "Speed" in silent.controls)
+        silent.change("Speed", 0.5)
+        silent.change("Task", "orbit")
+        opened.goes_on()
+    assert visitor.value("Speed") == 1.0
+    assert opened.playground.world.task_name == "stabilize"
+
+
+def test_a_flood_of_messages_does_not_hold_up_the_others(quiet, opened, visitor):
+    with Visitor(opened.viewer.port) as other:
+        stop = threading.Event()
+
+        def flood():
+            k = 0
+            while not stop.is_set():
+                k += 1
+                other.change("Speed", 0.1 + 0.1 * (k % 2))
+
+        thread = threading.Thread(target=flood, daemon=True)
+        thread.start()
+        time.sleep(0.5)
+        visitor.change("Masses, %", 50.0)
+        wait_for(lambda: opened.playground.plant["mass"] == 50.0, 10)
+        opened.goes_on()
+        stop.set()
+        other.connection.close()
+        thread.join(10)
+    wait_for(lambda: visitor.value("Speed") == 1.0)
     assert opened.page.clock.speed == 1.0
-    assert opened.playground.plant["mass"] == 0.0
-    with raw_client(port) as client:
-        assert client.recv(timeout=5)
 
 
-class Inner(BaseHTTPRequestHandler):
-    def do_GET(self):
-        self.send_response(200)
-        self.send_header("Content-Length", "6")
-        self.end_headers()
-        self.wfile.write(b"inside")
-
-    def log_message(self, *arguments):
-        pass
-
-
-@pytest.fixture
-def gate():
-    server = HTTPServer(("127.0.0.1", 0), Inner)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    gate = Gate("127.0.0.1", 0, server.server_address[1])
-    yield gate
-    gate.close()
-    gate.close()
-    server.shutdown()
-    server.server_close()
+def test_who_leaves_while_something_is_saved_or_dragged_harms_nothing(quiet, opened, visitor):
+    opened.goes_on()
+    with Visitor(opened.viewer.port) as other:
+        other.change("Take the controls")
+        other.drag("start", 0.5)
+        for label in ("Trajectory file", "Push", "Start for ballbot optimize"):
+            other.change(label)
+        other.connection.close()
+    wait_for(lambda: opened.page.driver is None)
+    visitor.change("Speed", 2.0)
+    wait_for(lambda: opened.page.clock.speed == 2.0)
 
 
-def asked(gate, path, **headers):
-    connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=5)
+@pytest.mark.slow
+def test_the_server_and_its_processes_end_when_they_are_told_to(tmp_path):
+    code = "from ballbot_train.commands.play import play; play('stabilize', 'lqr', (), port=0, physics='rk4')"
+    server = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        port = int(re.search(r":(\d+)", server.stdout.readline()).group(1))
+        with Visitor(port) as visitor:
+            wait_for(lambda: "LQR, " in visitor.text().replace("\\", ""), 60)
+            visitor.change("Film (WebP)")
+            wait_for(lambda: "drawing" in visitor.text(), 30)
+            mine = children(server.pid)
+            assert len(mine) >= 2  # that plans, and that draws
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(20) == 0
+        wait_for(lambda: not any(map(runs, mine)))
+    finally:
+        server.kill()
+        server.wait()
+
+
+def children(pid):
+    """The processes that a process has started."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+
+
+def runs(pid):
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, 0)
+        return True
+    return False
+
+
+# --- who may connect ---
+
+
+def asked(port, path="/", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     text = answer.read()
@@ -266,57 +435,84 @@ def asked(gate, path, **headers):
     return answer, text
 
 
-def test_nobody_passes_the_gate_without_its_token(gate):
-    for path, headers in (
-        ("/", {}),
-        ("/?token=", {}),
-        ("/?token=wrong", {}),
-        ("/", {"Cookie": "ballbot=wrong"}),
-        ("/", {"Cookie": "ballbot="}),
-        ("/", {"Cookie": "\x01;;=;="}),
-    ):
-        answer, text = asked(gate, path, **headers)
-        assert answer.status == 401
-        assert b"inside" not in text
+@pytest.mark.parametrize(
+    ("headers", "message"),
+    [
+        ({"Origin": "http://evil.example"}, "another page"),
+        ({"Origin": "null"}, "another page"),
+        ({"Origin": "http://localhost:1"}, "another page"),
+        ({"Host": "evil.example"}, "no other name"),
+        ({"Host": "localhost.evil.example", "Origin": "http://localhost.evil.example"}, "no other name"),
+        ({"Host": "192.168.0.1"}, "no other name"),
+        ({"Host": "["}, "not an address"),
+        ({"Host": ""}, "no other name"),
+    ],
+)
+@pytest.mark.parametrize("live", [False, True])
+def test_pages_of_others_and_names_of_others_are_refused(opened, headers, message, live):
+    upgrade = {
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
+    }
+    answer, text = asked(opened.viewer.port, **headers, **(upgrade if live else {}))
+    assert answer.status in (400, 403)
+    assert message in text.decode()
 
 
-def test_the_token_becomes_a_cookie_that_opens_the_gate(gate):
-    answer, _ = asked(gate, f"/?token={gate.token}")
-    assert (answer.status, answer.headers["Location"]) == (303, "/")
-    assert "HttpOnly" in answer.headers["Set-Cookie"]
-    cookie = answer.headers["Set-Cookie"].split(";")[0]
-    assert asked(gate, "/", Cookie=cookie)[1] == b"inside"
-    own = f"http://127.0.0.1:{gate.port}"
-    assert asked(gate, "/", Cookie=cookie, Origin=own, Host=own.removeprefix("http://"))[1] == b"inside"
-    assert asked(gate, "/", Cookie=cookie, Origin="http://evil.example")[0].status == 403
-    assert gate.token in gate.address
+def test_its_own_page_may_connect_and_no_other_may_frame_it(opened):
+    port = opened.viewer.port
+    for host in (f"localhost:{port}", f"127.0.0.1:{port}", "localhost:9000", "[::1]:8080"):  # tunnels have other ports
+        answer, text = asked(port, Host=host, Origin=f"http://{host}")
+        assert (answer.status, b"<html" in text) == (200, True)
+        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'self'"
+    with Visitor(port, Origin=f"http://127.0.0.1:{port}") as visitor:
+        assert visitor.value("Speed") == 1.0
 
 
-def test_the_page_and_its_live_connection_pass_the_gate(opened):
-    from websockets.exceptions import InvalidStatus
-    from websockets.sync.client import connect
-
-    gate = Gate("127.0.0.1", 0, opened.viewer.port)
+def test_others_need_the_token_which_becomes_a_cookie():
+    viewer = Viewer("0.0.0.0", 0)
     try:
-        assert b"<html" in asked(gate, "/", Cookie=f"ballbot={gate.token}")[1]
-        live = f"ws://127.0.0.1:{gate.port}", [f"viser-v{viser.__version__}"]
+        port, token = viewer.port, viewer.address.partition("?token=")[2]
+        assert len(token) > 20
+        cookies = ("", "ballbot=wrong", "ballbot=", "a;;=;=")
+        for path, cookie in [("/", ""), ("/?token=", ""), ("/?token=wrong", ""), *(("/", each) for each in cookies)]:
+            answer, text = asked(port, path, Cookie=cookie)
+            assert (answer.status, b"<html" in text) == (401, False)
+        answer, _ = asked(port, f"/?token={token}")
+        assert (answer.status, answer.headers["Location"]) == (303, "/")
+        assert "HttpOnly" in answer.headers["Set-Cookie"]
+        cookie = answer.headers["Set-Cookie"].split(";")[0]
+        host = "any.example:80"
+        assert b"<html" in asked(port, "/", Cookie=cookie, Host=host, Origin=f"http://{host}")[1]
+        assert asked(port, "/", Cookie=cookie, Origin="http://evil.example")[0].status == 403
+        from websockets.exceptions import InvalidStatus
+
         with pytest.raises(InvalidStatus, match="401"):
-            connect(live[0], subprotocols=live[1])
-        cookie = {"Cookie": f"ballbot={gate.token}"}
-        with connect(live[0], subprotocols=live[1], additional_headers=cookie, max_size=None) as client:
-            assert client.recv(timeout=10)
+            Visitor(port, arrive=False)
+        with Visitor(port, arrive=False, Cookie=cookie) as visitor:
+            wait_for(lambda: visitor.packets > 0)
     finally:
-        gate.close()
+        viewer.close()
 
 
-def test_what_is_no_request_is_dropped(gate):
-    for sent in (b"\x16\x03\x01 tls?", b"GET\r\n\r\n", b"x" * 70_000):
-        with socket.create_connection(("127.0.0.1", gate.port), timeout=5) as plain:
-            plain.sendall(sent)
-            plain.shutdown(socket.SHUT_WR)
-            with contextlib.suppress(ConnectionError):
-                assert b"inside" not in plain.recv(1000)
-    assert asked(gate, "/")[0].status == 401
+@pytest.mark.parametrize(
+    "sent", [b"\x16\x03\x01 tls?", b"GET\r\n\r\n", b"x" * 70_000, b"GET /../../etc/passwd HTTP/1.1\r\n\r\n"]
+)
+def test_what_is_no_request_is_dropped(quiet, opened, sent):
+    with socket.create_connection(("127.0.0.1", opened.viewer.port), timeout=5) as plain, contextlib.suppress(OSError):
+        plain.sendall(sent)
+        plain.shutdown(socket.SHUT_WR)
+        assert b"200 OK" not in plain.recv(1000)
+    assert asked(opened.viewer.port)[0].status == 200
+
+
+@pytest.mark.parametrize(("host", "port"), [("192.0.2.1", 8080), ("127.0.0.1", 70_000), ("no.such.host.invalid", 0)])
+def test_where_nothing_can_listen_is_said(host, port):
+    with pytest.raises(OSError, match="cannot listen on"):
+        Viewer(host, port)
 
 
 # --- in a browser ---
@@ -401,10 +597,10 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
     opened.do(lambda: opened.playground.set_ghosts(["you"]))
     one.execute_script(push)
     wait_for(lambda: opened.playground.main.samples[-1].tilt > max(before, np.radians(4)), 60)
-    assert opened.playground._runners["you"].samples
+    assert opened.playground.crew.runners[1].samples
 
     # the ghost gets the push too, and the driver chooses another controller: the robot goes on where it is
-    leaning = [sample.tilt for sample in opened.playground._runners["you"].samples]
+    leaning = [sample.tilt for sample in opened.playground.crew.runners[1].samples]
     assert max(leaning[-200:]) > np.radians(4)
     opened.do(lambda: opened.playground.set_ghosts([]))
     places = watched(opened)

@@ -1,5 +1,6 @@
 """`ballbot play`: a live playground in the browser."""
 
+import signal
 from pathlib import Path
 from typing import Literal
 
@@ -7,11 +8,8 @@ from ballbot_gym.robots import PAPER
 from ballbot_gym.viewer import HOST, PORT, Viewer, import_viser
 from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import task_name
-from ballbot_train.play.gate import Gate
-from ballbot_train.play.page import PlayPage
-from ballbot_train.play.playground import Playground
-
-_LOCAL = ("127.0.0.1", "localhost", "::1")
+from ballbot_train.play.live_page import PlayPage
+from ballbot_train.play.simulation import Playground
 
 
 def play(
@@ -47,19 +45,15 @@ def play(
     task = task_name(controller, task, robot)
     import_viser()
     playground = Playground(task, controller, ghosts, physics, episode, seed, robot, policies, other_process=True)
-    local = host in _LOCAL
-    viewer = Viewer(HOST if not local else host, port if local else 0, "ballbot play")
-    gate = None if local else Gate(host, port, viewer.port)
+    viewer = Viewer(host, port, "ballbot play")
     page = PlayPage(playground, viewer, out)
+    signal.signal(signal.SIGTERM, lambda *_: page.stop())
     try:
-        address = viewer.address if gate is None else gate.address
-        console.print(f"open {address}\nCtrl+C ends it", highlight=False)
+        console.print(f"open {viewer.address}\nCtrl+C ends it", highlight=False)
         page.run()
     except KeyboardInterrupt:
         console.print("ended")
     finally:
         page.close()
-        if gate is not None:
-            gate.close()
         viewer.close()
         playground.close()

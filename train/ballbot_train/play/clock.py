@@ -38,7 +38,7 @@ class Timing:
 class Clock:
     """Says when steps are due. Step k is due k·dt/speed after the start, so that waiting errors do not add up.
 
-    `now` gives wall time in s.
+    `speed` is simulated seconds per second, and `now` gives wall time in s.
     """
 
     dt: float
@@ -49,10 +49,6 @@ class Clock:
     def __post_init__(self) -> None:
         self._next: float | None = None  # when the next step is due; None while the simulation stands still
         self._last = 0.0
-
-    def set_speed(self, speed: float) -> None:
-        """Sets the simulated seconds per second."""
-        self.speed = speed
 
     def stop(self) -> None:
         """Stands still, for instance in a pause. The next call of `take` starts anew."""

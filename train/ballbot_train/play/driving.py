@@ -9,6 +9,9 @@ from ballbot_baselines.linearize import discretize
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
+DRIVERS: dict[str, Literal["force", "speed"]] = {"you": "speed", "you (force)": "force"}
+"""Controllers that are human: by name, what the stick commands."""
+
 DRIVE_FORCE = 100.0
 """N, of a stick that is fully out."""
 DRIVE_SPEED = 2.5
@@ -18,22 +21,18 @@ _EFFORT = 1e-4  # of squared force, 1/(N² s)
 
 
 class Stick:
-    """What the human commands: (2,) in the unit circle, along x and y."""
+    """What the human commands."""
 
     def __init__(self) -> None:
-        self._value = (0.0, 0.0)
-
-    @property
-    def value(self) -> tuple[float, float]:
+        self.value = (0.0, 0.0)
         """Along x and y; the length is at most 1."""
-        return self._value
 
     def move(self, x: float, y: float) -> None:
         """Moves it; more than a length of 1 counts as 1, and what is not finite as 0."""
         length = math.hypot(x, y)
         if not math.isfinite(length):
             x, y, length = 0.0, 0.0, 0.0
-        self._value = (x / max(length, 1.0), y / max(length, 1.0))
+        self.value = (x / max(length, 1.0), y / max(length, 1.0))
 
 
 class DriveController:

@@ -3,6 +3,7 @@
 import math
 import time
 from collections import deque
+from concurrent.futures import Future
 from typing import NamedTuple
 
 import numpy as np
@@ -39,11 +40,14 @@ class Runner:
     """A ballbot under one controller. Its controller counts time from the step in which it was reset."""
 
     def __init__(self, name: str, task: Tunable, params: BallbotParams, physics: str):
-        self.name = name
+        self.name = self.wanted = name
+        """Under which controller it runs, and which it shall have as soon as that is made."""
+        self.making: Future | None = None
+        self.following: Future | None = None
+        """What makes the wanted controller, and the one for the next episode."""
         self.controller: Controller | None = None
         self.x: State = (0.0,) * 8
         self.force = (0.0, 0.0)
-        self.push = (0.0, 0.0)
         self.cost = 0.0
         self.violated = ""
         """The limit that was violated, or ""."""
@@ -87,7 +91,7 @@ class Runner:
 
     def place(self, x: State) -> None:
         """Puts the robot upright, or however x (8,) says."""
-        self.x, self.force, self.push = x, (0.0, 0.0), (0.0, 0.0)
+        self.x, self.force = x, (0.0, 0.0)
         self.violated, self.arrived = "", False
         self._simulator.reset(x)
 
@@ -99,6 +103,21 @@ class Runner:
         """How long ago the controller was reset, s, at a step."""
         return (step - self._controller_start) * self._task.control_dt
 
+    def rest_of_plan(self, step: int) -> np.ndarray | None:
+        """(n, 8) states of the plan that its controller tracks, from a step on; None if it tracks none."""
+        plan = getattr(self.controller, "plan", None)
+        return None if plan is None else plan.trajectory.x[min(step - self._controller_start, len(plan.trajectory.u)) :]
+
+    def expected(self, step: int, ahead: int) -> State:
+        """The state (8,) in which it will be some control steps after a step, as far as its controller knows."""
+        rest = self.rest_of_plan(step)
+        return self.x if rest is None else tuple(rest[min(ahead, len(rest) - 1)].tolist())
+
+    def has_no_plan_left(self, step: int) -> bool:
+        """Whether it is on its way, but its controller has come to the end of the plan within which it predicts."""
+        rest = self.rest_of_plan(step)
+        return not self.stands_still and hasattr(self.controller, "predicted") and rest is not None and len(rest) < 2
+
     def set_plant(self, randomization: Randomization) -> None:
         """Changes what the controller does not know: the true robot, its actuator and its sensors."""
         dt = self._task.control_dt
@@ -106,8 +125,9 @@ class Runner:
         self._drawn = randomization.draw((0.5,) * Randomization.EPISODE_DRAWS, dt)
         self._disturbance = Disturbance(randomization, self._nominal, dt)
         self._disturbance.begin(self._drawn)
-        self._true = randomization.robot(self._nominal, self._drawn[:4])
-        self._simulator.set_params(self._true)
+        self.true = randomization.robot(self._nominal, self._drawn[:4])
+        """The robot that is simulated."""
+        self._simulator.set_params(self.true)
         self._simulator.reset(self.x)
 
     def act(self, step: int, noise: tuple[float, ...]) -> tuple[float, float]:
@@ -146,7 +166,6 @@ class Runner:
         """
         task, dt = self._task, self._task.control_dt
         self.force = self._disturbance.actuate(command)
-        self.push = push
         self.cost += task.cost(self.x, self.force, c) * dt
         total = (self.force[0] + push[0], self.force[1] + push[1])
         slips = self._slips(total)
@@ -166,10 +185,10 @@ class Runner:
 
     def _slips(self, total: tuple[float, float]) -> bool:
         """Whether a force, N, asks the floor for more than it can give, where contact is not simulated."""
-        if not self._true.grips or self._simulator.floor_force() is not None:
+        if not self.true.grips or self._simulator.floor_force() is not None:
             return False
-        asked = dynamics.held_contact(self._true, self.x, total, self._task.control_dt)
-        return not dynamics.keeps_grip(self._true, asked)
+        asked = dynamics.held_contact(self.true, self.x, total, self._task.control_dt)
+        return not dynamics.keeps_grip(self.true, asked)
 
     def weigh_again(self, c: tuple[float, ...]) -> None:
         """Counts the cost so far with other weights."""
@@ -179,3 +198,8 @@ class Runner:
     def close(self) -> None:
         """Releases the simulator; may be called again."""
         self._simulator.close()
+
+
+def failure_word(limit: str) -> str:
+    """What a violated limit means, in words; "" for none."""
+    return {"": "", "tilt": "fell", "arena": "left the arena"}.get(limit, f"touched {limit}")

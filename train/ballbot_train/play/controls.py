@@ -1,0 +1,317 @@
+"""The controls of the live page. Each shows what holds in the playground, and changes it for the browser that drives."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ballbot_gym.robots import ROBOTS
+from ballbot_gym.tasks import TASKS
+from ballbot_train.evaluation.controllers import is_file
+from ballbot_train.evaluation.robustness import STRESSES
+from ballbot_train.play import views
+from ballbot_train.play.driving import DRIVERS
+from ballbot_train.play.plots import MOST_GHOSTS
+from ballbot_train.play.simulation import AT_END, LARGEST_PUSH
+from ballbot_train.play.tunable import weight_names
+from ballbot_train.play.world import PLANT
+from ballbot_train.report import labels
+
+if TYPE_CHECKING:
+    from ballbot_train.play.live_page import PlayPage
+
+SPEEDS = (0.1, 2.0)
+"""Least and greatest simulated seconds per second."""
+
+_EXPONENTS = (-1.5, 1.5)  # of 10, by which a weight's slider multiplies the task's own
+_FILMS = {"Film (WebP)": ".webp", "Film (MP4)": ".mp4"}
+_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip) or rsl_rl (.pt), where the simulation runs"
+
+
+_IMPULSE_PER_METRE = 10.0  # N·s of a push by dragging the robot
+_STICK_METRES = 1.0  # of a drag that puts the stick fully out
+_HELD = 0.25  # s, after which a button of the pad counts as let go
+_KEY_HELD = 0.6  # s, the same for a key: keyboards repeat a held key only after half a second
+_DRAG_HELD = 5.0  # s, the same for a drag
+_DIRECTIONS = {"forward": (1.0, 0.0), "left": (0.0, 1.0), "back": (-1.0, 0.0), "right": (0.0, -1.0)}
+_KEYS = {
+    "forward": ("W", "arrowup"),
+    "left": ("A", "arrowleft"),
+    "back": ("S", "arrowdown"),
+    "right": ("D", "arrowright"),
+}
+_LEAD = (
+    "Choose **you** as the controller. The stick then commands a speed, and the robot keeps its balance. "
+    "**you (force)** commands the force itself: how long can you balance? Try it at speed 0.3."
+)
+
+
+class Controls:
+    """Builds the controls of a page, and keeps them as the playground is."""
+
+    def __init__(self, page: "PlayPage"):
+        self._page, self._playground, self._gui = page, page.playground, page.viewer.server.gui
+        self._bound: list[tuple[Any, Callable[[], Any]]] = []
+        self._task_controls: list[Any] = []
+        self._task_shown = ("", "")
+        self._episode_typed = self._playground.episode or 0
+        self._impulse, self._bearing = 10.0, 0.0  # N·s and degrees
+        tabs = self._gui.add_tab_group()
+        with tabs.add_tab("Play"):
+            self._build_choices()
+            self._build_time()
+            self._build_push()
+        with tabs.add_tab("Change"):
+            self._build_plant()
+            self._weight_folder = self._gui.add_folder("Weights of the cost")
+        with tabs.add_tab("Drive"):
+            page.steering.build()
+            self._scores = self._gui.add_markdown("")
+        with tabs.add_tab("Save"):
+            self._build_saving()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Shows in every control what holds now."""
+        shown = self._playground.world.task_name, self._playground.world.robot
+        if self._task_shown != shown:
+            self._task_shown = shown
+            self._build_task()
+        if self._controller.options != (options := tuple(self._options())):
+            self._controller.options = options
+        for control, read in self._bound:
+            if control.value != (value := read()):
+                control.value = value
+
+    def show_scores(self, scores: Sequence[str]) -> None:
+        """Lists how the last episodes ended, the last one first."""
+        self._scores.content = "\n".join(f"- {score}" for score in reversed(scores))
+
+    # --- building blocks ---
+
+    def _bind(self, control: Any, apply: Callable[[Any], None], read: Callable[[], Any]) -> Any:
+        """Lets a control change the playground. What a watcher changes, and what is refused, goes back to what holds."""
+        control.on_update(self._page.asking(lambda _, value: apply(value)))
+        self._bound.append((control, read))
+        return control
+
+    def _bind_attribute(self, control: Any, owner: object, name: str) -> None:
+        self._bind(control, lambda value: setattr(owner, name, value), lambda: getattr(owner, name))
+
+    def _button(self, label: str, action: Callable[[Any], None], hint: str | None = None) -> None:
+        """A button that does something for viser's client who presses it."""
+        self._gui.add_button(label, hint=hint).on_click(self._page.asking(lambda client, _: action(client)))
+
+    def _button_group(self, label: str, actions: dict[str, Callable[[], None]], hint: str) -> None:
+        group = self._gui.add_button_group(label, tuple(actions), hint=hint)
+        group.on_click(self._page.asking(lambda _, button: actions[button]()))
+
+    def _key(self, label: str, key: Any, action: Callable[[], None]) -> None:
+        self._gui.add_command(label, hotkey=key).on_trigger(self._page.asking(lambda *_: action()))
+
+    # --- the tabs ---
+
+    def _build_choices(self) -> None:
+        gui, playground = self._gui, self._playground
+        self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_task, lambda: playground.world.task_name)
+        self._bind(gui.add_dropdown("Robot", tuple(ROBOTS)), playground.set_robot, lambda: playground.world.robot)
+        self._controller = gui.add_dropdown("Controller", tuple(self._options()))
+        self._bind(self._controller, self._choose, self._chosen)
+        self._bind(gui.add_text("Policy file", "", hint=_FILE_HINT), self._choose_file, self._file)
+        self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
+
+    def _build_time(self) -> None:
+        gui, page, playground = self._gui, self._page, self._playground
+        with gui.add_folder("Time"):
+            actions = {"Play / pause": self._toggle, "Step": self._step, "Restart": playground.restart}
+            self._button_group(" ", actions, hint="keys: space, and R for restart")
+            self._bind_attribute(gui.add_slider("Speed", *SPEEDS, step=0.1, initial_value=1.0), page.clock, "speed")
+            self._episode = gui.add_number("Certified episode", 0, min=0, step=1)
+            self._bind(self._episode, self._start_certified, self._shown_episode)
+            starts = {
+                "Certified": lambda: self._start_certified(self._shown_episode()),
+                "Random": playground.start_random,
+            }
+            self._button_group("Start", starts, hint="key: N for a random one")
+            self._bind_attribute(gui.add_dropdown("At the end", AT_END), playground, "at_end")
+        self._key("pause or play", "space", self._toggle)
+        self._key("restart", "R", playground.restart)
+        self._key("random start", "N", playground.start_random)
+
+    def _build_push(self) -> None:
+        with self._gui.add_folder("Push"):
+            self._bind_attribute(self._gui.add_slider("N·s", 0.0, LARGEST_PUSH, 0.5, 10.0), self, "_impulse")
+            slider = self._gui.add_slider("Direction, °", 0.0, 360.0, 5.0, 0.0, hint="from the x axis")
+            self._bind_attribute(slider, self, "_bearing")
+            self._button("Push", lambda _: self._push(), hint="key: P; or drag the robot and let go")
+        self._key("push", "P", self._push)
+
+    def _build_plant(self) -> None:
+        playground = self._playground
+        with self._gui.add_folder("What the controllers do not know"):
+            for stress, (label, low, high, step) in PLANT.items():
+                self._bind(
+                    self._gui.add_slider(label, low, high, step, 0.0, hint=STRESSES[stress].label),
+                    lambda value, stress=stress: playground.set_plant(stress, value),
+                    lambda stress=stress: playground.plant[stress],
+                )
+            self._button("All as the controllers believe", lambda _: self._reset_plant())
+
+    def _build_saving(self) -> None:
+        saver = self._page.saver
+        self._gui.add_markdown(f"Files are written to `{saver.out}`, and this page downloads them.")
+        self._button("Trajectory file", saver.save_trajectory)
+        for label, ending in _FILMS.items():
+            self._button(label, lambda client, ending=ending: saver.save_film(client, ending))
+        self._button("Start for ballbot optimize", lambda _: self._show_optimize())
+        self._optimize_text = self._gui.add_markdown("", visible=False)
+
+    def _build_task(self) -> None:
+        """Controls that differ from task to task."""
+        gui, playground = self._gui, self._playground
+        self._bound = [pair for pair in self._bound if pair[0] not in self._task_controls]
+        for control in self._task_controls:
+            control.remove()
+        self._task_controls = []
+        with self._ghost_folder:
+            for option, name in self._options().items():
+                if name not in DRIVERS:
+                    self._task_controls.append(
+                        self._bind(
+                            gui.add_checkbox(option, False),
+                            lambda wanted, name=name: self._set_ghost(name, wanted),
+                            lambda name=name: name in playground.crew.ghosts,
+                        )
+                    )
+        with self._weight_folder:
+            for name in weight_names(playground.world.base):
+                label, own = name.removesuffix("_weight").replace("_", " "), getattr(playground.world.base, name)
+                hint = f"{name}: 0 is the task's own, {own:g}"
+                self._task_controls.append(
+                    self._bind(
+                        gui.add_slider(f"{label} × 10^", *_EXPONENTS, 0.05, 0.0, hint=hint),
+                        lambda value, name=name, own=own: playground.set_weight(name, own * 10**value),
+                        lambda name=name, own=own: self._exponent(name, own),
+                    )
+                )
+        self._episode.max = max(0, playground.world.episodes - 1)
+        self._page.clock.dt = playground.world.task.control_dt
+
+    # --- what they do ---
+
+    def _options(self) -> dict[str, str]:
+        """What can be chosen by how the page calls it. Files called the same are told apart by their paths."""
+        names = self._playground.controllers
+        shown = [labels.label(name) for name in names]
+        return {
+            name if is_file(name) and shown.count(label) > 1 else label: name
+            for name, label in zip(names, shown, strict=True)
+        }
+
+    def _choose(self, option: str) -> None:
+        if (name := self._options().get(option)) is None:  # the options have changed meanwhile
+            raise ValueError(f"unknown controller {option!r}")
+        self._playground.set_controller(name)
+
+    def _chosen(self) -> str:
+        return next(option for option, name in self._options().items() if name == self._playground.main.wanted)
+
+    def _choose_file(self, path: str) -> None:
+        if path:
+            self._playground.set_controller(path)
+
+    def _file(self) -> str:
+        """The policy file of the main robot, if it has one."""
+        name = self._playground.main.wanted
+        return name if is_file(name) else ""
+
+    def _set_ghost(self, name: str, wanted: bool) -> None:
+        others = [ghost for ghost in self._playground.crew.ghosts if ghost != name]
+        if wanted and len(others) >= MOST_GHOSTS:
+            raise ValueError(f"at most {MOST_GHOSTS} ghosts")
+        self._playground.set_ghosts([*others, name] if wanted else others)
+
+    def _exponent(self, name: str, own: float) -> float:
+        return round(20 * math.log10(self._playground.world.weights.get(name, own) / own)) / 20
+
+    def _start_certified(self, episode: int) -> None:
+        self._playground.start_certified(episode)
+        self._episode_typed = episode
+
+    def _shown_episode(self) -> int:
+        """The certified episode, or the number that was typed last."""
+        episode = self._playground.episode
+        return self._episode_typed if episode is None else episode
+
+    def _toggle(self) -> None:
+        self._page.paused = not self._page.paused
+
+    def _step(self) -> None:
+        self._page.paused = True
+        self._page.single_steps += 1
+
+    def _push(self) -> None:
+        bearing = math.radians(self._bearing)
+        self._playground.push(self._impulse * math.cos(bearing), self._impulse * math.sin(bearing))
+
+    def _reset_plant(self) -> None:
+        for stress in PLANT:
+            self._playground.set_plant(stress, 0.0)
+
+    def _show_optimize(self) -> None:
+        self._optimize_text.content = f"```\n{views.optimize_command(self._playground)}\n```"
+        self._optimize_text.visible = True
+
+
+class Steering:
+    """Moves the playground's stick for a page."""
+
+    def __init__(self, page: "PlayPage"):
+        self._page, self._playground = page, page.playground
+        self._until = 0.0
+        page.viewer.on_grab = self._grab
+
+    def build(self) -> None:
+        """Adds the buttons of the pad, and the keys."""
+        gui = self._page.viewer.server.gui
+        gui.add_markdown(_LEAD)
+        for direction, keys in _KEYS.items():
+            gui.add_button(direction.capitalize()).on_hold(self._steered(direction, _HELD), callback_hz=20.0)
+            for key in keys:
+                command = gui.add_command(f"drive {direction} ({key})", hotkey=key)  # pyright: ignore[reportArgumentType]
+                command.on_trigger(self._steered(direction, _KEY_HELD))
+        gui.add_markdown("Or hold W A S D or the arrow keys, or drag the robot.")
+
+    def let_go(self) -> None:
+        """Centres the stick when nothing holds it any more."""
+        if time.perf_counter() > self._until:
+            self._playground.stick.move(0.0, 0.0)
+
+    def _steered(self, direction: str, seconds: float) -> Any:
+        """Moves the stick as seen by the browser that asks, for a while."""
+
+        async def steered(event: Any) -> None:
+            camera = event.client.camera
+            ahead = np.array(camera.look_at, np.float64)[:2] - np.array(camera.position, np.float64)[:2]
+            length = float(np.hypot(*ahead))
+            cosine, sine = (ahead / length).tolist() if math.isfinite(length) and length > 0 else (1.0, 0.0)
+            x, y = _DIRECTIONS[direction]
+            self._page.ask(event.client_id, lambda: self._move(cosine * x - sine * y, sine * x + cosine * y, seconds))
+
+        return steered
+
+    def _move(self, x: float, y: float, seconds: float) -> None:
+        self._playground.stick.move(x, y)
+        self._until = time.perf_counter() + seconds
+
+    def _grab(self, client_id: int, phase: str, vector: np.ndarray) -> None:
+        """Dragging steers where a human drives, and pushes when it ends everywhere else."""
+        x, y = vector.tolist()
+        ended = phase == "end"
+        if self._playground.is_driven:
+            held = 0.0 if ended else _DRAG_HELD
+            self._page.ask(client_id, lambda: self._move(x / _STICK_METRES, y / _STICK_METRES, held))
+        elif ended:
+            self._page.ask(client_id, lambda: self._playground.push(_IMPULSE_PER_METRE * x, _IMPULSE_PER_METRE * y))

@@ -1,0 +1,273 @@
+"""The robots of a playground under their controllers: the main one, which counts, and its ghosts."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, wait
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ballbot_baselines import CONTROLLERS
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.rollout import Controller
+from ballbot_gym.simulator import State
+from ballbot_train.evaluation.controllers import is_expert, is_file, make_controller
+from ballbot_train.play.background import Background
+from ballbot_train.play.driving import DRIVERS, DriveController, Stick
+from ballbot_train.play.runner import Runner
+from ballbot_train.play.tunable import Tunable
+from ballbot_train.play.world import World
+from ballbot_train.report import labels
+
+_SETTLE = 900.0  # s: the first time in a task, solvers are compiled
+_FROM_ELSEWHERE = ("lqr", "trajopt")  # controllers that are data, so that they can come from another process
+
+
+class Crew:
+    """Runners and who controls them. A robot waits for its first controller, and goes on while another one is made."""
+
+    def __init__(self, physics: str, stick: Stick, other_process: bool):
+        """Starts the background, which has another process plan if it is told so."""
+        self.runners: list[Runner] = []
+        """The main robot, then the ghosts."""
+        self.steps = 0
+        """Control steps since the playground was opened."""
+        self.notice = ""
+        """What went wrong last, in words."""
+        self._physics, self._stick, self.background = physics, stick, Background(other_process)
+        self._randomization = Randomization()
+        self._optimum: Future | None = None
+
+    @property
+    def main(self) -> Runner:
+        """The main robot."""
+        return self.runners[0]
+
+    @property
+    def ghosts(self) -> tuple[str, ...]:
+        """The names of the ghosts' controllers."""
+        return tuple(ghost.wanted for ghost in self.runners[1:])
+
+    @property
+    def preparing(self) -> bool:
+        """Whether a robot waits for its controller."""
+        return any(runner.controller is None for runner in self.runners)
+
+    @property
+    def planning(self) -> bool:
+        """Whether a controller is being made while the robots go on."""
+        return any(runner.making is not None for runner in self.runners)
+
+    @property
+    def optimum(self) -> np.ndarray | None:
+        """(n + 1,) what the optimum of the episode has cost after each control step; None while it is not known."""
+        made = self._optimum
+        return made.result() if made is not None and made.done() and made.exception() is None else None
+
+    # --- who is there ---
+
+    def open(self, world: World, names: Iterable[str]) -> None:
+        """Replaces all robots by others for another world, under controllers by name. The first is the main one's."""
+        for runner in self.runners.copy():
+            self._remove(runner)
+        self.world = world
+        for name in dict.fromkeys(names):
+            self._add(name)
+
+    def set_ghosts(self, names: Iterable[str]) -> None:
+        """Other ghosts. A new one begins where the main robot is."""
+        wanted = [name for name in dict.fromkeys(names) if name != self.main.wanted]
+        for runner in self.runners[1:]:
+            if runner.wanted not in wanted:
+                self._remove(runner)
+        for name in wanted:
+            if name not in self.ghosts:
+                runner = self._add(name)
+                runner.begin(self.main.x)
+                runner.cost = self.main.cost
+                self.order(runner)
+
+    def set_plant(self, randomization: Randomization) -> None:
+        """Changes what the controllers do not know."""
+        self._randomization = randomization
+        for runner in self.runners:
+            runner.set_plant(randomization)
+
+    def close(self) -> None:
+        """Releases the simulators and the background; may be called again."""
+        self.background.close()
+        for runner in self.runners:
+            runner.close()
+
+    def _add(self, name: str) -> Runner:
+        runner = Runner(name, self.world.task, self.world.params, self._physics)
+        runner.set_plant(self._randomization)
+        self.runners.append(runner)
+        return runner
+
+    def _remove(self, runner: Runner) -> None:
+        _cancel(runner.making, runner.following)
+        runner.close()
+        self.runners.remove(runner)
+
+    # --- time ---
+
+    def begin(self, x: State, c: tuple[float, ...]) -> None:
+        """Places all robots in state x (8,) of an episode with constants c of the tunable task. They wait for controllers."""
+        self._x, self._c = x, c
+        for runner in self.runners:
+            runner.begin(x)
+            runner.take_controller(None, self.steps)
+            runner.name = runner.wanted
+            self.order(runner)
+        self._order_optimum()
+
+    def go_on(self) -> None:
+        """Begins another episode where the robots are. A ghost that has failed begins where the main robot is."""
+        self._x = self.main.x
+        for runner in self.runners:
+            ahead, failed = runner.following, runner.violated != ""
+            if failed:
+                runner.place(self._x)
+            runner.restart_cost()
+            planned = not failed and ahead is not None and ahead.done() and ahead.exception() is None
+            if ahead is not None and planned and ahead.result()[0] == runner.wanted == runner.name:
+                runner.take_controller(ahead.result()[2], self.steps)
+            else:
+                self.order(runner)
+        self._order_optimum()
+
+    def step(self, noise: tuple[float, ...], push: tuple[float, float], seconds_left: float) -> None:
+        """Moves all robots by one control step, under a push (2,), N, with that many seconds of the episode left after it."""
+        for runner in self.runners:
+            if not runner.stands_still:
+                try:
+                    command = runner.act(self.steps, noise)
+                except Exception as error:  # a controller of any kind, such as a policy: the others go on
+                    self.notice, command = f"{labels.label(runner.wanted)}: {error}", (0.0, 0.0)
+                runner.step(self.steps, command, push, self._c, seconds_left)
+        self.steps += 1
+
+    def weigh_again(self, c: tuple[float, ...]) -> None:
+        """Counts costs with other weights, and has the controllers that know of them made again."""
+        self._c = c
+        for runner in self.runners:
+            runner.weigh_again(c)
+            if is_expert(runner.wanted):
+                self.order(runner)
+        self._order_optimum()
+
+    # --- controllers ---
+
+    def order(self, runner: Runner, ahead: int = 0) -> None:
+        """Asks for the controller that a robot wants, from now on or for an episode that begins some steps ahead."""
+        name, step, compute = runner.wanted, self.steps + ahead, self.background.compute
+        x = np.array(runner.expected(self.steps, ahead) if ahead else runner.x)
+        made = partial(_make, name, self.world.task, self.world.params, x, np.array(self._c), self._stick, compute)
+        future = self.background.submit(lambda: (name, step, made()))
+        _cancel(runner.following)
+        if ahead:
+            runner.following = future
+        else:
+            _cancel(runner.making)
+            runner.making, runner.following = future, None
+
+    def _order_optimum(self) -> None:
+        _cancel(self._optimum)
+        problem = self.world.task, self.world.params, np.array(self._x), np.array(self._c)
+        self._optimum = self.background.submit(lambda: self.background.compute(_optimum_costs, *problem))
+
+    def poll(self) -> None:
+        """Hands out the controllers that are made."""
+        for runner in self.runners:
+            if runner.making is None or not runner.making.done():
+                continue
+            future, runner.making = runner.making, None
+            if (error := future.exception()) is not None:
+                self._do_without(runner, error)
+                continue
+            runner.name, step, controller = future.result()
+            runner.take_controller(controller, step)
+            if is_file(runner.name):
+                self.world.offer(runner.name)
+
+    def wait(self) -> None:
+        """Waits for everything that is being made; raises a TimeoutError if that takes too long."""
+        jobs = [self._optimum, *(job for runner in self.runners for job in (runner.making, runner.following))]
+        if wait([job for job in jobs if job is not None], _SETTLE).not_done:
+            raise TimeoutError(f"no plan in {_SETTLE:g} s")
+
+    def plan_again(self) -> None:
+        """Has a robot wait for another plan if its plan to a first-exit goal is over, and it is not there.
+
+        NMPC would plan within `act`. But solvers must not run in two threads, so the background plans.
+        """
+        for runner in self.runners if self.world.task.first_exit else ():
+            if runner.has_no_plan_left(self.steps):
+                runner.take_controller(None, self.steps)
+                self.order(runner)
+
+    def _do_without(self, runner: Runner, error: BaseException) -> None:
+        """Leaves a robot under its controller where the wanted one cannot be made. If it has none, it gets LQR."""
+        who = labels.label(runner.wanted)
+        self.notice = f"{who}: {error}"
+        if runner.controller is not None:
+            runner.wanted = runner.name
+        elif runner.wanted != "lqr":
+            self.notice = f"{who} cannot start here, LQR does instead: {error}"
+            runner.wanted = "lqr"
+            self.order(runner)
+
+
+def _cancel(*jobs: Future | None) -> None:
+    for job in jobs:
+        if job is not None:
+            job.cancel()
+
+
+def _make(
+    name: str,
+    task: Tunable,
+    params: BallbotParams,
+    x: np.ndarray,
+    c: np.ndarray,
+    stick: Stick,
+    compute: Callable[..., Any],
+) -> Controller:
+    """The controller of a name, at the start of an episode in state x (8,) with constants c (nc,) of the tunable task.
+
+    What takes long is called by `compute`, that may have another process do it.
+    """
+    if name in DRIVERS:
+        return DriveController(task, params, stick, DRIVERS[name])
+    if name in _FROM_ELSEWHERE:
+        return compute(_expert, name, task, params, x, c)
+    if not is_expert(name):
+        controller = make_controller(name, task.base, params)
+        controller.reset(0.0, x, c[: len(task.base.constant_names)])
+        return controller
+    from ballbot_baselines.nmpc import NmpcController, prepared_plan  # it imports CasADi
+
+    controller = make_controller(name, task, params)
+    if isinstance(controller, NmpcController):  # its solver stays in this process
+        controller.start(0.0, c, compute(prepared_plan, task, params, x, c, controller.backoff))
+    else:
+        controller.reset(0.0, x, c)
+    return controller
+
+
+def _optimum_costs(task: Tunable, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(n + 1,) what the optimum has cost after each control step."""
+    from ballbot_baselines import find_optimum
+
+    trajectory = find_optimum(task, params, x, c).trajectory
+    rates = task.cost(tuple(trajectory.x[:-1].T), tuple(trajectory.u.T), tuple(c))
+    return np.concatenate([[0.0], np.cumsum(rates * task.control_dt)])
+
+
+def _expert(name: str, task: Tunable, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> Controller:
+    """An expert at the start of an episode."""
+    controller = CONTROLLERS[name](task, params)
+    controller.reset(0.0, x, c)
+    return controller

@@ -1,0 +1,207 @@
+"""The page of the live playground: who drives, what is shown when, and the loop that keeps the simulation in real time.
+
+viser calls back in a thread of its own. What a browser asks for goes into a queue, and the loop of the simulation does it
+between two steps. So the playground itself needs no locks.
+"""
+
+import gc
+import math
+import queue
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import dynamics
+from ballbot_gym.viewer import Viewer
+from ballbot_train.play import views
+from ballbot_train.play.clock import Clock
+from ballbot_train.play.controls import Controls, Steering
+from ballbot_train.play.plots import Plots
+from ballbot_train.play.saving import Saver
+from ballbot_train.play.simulation import Playground
+
+_DRAW_HZ, _PLOT_HZ, _TEXT_HZ = 30.0, 5.0, 4.0
+_STARVED = 0.25  # s, after which a moment is drawn even if steps are due
+_MOST_STEPS = 10  # between two looks at the requests
+_IDLE = 0.02  # s, between two looks while nothing moves
+_NARROW = 600  # px, of a phone's page, whose lower part viser covers with the controls
+_NARROW_EYE, _NARROW_AIM = (-3.4, -2.4, 2.4), (-1.55, -1.1, 0.0)  # m: the robot is in the upper part
+_SCORES_SHOWN = 8
+_NOTICE_LENGTH = 300
+_HELP = "Drag the robot and let go to push it."
+
+
+class PlayPage:
+    """Controls, plots and scene of a playground in a viewer, and the loop that runs them."""
+
+    def __init__(self, playground: Playground, viewer: Viewer, out: Path):
+        """Builds the page; `run` brings it to life.
+
+        Args:
+            playground: what is simulated.
+            viewer: where it is shown. The page closes neither of them.
+            out: folder of saved files.
+        """
+        self.playground, self.viewer = playground, viewer
+        self.clock = Clock(playground.world.task.control_dt)
+        self.paused = False
+        self.single_steps = 0
+        """To do in a pause."""
+        self.driver: int | None = None
+        """Id of the browser that drives; the next that touches anything, if None."""
+        self._open_pages: set[int] = set()
+        self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._stopped = self._moving = False
+        gui = viewer.server.gui
+        self._status = gui.add_markdown("")
+        self._role_text = gui.add_markdown("", visible=False)
+        self._role_button = gui.add_button("Take the controls", visible=False)
+        self._role_button.on_click(self._take_over)
+        self.saver = Saver(playground, out)
+        self.steering = Steering(self)
+        self._controls, self._plots = Controls(self), Plots(playground, gui)
+        viewer.server.on_client_connect(self._on_connect)
+        viewer.server.on_client_disconnect(self._on_disconnect)
+        viewer.centre_on(np.array(playground.main.x[:2]))
+
+    # --- the loop ---
+
+    def run(self, seconds: float = math.inf) -> None:
+        """Simulates and draws in real time until `stop` is called, or for some seconds."""
+        end = time.perf_counter() + seconds
+        next_draw = next_plot = next_text = drawn = 0.0
+        while not self._stopped and (now := time.perf_counter()) < end:
+            self._do_requests()
+            stood, self._moving = not self._moving, self._steps_due()
+            if stood and self._moving:
+                self._collect_garbage()
+            now = time.perf_counter()
+            if now >= next_draw and (self.clock.wait() > 0 or now - drawn > _STARVED):
+                self.viewer.draw(views.drawing(self.playground))
+                next_draw, drawn = max(next_draw + 1 / _DRAW_HZ, now), now
+                if now >= next_plot:
+                    self._plots.show()
+                    next_plot = now + 1 / _PLOT_HZ
+                elif now >= next_text:
+                    self._write()
+                    next_text = now + 1 / _TEXT_HZ
+            until = min(next_draw, end) - time.perf_counter()
+            time.sleep(max(0.0, min(until, self.clock.wait() if self._moving else _IDLE)))
+
+    def stop(self) -> None:
+        """Ends `run`; from any thread."""
+        self._stopped = True
+
+    def request(self, action: Callable[[], object]) -> None:
+        """Has the loop do something between two steps; from any thread."""
+        self._requests.put(action)
+
+    def close(self) -> None:
+        """Ends `run`, and gives up a film that is not finished."""
+        self._stopped = True
+        self.saver.close()
+
+    def _collect_garbage(self) -> None:
+        """Does it when the robot begins to move. A collection of everything that was imported would be a step too late."""
+        gc.unfreeze()
+        gc.collect()
+        gc.freeze()
+        self.clock.stop()  # the pause that this made is not caught up
+
+    def _steps_due(self) -> bool:
+        """Does the steps that are due; whether the simulation moves."""
+        if self.paused:
+            self.clock.stop()
+            if self.single_steps > 0 and self.playground.step():
+                self.single_steps -= 1
+            return False
+        self.steering.let_go()
+        for _ in range(_MOST_STEPS):
+            if not self.clock.take():
+                break
+            if not self.playground.step():
+                self.clock.stop()
+                return False
+        return True
+
+    def _do_requests(self) -> None:
+        """Does what was asked for until now. Whatever a browser sends, the simulation goes on."""
+        count = self._requests.qsize()
+        for action in [
+            *(self._requests.get() for _ in range(count)),
+            *[self._controls.refresh] * (count > 0),
+            self.saver.poll,
+        ]:
+            try:
+                action()
+            except Exception as error:
+                self.playground.crew.notice = str(error) or repr(error)
+
+    # --- who drives ---
+
+    def ask(self, client_id: int | None, action: Callable[[], object]) -> None:
+        """Does what a browser asks for, if it drives. What a watcher has changed goes back to what holds."""
+        if client_id is not None:  # not set by this program
+            self.request(action if self.drives(client_id) else lambda: None)
+
+    def asking(self, action: Callable[[Any, Any], object]) -> Any:
+        """A callback of viser that asks for something, by viser's client and the value that the control has got.
+
+        It is a coroutine of viser's loop, so that callbacks come in the order of the changes.
+        """
+
+        async def asked(event: Any) -> None:
+            value = getattr(event.target, "value", None)
+            self.ask(event.client_id, lambda: action(event.client, value))
+
+        return asked
+
+    def drives(self, client_id: int) -> bool:
+        """Whether this browser drives. The first one that asks takes a free seat."""
+        if self.driver is None:
+            self.driver = client_id
+        return self.driver == client_id
+
+    async def _on_connect(self, client: Any) -> None:
+        self._open_pages.add(client.client_id)
+        self.drives(client.client_id)
+        if client.camera.image_width < _NARROW:
+            client.camera.position, client.camera.look_at = _NARROW_EYE, _NARROW_AIM
+        self._show_roles()
+
+    async def _on_disconnect(self, client: Any) -> None:
+        self._open_pages.discard(client.client_id)
+        if self.driver == client.client_id:
+            self.driver = None
+        self._show_roles()
+
+    async def _take_over(self, event: Any) -> None:
+        self.driver = event.client_id
+
+    def _show_roles(self) -> None:
+        if self._stopped:
+            return
+        count = len(self._open_pages)
+        self._role_text.content = f"{count} browsers show this page. One drives, the others watch."
+        self._role_text.visible = self._role_button.visible = count > 1
+
+    # --- words ---
+
+    def _write(self) -> None:
+        playground, crew = self.playground, self.playground.crew
+        main, best = playground.main, playground.optimum_cost_so_far
+        cost = f"cost {main.cost:.2f}" + (f", the optimum's {best:.2f}" if math.isfinite(best) else "")
+        lines = [f"**{_plain(views.status(playground))}**", f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, {cost}"]
+        lines += ["planning …"] * (crew.planning and not crew.preparing) + ["paused"] * self.paused
+        lines.append(f"*{_plain(crew.notice[:_NOTICE_LENGTH])}*" if crew.notice else _HELP)
+        self._status.content = "  \n".join(lines)
+        self._controls.show_scores([_plain(score.text) for score in playground.scores[-_SCORES_SHOWN:]])
+
+
+def _plain(text: str) -> str:
+    """Text as Markdown that shows it as it is. Names of files come into it, and Markdown may hold HTML."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))

@@ -1,0 +1,316 @@
+"""The simulation of the live playground, which knows nothing of pages: a ballbot, ghosts, pushes, hidden changes, costs.
+
+The robot that counts is the main one. Ghosts get the same start and the same pushes under other controllers. Controllers are
+made and plans are found in the background, while the robots go on under those that they have.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import PAPER
+from ballbot_gym.simulator import default_physics
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.play.crew import Crew
+from ballbot_train.play.driving import DRIVERS, Stick
+from ballbot_train.play.runner import Runner, failure_word
+from ballbot_train.play.world import PLANT, World, randomization, severity
+from ballbot_train.report import labels
+
+AtEnd = Literal["go on", "again", "next", "stop"]
+"""What comes after an episode: another one from where the robot is, the same one, another one, or nothing."""
+
+AT_END: tuple[AtEnd, ...] = get_args(AtEnd)
+
+LARGEST_PUSH = 30.0
+"""N·s, of a push; larger ones are cut to this length."""
+
+_PAUSE = 1.5  # s, between the end of an episode and the next
+_PUSH_SHOWN = 0.3  # s, for which a push is drawn
+_AHEAD = 1.0  # s before the end of an episode at which the plan for the next one is begun
+_EPISODES_KEPT = 100
+_LEAST_COST = 0.01  # of an optimum to which a cost is compared; one that starts at rest costs nothing
+
+
+class Score(NamedTuple):
+    """How an episode of the main robot ended."""
+
+    controller: str
+    seconds: float
+    cost: float
+    regret: float
+    """Cost over the optimum's, less 1; NaN without an optimum. Pushes count: the optimum had none."""
+    failure: str
+    """The violated limit, or ""."""
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %"
+        if self.failure:
+            return f"{self.controller}: {failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
+        return f"{self.controller}: {self.seconds:.1f} s, cost {self.cost:.1f}{regret}"
+
+
+class Playground:
+    """A ballbot, its ghosts and their world. `step` moves everything by one control step; nothing here waits for real time.
+
+    Whatever asks for something unknown, or for a value outside of its bounds, gets a ValueError and changes nothing. Except
+    for `stick`, everything is for one thread.
+    """
+
+    def __init__(
+        self,
+        task: str = "stabilize",
+        controller: str = "nmpc",
+        ghosts: Sequence[str] = (),
+        physics: str | None = None,
+        episode: int | None = 0,
+        seed: int = 0,
+        robot: str = PAPER,
+        policies: Sequence[str] = (),
+        other_process: bool = False,
+    ):
+        """Begins an episode.
+
+        Args:
+            task: name of a task.
+            controller: of the main robot: an expert, a policy that comes with the package, the path of a policy file or of a
+                model that Stable-Baselines3 or rsl_rl saved, or one of `DRIVERS`.
+            ghosts: controllers of the ghosts.
+            physics: "bullet" or "rk4"; default, as for environments.
+            episode: index of a certified episode; None for a random start.
+            seed: of random starts, sensor noise and random pushes.
+            robot: name in `robots.ROBOTS`.
+            policies: paths of more policies that can be chosen in the tasks that they are made for.
+            other_process: whether another process plans, so that planning takes no time from a simulation in real time. A
+                script that asks for it needs the guard `if __name__ == "__main__":`.
+
+        Raises:
+            ValueError: an unknown task, robot, controller or episode.
+            PolicyError: one of `policies` is missing or damaged.
+        """
+        world = World(task, robot, policies)
+        world.check_controllers(controller, *ghosts)
+        self.stick = Stick()
+        self.at_end: AtEnd = "go on"
+        self.scores: list[Score] = []
+        """Of the last episodes of the main robot."""
+        self.plant = dict.fromkeys(PLANT, 0.0)
+        """Severity of each hidden change."""
+        self._rng = np.random.default_rng(seed)
+        self._randomization = Randomization()
+        self.crew = Crew(default_physics() if physics is None else physics, self.stick, other_process)
+        self._open(world, controller, ghosts, episode)
+
+    # --- what it is ---
+
+    @property
+    def main(self) -> Runner:
+        """The main robot."""
+        return self.crew.main
+
+    @property
+    def controllers(self) -> list[str]:
+        """What can be chosen in this task, and what is in use; policy files that were not used yet come to it."""
+        return list(dict.fromkeys([*self.world.controllers, self.main.wanted, *self.crew.ghosts]))
+
+    @property
+    def seconds(self) -> float:
+        """Since the episode began."""
+        return self.elapsed * self.world.task.control_dt
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is over, and everything stands still."""
+        return self._pause_left > 0
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether a human drives the main robot."""
+        return self.main.name in DRIVERS
+
+    @property
+    def optimum_cost(self) -> float:
+        """The best cost of an episode from this start without pushes; NaN while it is not known."""
+        costs = self.crew.optimum
+        return self.world.certified_cost(self.episode) if costs is None else float(costs[-1])
+
+    @property
+    def optimum_cost_so_far(self) -> float:
+        """What the optimum has cost until now; NaN while it is not known."""
+        costs = self.crew.optimum
+        return math.nan if costs is None else float(costs[min(self.elapsed, len(costs) - 1)])
+
+    @property
+    def shown_push(self) -> np.ndarray | None:
+        """(2,) the push that is drawn, N; None if there was none lately."""
+        return self._push if self.crew.steps < self._push_until else None
+
+    def trajectory(self) -> Trajectory:
+        """The main robot's episode so far.
+
+        Raises:
+            ValueError: it has not begun.
+        """
+        if self.main.trajectory is None:
+            raise ValueError("the episode has not begun: there is nothing to save")
+        return self.main.trajectory
+
+    # --- time ---
+
+    def step(self) -> bool:
+        """Moves everything by one control step; False while the episode waits for its controllers."""
+        self.crew.poll()
+        if self.crew.preparing:
+            return False
+        if self.ended:
+            self._pause_left -= 1
+            if not self.ended:
+                self._begin_next()
+            return True
+        self.crew.plan_again()
+        if self.crew.preparing:
+            return False
+        noise = tuple(self._rng.random(Randomization.NOISE_DRAWS).tolist())
+        push = self._take_push()
+        task = self.world.task
+        self.crew.step(noise, push, (task.steps - self.elapsed - 1) * task.control_dt)
+        self.elapsed += 1
+        self._after_step()
+        return True
+
+    def settle(self) -> None:
+        """Waits until every plan is found; for scripts and tests. A TimeoutError says that it took too long."""
+        for _ in range(2):  # a plan that is not found asks for another controller
+            self.crew.wait()
+            self.crew.poll()
+
+    def close(self) -> None:
+        """Releases simulators and the background; may be called again."""
+        self.crew.close()
+
+    # --- what a user does ---
+
+    def push(self, x: float, y: float) -> None:
+        """Pushes every robot's ball by an impulse along x and y, N·s, in the next control step."""
+        length = math.hypot(x, y)
+        if not math.isfinite(length):
+            self.crew.notice = "a push must be finite numbers"
+            return
+        factor = min(1.0, LARGEST_PUSH / length) if length else 0.0
+        self._pending_push = self._pending_push + factor * np.array([x, y])
+
+    def set_task(self, task: str) -> None:
+        """Another task, under the same controllers where it has them."""
+        self._change(task, self.world.robot)
+
+    def set_robot(self, robot: str) -> None:
+        """Another robot, in the same task, under the same controllers where it has them."""
+        self._change(self.world.task_name, robot)
+
+    def set_controller(self, name: str) -> None:
+        """Another controller for the main robot, as soon as it is made. The robot goes on where it is."""
+        self.world.check_controllers(name)
+        self.crew.set_ghosts([ghost for ghost in self.crew.ghosts if ghost != name])
+        self.main.wanted = name
+        if self.main.controller is not None and not self.main.violated:
+            self.crew.order(self.main)
+        else:
+            self.restart()
+
+    def set_ghosts(self, ghosts: Sequence[str]) -> None:
+        """Other ghosts. A new one begins where the main robot is."""
+        self.world.check_controllers(*ghosts)
+        self.crew.set_ghosts(ghosts)
+
+    def set_weight(self, name: str, value: float) -> None:
+        """Changes a weight of the cost; LQR, trajectory optimization and NMPC reckon with it as soon as they can."""
+        self.world.set_weight(name, value)
+        self.crew.weigh_again(self.world.constants(self.start[1]))
+
+    def set_plant(self, stress: str, value: float) -> None:
+        """Changes what the controllers do not know, for every robot. The value is a severity within its `Span`."""
+        self.plant[stress] = severity(stress, value)
+        self._randomization = randomization(self.plant)
+        self.crew.set_plant(self._randomization)
+
+    def restart(self) -> None:
+        """Begins the same episode again."""
+        self._begin(self.start, self.episode)
+
+    def start_certified(self, episode: int) -> None:
+        """Begins a certified episode."""
+        self._begin(self.world.certified_start(episode), episode)
+
+    def start_random(self) -> None:
+        """Begins an episode with a random start."""
+        self._begin(self.world.base.sample(self._rng, self.world.params), None)
+
+    # --- inside ---
+
+    def _change(self, task: str, robot: str) -> None:
+        """Opens a task for a robot, with the present controllers that are made for them."""
+        world = World(task, robot)
+        world.offer(*self.world.policies)
+        ghosts = [ghost for ghost in self.crew.ghosts if ghost in world.controllers]
+        self._open(world, self.main.wanted if self.main.wanted in world.controllers else "nmpc", ghosts, 0)
+
+    def _open(self, world: World, controller: str, ghosts: Sequence[str], episode: int | None) -> None:
+        start = None if episode is None or world.certified is None else world.certified_start(episode)
+        self.world = world
+        self.crew.open(world, [controller, *ghosts])
+        if start is None:
+            self.start_random()
+        else:
+            self._begin(start, episode)
+
+    def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: int | None) -> None:
+        """Starts an episode; the robots wait for their controllers."""
+        self.start, self.episode = start, episode
+        self.elapsed = self._pause_left = self._push_until = 0
+        self._pending_push = self._push = np.zeros(2)
+        self.crew.begin(tuple(map(float, start[0])), self.world.constants(start[1]))
+
+    def _after_step(self) -> None:
+        task, main = self.world.task, self.main
+        ahead = round(_AHEAD / task.control_dt)
+        goes_on = self.at_end == "go on" and not task.first_exit and not main.stands_still
+        if goes_on and self.elapsed == task.steps - ahead:
+            for runner in self.crew.runners:
+                self.crew.order(runner, ahead)
+        if self.elapsed < task.steps and not main.stands_still:
+            return
+        best = self.optimum_cost
+        regret = main.cost / best - 1 if best > _LEAST_COST else math.nan
+        score = Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated)
+        self.scores = [*self.scores, score][-_EPISODES_KEPT:]
+        if goes_on:
+            self.start, self.episode, self.elapsed = (np.array(main.x), self.start[1]), None, 0
+            self.crew.go_on()
+        else:
+            self._pause_left = round(_PAUSE / task.control_dt)
+
+    def _begin_next(self) -> None:
+        if self.at_end == "stop":
+            self._pause_left = 1  # until the user asks for something
+        elif self.at_end == "next" and self.episode is not None:
+            self.start_certified((self.episode + 1) % self.world.episodes)
+        elif self.at_end == "next":
+            self.start_random()
+        else:
+            self.restart()
+
+    def _take_push(self) -> tuple[float, float]:
+        """The push of this control step, N, drawn and asked for."""
+        dt = self.world.task.control_dt
+        push, self._pending_push = self._pending_push / dt, np.zeros(2)
+        if self._randomization.pushes:
+            z = tuple(self._rng.random(Randomization.PUSH_DRAWS).tolist())
+            push = push + np.array(self._randomization.push(z, dt), np.float64)
+        if push.any():
+            self._push, self._push_until = push, self.crew.steps + round(_PUSH_SHOWN / dt)
+        return float(push[0]), float(push[1])

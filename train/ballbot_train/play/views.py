@@ -1,0 +1,129 @@
+"""What there is to see of a playground, and what is kept of it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_train.play.driving import DRIVERS
+from ballbot_train.play.runner import Runner, Sample, failure_word
+from ballbot_train.play.simulation import Playground
+from ballbot_train.report import labels
+from ballbot_train.report.replay import Replay, Take
+
+_PLAN_POINTS = 60  # of a drawn plan
+
+
+class History(NamedTuple):
+    """What the plots show. A robot that joined later or has failed keeps its first and last values."""
+
+    seconds: np.ndarray
+    """(n,) since the playground was opened."""
+    lines: dict[str, np.ndarray]
+    """(n, 4) tilt, rad, force, N, cost so far and computing time of the controller, s, by the name of the controller, the
+    main robot's first."""
+    optimum: np.ndarray
+    """(n,) what the optimum has cost so far; 0 where that is not known."""
+
+
+def drawing(playground: Playground) -> Drawing:
+    """The present moment."""
+    main, push = playground.main, playground.shown_push
+    robots, paths = [], []
+    for i, runner in reversed(list(enumerate(playground.crew.runners))):
+        name, tint = f"ghost {i}" if i else "robot", color(runner, i)
+        force = np.array(runner.force) if runner is main and not main.violated else None
+        alpha = GHOST_OPACITY if i else 1.0
+        robots.append(Robot(np.array(runner.x), tint, force, alpha, name, push if runner is main else None))
+        if len(runner.trace) > 1:
+            paths.append(GroundPath(np.array(runner.trace), tint, name=name))
+    if (planned := _plan(playground)) is not None:
+        paths.append(GroundPath(planned, color(main, 0), dashed=True, name="plan"))
+    markers = tuple(playground.world.base.markers(playground.start[1]))
+    return Drawing(playground.world.params, tuple(robots), tuple(paths), markers)
+
+
+def color(runner: Runner, i: int) -> str:
+    """The colour of the `i`-th robot."""
+    return "#2e8b57" if runner.name in DRIVERS else labels.color(Path(runner.name).stem, i)
+
+
+def colors(playground: Playground) -> dict[str, str]:
+    """The colours of the robots by the names of their controllers, the main robot's first."""
+    found: dict[str, str] = {}
+    for i, runner in enumerate(playground.crew.runners):
+        found.setdefault(runner.name, color(runner, i))
+    return found
+
+
+def history(playground: Playground, points: int) -> History:
+    """The last seconds of every robot, at this many times at most."""
+    times = np.array([sample.seconds for sample in playground.main.samples] or [0.0])
+    times = times[np.linspace(0, len(times) - 1, min(points, len(times))).round().astype(int)]
+    lines = {}
+    for runner in playground.crew.runners:
+        rows = np.array(runner.samples or [Sample(times[0], 0.0, 0.0, 0.0, 0.0)])
+        lines.setdefault(runner.name, np.stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:]], axis=1))
+    optimum, costs = np.zeros(len(times)), playground.crew.optimum
+    if costs is not None and playground.elapsed:
+        steps = np.round(times / playground.world.task.control_dt).astype(int) - (
+            playground.crew.steps - playground.elapsed
+        )
+        optimum = np.where(steps >= 0, costs[np.clip(steps, 0, len(costs) - 1)], 0.0)
+    return History(times, lines, optimum)
+
+
+def status(playground: Playground) -> str:
+    """What goes on, in a line."""
+    if playground.crew.preparing:
+        waiting = [labels.label(runner.wanted) for runner in playground.crew.runners if runner.controller is None]
+        return f"preparing {', '.join(waiting)} … the first time in a task, solvers are compiled"
+    if playground.ended and playground.scores:
+        return playground.scores[-1].text
+    of = f"{playground.seconds:.1f} s of {playground.world.task.duration:g} s"
+    return f"{labels.label(playground.main.name)}, {of}"
+
+
+def replay(playground: Playground) -> Replay:
+    """The episode so far, of every robot, as a film shows it.
+
+    Raises:
+        ValueError: it has not begun.
+    """
+    playground.trajectory()
+    takes = [
+        Take(
+            labels.label(runner.name),
+            runner.trajectory,
+            color(runner, i),
+            failure_word(runner.violated) or f"cost {runner.cost:.1f}",
+            runner.violated != "",
+        )
+        for i, runner in enumerate(playground.crew.runners)
+        if runner.trajectory is not None
+    ]
+    markers = tuple(playground.world.base.markers(playground.start[1]))
+    return Replay(f"{playground.world.task_name}, played", tuple(takes), markers, playground.world.params)
+
+
+def optimize_command(playground: Playground) -> str:
+    """The command that finds the optimum from where the main robot is."""
+    state = " ".join(f"{value:.9g}" for value in playground.main.x)
+    named = zip(playground.world.base.constant_names, playground.start[1], strict=True)
+    constants = " ".join(f"{name} {value:.9g}" for name, value in named)
+    return f"ballbot optimize {playground.world.task_name} --state {state}" + (
+        f" --constants {constants}" if constants else ""
+    )
+
+
+def _plan(playground: Playground) -> np.ndarray | None:
+    """(n, 2) where the main robot's controller plans to go, m; None if it does not plan."""
+    main = playground.main
+    if main.violated or playground.ended:
+        return None
+    if hasattr(main.controller, "predicted"):
+        predicted = getattr(main.controller, "predicted")  # noqa: B009
+        return None if predicted is None else predicted[:, :2]
+    rest = main.rest_of_plan(playground.crew.steps)
+    return None if rest is None or len(rest) < 2 else rest[:: max(1, len(rest) // _PLAN_POINTS), :2]

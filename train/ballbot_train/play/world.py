@@ -1,0 +1,142 @@
+"""What is played: a task, a robot and the controllers that can be chosen, and what a user changes of them."""
+
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ballbot_baselines import VARIANTS
+from ballbot_gym import certified
+from ballbot_gym.env import make_task
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import ROBOTS, named_robot
+from ballbot_gym.tasks import TASKS, Task
+from ballbot_train.console import check_names
+from ballbot_train.evaluation.controllers import is_expert, is_made_for, is_saved_model, made_for, names
+from ballbot_train.evaluation.robustness import STRESSES
+from ballbot_train.play.driving import DRIVERS
+from ballbot_train.play.tunable import Tunable, weight_names
+from ballbot_train.policy_files import PolicyError
+
+WEIGHT_FACTOR = 100.0
+"""How far a weight may be from the task's own, as a factor, up and down."""
+
+
+class Span(NamedTuple):
+    """What a slider allows."""
+
+    label: str
+    low: float
+    high: float
+    step: float
+
+
+PLANT: dict[str, Span] = {
+    "mass": Span("Masses, %", -50.0, 100.0, 5.0),
+    "com": Span("Centre of mass, %", -30.0, 50.0, 5.0),
+    "delay": Span("Delay, ms", 0.0, 120.0, 20.0),
+    "lag": Span("Lag, ms", 0.0, 100.0, 5.0),
+    "noise": Span("Sensor noise, ×", 0.0, 5.0, 0.25),
+    "push": Span("Random pushes, N·s", 0.0, 12.0, 0.5),
+}
+"""What the controllers do not know, by the name of the stress in `robustness.STRESSES`. 0 is nothing."""
+
+
+class World:
+    """A task for a robot. Whatever is unknown or out of bounds is refused with a ValueError and changes nothing."""
+
+    def __init__(self, task: str, robot: str, policies: Sequence[str] = ()):
+        """A task and a robot by name, with its own weights. `policies` are paths of files that can be chosen where they fit.
+
+        Raises:
+            PolicyError: one of them is missing or damaged.
+        """
+        check_names("task", [task], TASKS)
+        check_names("robot", [robot], ROBOTS)
+        self.task_name, self.robot, self.params = task, robot, named_robot(robot)
+        self.base: Task = make_task(task, robot)
+        self.task = Tunable.of(self.base)
+        self.weights: dict[str, float] = {}
+        """Those that differ from the task's own."""
+        self.policies: list[str] = []
+        self.controllers: list[str] = []
+        """What can be chosen, experts first."""
+        known = certified.path_of(self.base, robot).exists()
+        self.certified = certified.load(self.base, robot=robot) if known else None
+        for policy in policies:
+            made_for(policy)  # whether it can be read
+        self.offer(*policies)
+
+    @property
+    def episodes(self) -> int:
+        """How many certified episodes there are."""
+        return 0 if self.certified is None else len(self.certified)
+
+    def offer(self, *policies: str) -> None:
+        """Has more policy files be chosen, if they are made for the task and the robot."""
+        self.policies = list(dict.fromkeys([*self.policies, *policies]))
+        own = []
+        for policy in self.policies:
+            with contextlib.suppress(PolicyError):  # a file that is gone by now
+                own += [policy] * is_made_for(policy, self.base, self.robot)
+        known = names(self.base, self.robot)
+        experts = [name for name in known if is_expert(name)]
+        self.controllers = [*experts, *VARIANTS, *(name for name in known if name not in experts), *own, *DRIVERS]
+
+    def check_controllers(self, *wanted: str) -> None:
+        """Refuses what no controller is called. What is in a policy file is found out when it is loaded."""
+        for name in wanted:
+            readable = is_saved_model(name) or Path(name).suffix in (".json", ".safetensors")
+            if name not in self.controllers and not (readable and Path(name).is_file()):
+                raise ValueError(
+                    f"unknown controller {name!r}; {self.base.id} has {', '.join(self.controllers)}, or give a policy's "
+                    ".json, or a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt)"
+                )
+
+    def set_weight(self, name: str, value: float) -> None:
+        """Changes a weight of the cost."""
+        check_names("weight", [name], weight_names(self.base))
+        own = getattr(self.base, name)
+        if not own / WEIGHT_FACTOR <= value <= own * WEIGHT_FACTOR:
+            raise ValueError(f"{name} must be {own / WEIGHT_FACTOR:g} to {own * WEIGHT_FACTOR:g}, not {value:g}")
+        self.weights[name] = value
+        if value == own:
+            del self.weights[name]
+
+    def constants(self, c: np.ndarray) -> tuple[float, ...]:
+        """The constants of the tunable task in an episode with constants c (nc,)."""
+        return tuple(self.task.constants(c, self.weights).tolist())
+
+    def certified_start(self, episode: int) -> tuple[np.ndarray, np.ndarray]:
+        """The state (8,) and the constants (nc,) with which a certified episode begins."""
+        if self.certified is None:
+            raise ValueError(f"{self.task_name} has no certified episodes for {self.robot}; begin a random one")
+        if not 0 <= episode < self.episodes:
+            raise ValueError(f"episode must be 0 to {self.episodes - 1}, not {episode}")
+        return self.certified.states[episode], self.certified.constants[episode]
+
+    def certified_cost(self, episode: int | None) -> float:
+        """What the optimum of a certified episode costs with the task's own weights; NaN for other episodes or weights."""
+        if self.certified is None or episode is None or self.weights:
+            return math.nan
+        return float(self.certified.costs[episode])
+
+
+def severity(stress: str, value: float) -> float:
+    """The severity that a slider gives a stress; a ValueError for an unknown one, or a value outside of its `Span`."""
+    check_names("change", [stress], PLANT)
+    span = PLANT[stress]
+    if not span.low <= value <= span.high:
+        raise ValueError(f"{stress} must be {span.low:g} to {span.high:g}, not {value:g}")
+    return span.step * round(value / span.step)
+
+
+def randomization(severities: Mapping[str, float]) -> Randomization:
+    """All hidden changes together: of each stress the fields that it changes."""
+    changes = [STRESSES[stress].at(value) for stress, value in severities.items() if value]
+    changed = {f.name: value for each in changes for f in fields(each) if (value := getattr(each, f.name)) != f.default}
+    return replace(Randomization(), **changed)
