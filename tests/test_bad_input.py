@@ -342,20 +342,20 @@ def evaluation_set(**changes):
     def read(folder):
         arrays = files.read_npz(certified.path_of(make_task("turn"))) | changes
         path = files.write_npz(folder / "set.npz", {name: part for name, part in arrays.items() if part is not None})
-        return certified.load("turn", path)
+        return certified.load("turn", "paper", path)
 
     return read
 
 
 SETS = [
-    (lambda f: certified.load("dance"), "unknown task 'dance'; known"),
-    (lambda f: certified.load(None), "unknown task None"),
-    (lambda f: certified.load("turn", f / "none.npz"), 'compute it with "ballbot certify"'),
-    (lambda f: certified.load(make_task("turn", duration=4.0)), "was computed for Turn("),
-    (lambda f: certified.load("stabilize", certified.path_of(make_task("turn"))), "was computed for Turn("),
-    (lambda f: certified.load("turn", f), "is no evaluation set"),
-    (written(b"garbage", lambda path: certified.load("turn", path)), "is no evaluation set"),
-    (written(bomb(), lambda path: certified.load("turn", path)), "unpacks to 2384 MiB"),
+    (lambda f: certified.load("dance", "paper"), "unknown task 'dance'; known"),
+    (lambda f: certified.load(None, "paper"), "unknown task None"),
+    (lambda f: certified.load("turn", "paper", f / "none.npz"), 'compute it with "ballbot certify --tasks turn"'),
+    (lambda f: certified.load(make_task("turn", duration=4.0), "paper"), "was computed for Turn("),
+    (lambda f: certified.load("stabilize", "paper", certified.path_of(make_task("turn"))), "was computed for Turn("),
+    (lambda f: certified.load("turn", "paper", f), "is no evaluation set"),
+    (written(b"garbage", lambda path: certified.load("turn", "paper", path)), "is no evaluation set"),
+    (written(bomb(), lambda path: certified.load("turn", "paper", path)), "unpacks to 2384 MiB"),
     (evaluation_set(costs=None), "it has no array costs"),
     (evaluation_set(states=np.zeros((200, 7))), "states has the shape (200, 7)"),
     (evaluation_set(costs=np.full(200, math.nan)), "costs must be finite numbers"),

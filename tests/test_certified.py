@@ -37,7 +37,7 @@ def task(robot_and_task, robot):
 
 @pytest.fixture
 def evaluation(task, robot):
-    return certified.load(task, robot=robot)
+    return certified.load(task, robot)
 
 
 def test_set_has_200_episodes_and_20_trajectories(evaluation):
@@ -154,7 +154,7 @@ def test_set_with_a_missing_episode_is_refused():
 
 
 def test_set_survives_saving(task, robot, evaluation, tmp_path):
-    loaded = certified.load(task, evaluation.save(task, tmp_path / "set.npz", robot), robot)
+    loaded = certified.load(task, robot, evaluation.save(task, tmp_path / "set.npz", robot))
     np.testing.assert_array_equal(loaded.costs, evaluation.costs)
     np.testing.assert_array_equal(loaded.statuses, evaluation.statuses)
     for a, b in zip(loaded.trajectories, evaluation.trajectories, strict=True):
@@ -165,12 +165,12 @@ def test_set_survives_saving(task, robot, evaluation, tmp_path):
 def test_set_of_other_fields_is_refused(task, robot):
     other = replace(task, duration=2 * task.duration)
     with pytest.raises(certified.CertificateError, match=rf"{task.id}.*\.npz was computed for"):
-        certified.load(other, robot=robot)
+        certified.load(other, robot)
 
 
 def test_missing_set_says_how_to_make_one(task, tmp_path):
     with pytest.raises(certified.CertificateError, match=r"no evaluation set.*ballbot certify"):
-        certified.load(task, tmp_path / "none.npz")
+        certified.load(task, "paper", tmp_path / "none.npz")
 
 
 def test_all_sets_together_are_under_5_megabytes():

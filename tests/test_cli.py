@@ -273,7 +273,10 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     assert (len(solved), len(again)) == (2, 1)
     out = tmp_path / "runs" / "certify"
     assert [path.name for path in out.iterdir()] == ["BallbotTurn-v0.npz"]
-    made, known = certified.load(make_task("turn"), out / "BallbotTurn-v0.npz"), certified.load(make_task("turn"))
+    made, known = (
+        certified.load(make_task("turn"), "paper", out / "BallbotTurn-v0.npz"),
+        certified.load(make_task("turn"), "paper"),
+    )
     np.testing.assert_array_equal(made.states, known.states[:3])
     np.testing.assert_allclose(made.costs, known.costs[:3], rtol=1e-9)
     assert len(made.trajectories) == 3
@@ -300,34 +303,38 @@ def test_certify_goes_on_when_a_worker_dies(tmp_path):
     os.kill(int(workers[0]), signal.SIGKILL)
     printed, _ = run.communicate(timeout=120)
     assert run.returncode == 0, printed
-    made, known = certified.load("turn", tmp_path / "out" / "BallbotTurn-v0.npz"), certified.load("turn")
+    made, known = (
+        certified.load("turn", "paper", tmp_path / "out" / "BallbotTurn-v0.npz"),
+        certified.load("turn", "paper"),
+    )
     np.testing.assert_array_equal(made.states, known.states[:4])
     np.testing.assert_allclose(made.costs, known.costs[:4], rtol=1e-9)
 
 
 def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
     task = make_task("turn")
-    full = certified.load(task)
+    full = certified.load(task, "paper")
     monkeypatch.setattr(certified, "EPISODES", 2)
     monkeypatch.setattr(certified, "path_of", lambda task, robot: tmp_path / "package" / f"{task.id}.npz")
     certify(("turn",), 2, out=tmp_path / "out", workers=1)
     assert not (tmp_path / "package").exists()
     certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
-    np.testing.assert_array_equal(certified.load(task).states, full.states[:2])
+    np.testing.assert_array_equal(certified.load(task, "paper").states, full.states[:2])
 
 
 def test_certify_keeps_installed_optima_that_are_cheaper(tmp_path, monkeypatch, capsys):
     task, path = make_task("turn"), tmp_path / "package" / "set.npz"
     first = replace(
-        certified.load(task), **{name: getattr(certified.load(task), name)[:2] for name in certified._PER_EPISODE}
+        certified.load(task, "paper"),
+        **{name: getattr(certified.load(task, "paper"), name)[:2] for name in certified._PER_EPISODE},
     )
     first = replace(first, costs=first.costs * [0.9, 1.1], trajectories=first.trajectories[:2])
-    first.save(task, path)
+    first.save(task, path, "paper")
     monkeypatch.setattr(certified, "EPISODES", 2)
     monkeypatch.setattr(certified, "path_of", lambda task, robot: path)
     certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
     assert "turn: 1 of 2 optima are cheaper than those installed" in capsys.readouterr().out
-    now = certified.load(task).costs / first.costs
+    now = certified.load(task, "paper").costs / first.costs
     assert now[0] == 1
     assert now[1] == pytest.approx(1 / 1.1, rel=1e-6)
 

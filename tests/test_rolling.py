@@ -414,12 +414,15 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
 
 def test_a_certified_set_is_of_one_robot(tmp_path):
     task = make_task("turn", "rolling")  # the very fields of the paper's
-    path = certified.load("turn").save(task, tmp_path / "set.npz", "rolling")
-    assert len(certified.load("turn", path, "rolling")) == 200
+    path = certified.load("turn", "rolling").save(task, tmp_path / "set.npz", "rolling")
+    assert len(certified.load("turn", "rolling", path)) == 200
     with pytest.raises(certified.CertificateError, match=r"was computed for BallbotParams\(.*ballbot certify"):
-        certified.load("turn", path)
-    with pytest.raises(certified.CertificateError, match="ballbot certify --robot rolling"):
-        certified.load("turn", certified.path_of(task), "rolling")
+        certified.load("turn", "paper", path)
+    with pytest.raises(certified.CertificateError, match="ballbot certify --tasks turn --robot rolling"):
+        certified.load("turn", "rolling", certified.path_of(task))
+    renamed = certified.load("turn", "paper").save(task, tmp_path / "renamed.npz", "rolling")
+    with pytest.raises(certified.CertificateError, match="its optimal trajectories do not move or cost"):
+        certified.load("turn", "rolling", renamed)
 
 
 def test_transfer_tells_who_was_made_for_what(tmp_path):

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 
 import ballbot_gym  # noqa: F401
 from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
 from ballbot_train import save_vecnormalize
 from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
 from ballbot_train.evaluation.evaluate import Predictor, evaluate
@@ -33,7 +34,7 @@ def envs():
 
 def acts(path):
     with torch.no_grad():
-        return load_actor(path, TASK)(torch.as_tensor(OBSERVATIONS)).numpy()
+        return load_actor(path, TASK, default_params())(torch.as_tensor(OBSERVATIONS)).numpy()
 
 
 def louder(model):
@@ -76,7 +77,7 @@ def normalized(tmp_path):
 def test_statistics_of_vecnormalize_are_applied(normalized):
     model, path = normalized
     save_vecnormalize(model.get_vec_normalize_env(), path)
-    expected = Predictor(model)(OBSERVATIONS, begins=True)
+    expected = Predictor(model, TASK, default_params())(OBSERVATIONS, begins=True)
     np.testing.assert_allclose(acts(path), np.clip(expected, -1, 1), atol=1e-5)
     before = policy_digests({"stabilize": [str(path)]})
     statistics_of(path).write_bytes(b"other")
@@ -126,7 +127,7 @@ def test_a_saved_model_is_evaluated_by_its_path(tmp_path):
     with pytest.raises(ValueError, match="was made for a task with 8 observations, which is none of turn"):
         controllers_of(["turn"], [str(path)])
     with pytest.raises(PolicyError, match="takes 8 observations, BallbotTurn-v0 has 9"):
-        load_actor(path, make_task("turn"))
+        load_actor(path, make_task("turn"), default_params())
 
 
 class Bomb:

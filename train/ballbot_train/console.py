@@ -6,9 +6,10 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ballbot_gym.lazy import missing
+from ballbot_gym.robots import ROBOTS
 from ballbot_gym.simulator import default_physics
 
 try:
@@ -31,7 +32,7 @@ except ModuleNotFoundError as error:
 Physics = Literal["bullet", "rk4"]
 """What options called --physics take."""
 
-RobotName = Literal["paper", "rolling", "kugle"]
+RobotName = str if TYPE_CHECKING else Literal[tuple(ROBOTS)]
 """What options called --robot take: the names in `ROBOTS`."""
 
 # A file or pipe has no width of its own: give it one that holds the widest table.

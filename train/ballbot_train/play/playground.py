@@ -537,7 +537,7 @@ class Playground:
         self.weights: dict[str, float] = {}
         """Those that differ from the task's own."""
         known = certified.path_of(self.base, self.robot).exists()
-        self._episodes = certified.load(self.base, robot=self.robot) if known else None
+        self._episodes = certified.load(self.base, self.robot) if known else None
         self._runners, self._wanted = {}, {}
         self._next: dict[str, Controller] = {}
         self._add_runner("main", controller)
