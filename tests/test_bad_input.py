@@ -35,6 +35,7 @@ from ballbot_train import evaluate, jobs, load_policy
 from ballbot_train.cli import _run
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
+from ballbot_train.learning import training
 from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
 from ballbot_train.learning.learners import LEARNERS, check_settings
 from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy
@@ -627,6 +628,7 @@ def nothing(observation):
     return np.zeros(2)
 
 
+LIGHT = replace(default_params(), body_mass=7.5)
 EVALUATION = [
     (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, or a list of indices, not 0"),
     (lambda f: evaluate(nothing, episodes=201), "episodes must be 1 to 200"),
@@ -648,6 +650,9 @@ EVALUATION = [
     (lambda f: evaluate(nothing, episodes=itertools.count()), "names more than the 200 episodes"),
     (lambda f: evaluate(nothing, "dance"), "unknown task 'dance'"),
     (lambda f: evaluate(nothing, make_task("turn", duration=4.0)), "was computed for Turn("),
+    (lambda f: evaluate(nothing, robot=LIGHT), "was computed for BallbotParams("),
+    (lambda f: evaluate(nothing, robot="kugle"), "no evaluation set of BallbotStabilize-v0; compute it with"),
+    (lambda f: training.score(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
     (lambda f: evaluate(nothing, physics="real"), "unknown physics 'real'"),
     (lambda f: evaluate(nothing, randomization=3), "randomization must be a Randomization"),
     (lambda f: evaluate(None), "None is no policy: give a Controller"),

@@ -117,28 +117,27 @@ def _in_words(space: Any, other: Any) -> str:
     return f"{space.shape} {space.dtype} from {low:g} to {high:g}"
 
 
-def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
-    """Whether a saved model takes the observations of a task and gives its actions, as far as its file says.
+def observations_of(path: str | Path) -> int:
+    """The size of the observations that a saved model takes.
 
     Raises:
-        PolicyError: as `load_actor`, where it cannot be read.
+        PolicyError: as `load_actor`.
     """
-    layers, *_, model = _read(path)
-    try:
-        check_spaces(str(path), model, task, params)
-    except PolicyError:
+    layers, *_ = _read(path)
+    return layers[0][0].shape[1]
+
+
+def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
+    """Whether a saved model takes observations of a task's size.
+
+    Raises:
+        PolicyError: as `load_actor`; also where the size is the task's and the spaces are not.
+    """
+    layers, *_, trained = _read(path)
+    if layers[0][0].shape[1] != len(task.observation_scale):
         return False
-    return layers[0][0].shape[1] == len(task.observation_scale)
-
-
-def made_for(path: str | Path) -> str:
-    """What a saved model was trained on, in words."""
-    layers, *_, model = _read(path)
-    size = f"a task with {layers[0][0].shape[1]} observations"
-    if model is None:
-        return size
-    seen, done = (_in_words(getattr(model, f"{kind}_space"), None) for kind in ("observation", "action"))
-    return f"{size}, which were {seen}, and with actions {done}"
+    check_spaces(str(path), trained, task, params)
+    return True
 
 
 def digest(path: str | Path) -> str:
@@ -194,11 +193,11 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
             env's.
     """
-    layers, activation, output, normalization, model = _read(path)
+    layers, activation, output, normalization, trained = _read(path)
     size = layers[0][0].shape[1]
     if size != len(task.observation_scale):
         raise PolicyError(f"{path} takes {size} observations, {task.id} has {len(task.observation_scale)}")
-    check_spaces(str(path), model, task, params)
+    check_spaces(str(path), trained, task, params)
     if normalization is not None and len(normalization["mean"]) != size:
         raise PolicyError(f"{path} takes {size} observations, its statistics are of {len(normalization['mean'])}")
     parts: list[torch.nn.Module] = []

@@ -42,7 +42,7 @@ def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
     """Whether the policy of a file is one for a task and a robot. A saved model tells only its spaces.
 
     Raises:
-        PolicyError: the file is missing or damaged.
+        PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.
     """
     if is_saved_model(name):
         from ballbot_train.saved_models import fits  # it imports torch
@@ -59,9 +59,9 @@ def made_for(name: str) -> str:
         PolicyError: the file is missing or damaged.
     """
     if is_saved_model(name):
-        from ballbot_train import saved_models
+        from ballbot_train.saved_models import observations_of
 
-        return saved_models.made_for(name)
+        return f"a task with {observations_of(name)} observations"
     spec = read_description(name)["spec"]
     robot = spec.get("robot", PAPER)
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"

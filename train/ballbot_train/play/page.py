@@ -19,6 +19,7 @@ import numpy as np
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
+from ballbot_train.escaping import markdown_text
 from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play.clock import Clock
@@ -562,17 +563,17 @@ class PlayPage:
         playground = self.playground
         main, best = playground.main, playground.optimum_cost_so_far
         cost = f"cost {main.cost:.2f}" + (f", the optimum's {best:.2f}" if math.isfinite(best) else "")
-        lines = [f"**{playground.status()}**", f"tilt {_degrees(main.x):.0f}°, {cost}"]
+        lines = [f"**{markdown_text(playground.status())}**", f"tilt {_degrees(main.x):.0f}°, {cost}"]
         if playground.planning and not playground.preparing:
             lines.append("planning …")
         if self._paused:
             lines.append("paused")
         if playground.notice:
-            lines.append(f"*{playground.notice:.300}*")
+            lines.append(f"*{markdown_text(playground.notice[:300])}*")
         else:
             lines.append(_HELP)
         self._status.content = "  \n".join(lines)
-        self._scores.content = "\n".join(f"- {score.text}" for score in reversed(playground.scores[-8:]))
+        self._scores.content = "\n".join(f"- {markdown_text(score.text)}" for score in reversed(playground.scores[-8:]))
 
     def _plot(self) -> None:
         names = self.playground.robot_names()

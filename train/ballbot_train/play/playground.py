@@ -90,15 +90,18 @@ class Score(NamedTuple):
     seconds: float
     cost: float
     regret: float
-    """Cost over the optimum's, less 1; NaN without an optimum. Pushes count: the optimum had none."""
+    """Cost over the optimum's, less 1; NaN without an optimum. Pushes and hidden changes count: the optimum had none."""
     failure: str
     """The violated limit, or ""."""
+    changed: bool = False
+    """Whether something was hidden from the controllers, and from the optimum."""
 
     @property
     def text(self) -> str:
         """In words."""
         who = self.controller
-        regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %"
+        of = " to the optimum of the unchanged robot" * self.changed
+        regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %{of}"
         if self.failure:
             return f"{who}: {_failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
         return f"{who}: {self.seconds:.1f} s, cost {self.cost:.1f}{regret}"
@@ -734,7 +737,14 @@ class Playground:
     def _score(self) -> None:
         best = self.optimum_cost
         regret = self.main.cost / best - 1 if best > _LEAST_COST else math.nan
-        score = Score(labels.label(self.main.name), self.seconds, self.main.cost, regret, self.main.violated)
+        score = Score(
+            labels.label(self.main.name),
+            self.seconds,
+            self.main.cost,
+            regret,
+            self.main.violated,
+            any(self.plant.values()),
+        )
         self.scores = [*self.scores, score][-_EPISODES_KEPT:]
 
     def _begin_next(self) -> None:

@@ -13,6 +13,7 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
@@ -293,9 +294,16 @@ def add_circles(axis: Axes, circles: Sequence[Circle]) -> None:
 
 def save(figure: Figure, path: Path) -> Path:
     """Writes a figure as a PNG."""
+    plain(figure)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return files.write(path, buffer.getvalue())
+
+
+def plain(figure: Figure) -> None:
+    """Shows dollar signs as they are: a name is no formula, and one that is half a formula cannot be drawn."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _folded(text: str) -> str:
