@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 # imports anew: one that trains takes 6 s to start in place of 2.5.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types pytest test-slow bench soak faults fuzz docs certify clients ray clean
+.PHONY: demo test types pytest test-slow bench soak faults fuzz docs pictures certify clients ray clean
 
 demo: $(VENV)/runs
 	$(BIN)/ballbot benchmark --episodes 10 --out runs/demo
@@ -48,6 +48,10 @@ fuzz: $(VENV)/installed
 # the documentation as a site
 docs: $(VENV)/installed
 	$(BIN)/mkdocs build --strict
+
+# the pictures and films of the documentation that show other policies than the shipped ones, or were made by another command
+pictures: $(VENV)/installed
+	$(BIN)/python docs/make_pictures.py
 
 # RLlib is tested where it is installed; it pins another Gymnasium, so that it cannot be here. RL Zoo wants an older dateutil,
 # and torchrl an older tensordict; without this minimum pip takes a torchrl from before Gymnasium 1.

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import os
+import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ READ_LIMIT = 256 * 2**20
 """Bytes that a file may hold, unpacked, unless a reader says otherwise."""
 
 _PIECE = 2**20  # bytes
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
 class FileError(ValueError):
@@ -128,7 +130,7 @@ def write(path: str | Path, content: bytes | str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
+        unfinished.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -148,10 +150,28 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> Path:
-    """Writes one line for each row under a line of column names; columns default to the keys of the first row."""
+    """Writes one line for each row under a line of column names; columns default to the keys of the first row.
+
+    Text that a spreadsheet would compute as a formula gets an apostrophe in front; `csv_text` takes it off.
+    """
     text = io.StringIO()
     names = list(columns or (rows[0] if rows else ()))
     writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+    writer.writerow({name: _csv_cell(name) for name in names})
+    writer.writerows({name: _csv_cell(value) for name, value in row.items()} for row in rows)
     return write(path, text.getvalue())
+
+
+def csv_text(cell: str) -> str:
+    """The text that `write_csv` wrote as this cell."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
+def _csv_cell(value: Any) -> Any:
+    if not isinstance(value, str) or not _FORMULA.match(value):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value

@@ -38,7 +38,7 @@ def demand(out: Path) -> None:
     figure = Figure(figsize=(10, 6), layout="constrained")
     axes = figure.subplots(2, 2, sharey=True)
     for name, axis in zip(TASKS, axes.flat, strict=True):
-        for i, trajectory in enumerate(certified.load(name).trajectories):
+        for i, trajectory in enumerate(certified.load(name, "paper").trajectories):
             load, needed = floor_force(params, trajectory)
             rows.append(
                 {
@@ -125,7 +125,7 @@ def contact(out: Path, episodes: int) -> None:
 
     robot, rows = named_robot("rolling"), []
     for name in TASKS:
-        task, stored = make_task(name, "rolling"), certified.load(name, robot="rolling")
+        task, stored = make_task(name, "rolling"), certified.load(name, "rolling")
         env = _Floor(task, physics="bullet", robot="rolling")
         for i in range(episodes):
             run = rollout(env, TrajoptController(task, robot), options=stored.options(i))

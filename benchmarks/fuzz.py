@@ -125,7 +125,7 @@ def _certified(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
     path = folder / "set.npz"
     arrays: dict[str, Any] = files.read_npz(certified.path_of(make_task("turn")))
     np.savez(path, **arrays)
-    return [path], lambda: certified.load("turn", path), (certified.CertificateError,)
+    return [path], lambda: certified.load("turn", "paper", path), (certified.CertificateError,)
 
 
 def _urdf(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
@@ -150,19 +150,25 @@ def _sb3_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     from ballbot_gym.env import make_task
+    from ballbot_gym.params import default_params
     from ballbot_train.policy_files import PolicyError
     from ballbot_train.saved_models import load_actor, save_vecnormalize
 
     env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("BallbotTurn-v0", physics="rk4")]))
     path = folder / "mine.zip"
     PPO("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu").save(path)
-    return [path, save_vecnormalize(env, path)], lambda: load_actor(path, make_task("turn")), (PolicyError,)
+    return (
+        [path, save_vecnormalize(env, path)],
+        lambda: load_actor(path, make_task("turn"), default_params()),
+        (PolicyError,),
+    )
 
 
 def _rsl_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     import torch
 
     from ballbot_gym.env import make_task
+    from ballbot_gym.params import default_params
     from ballbot_train.policy_files import PolicyError
     from ballbot_train.saved_models import load_actor
 
@@ -173,7 +179,7 @@ def _rsl_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
     path = folder / "model_1.pt"
     torch.save({"actor_state_dict": weights | biases, "iter": 1}, path)
     path.with_suffix(".json").write_text(json.dumps({"activation": "elu"}))
-    return [path, path.with_suffix(".json")], lambda: load_actor(path, task), (PolicyError,)
+    return [path, path.with_suffix(".json")], lambda: load_actor(path, task, default_params()), (PolicyError,)
 
 
 def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:

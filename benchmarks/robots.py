@@ -94,7 +94,7 @@ def nmpc_steps(task: str, robots: list[str], episodes: int) -> dict[str, float]:
     controllers = {robot: _Timed(env) for robot, env in envs.items()}
     for i in range(episodes):
         for robot, env in envs.items():
-            sets = certified.load(env.task, robot=robot)
+            sets = certified.load(env.task, robot)
             rollout(env, controllers[robot], options={"state": sets.states[i], "constants": sets.constants[i]})
     return {robot: 1e3 * statistics.median(nmpc.spent) for robot, nmpc in controllers.items()}
 

@@ -35,6 +35,7 @@ from ballbot_train import evaluate, jobs, load_policy
 from ballbot_train.cli import _run
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
+from ballbot_train.learning import training
 from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
 from ballbot_train.learning.learners import LEARNERS, check_settings
 from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy
@@ -342,20 +343,20 @@ def evaluation_set(**changes):
     def read(folder):
         arrays = files.read_npz(certified.path_of(make_task("turn"))) | changes
         path = files.write_npz(folder / "set.npz", {name: part for name, part in arrays.items() if part is not None})
-        return certified.load("turn", path)
+        return certified.load("turn", "paper", path)
 
     return read
 
 
 SETS = [
-    (lambda f: certified.load("dance"), "unknown task 'dance'; known"),
-    (lambda f: certified.load(None), "unknown task None"),
-    (lambda f: certified.load("turn", f / "none.npz"), 'compute it with "ballbot certify --tasks turn"'),
-    (lambda f: certified.load(make_task("turn", duration=4.0)), "was computed for Turn("),
-    (lambda f: certified.load("stabilize", certified.path_of(make_task("turn"))), "was computed for Turn("),
-    (lambda f: certified.load("turn", f), "is no evaluation set"),
-    (written(b"garbage", lambda path: certified.load("turn", path)), "is no evaluation set"),
-    (written(bomb(), lambda path: certified.load("turn", path)), "unpacks to 2384 MiB"),
+    (lambda f: certified.load("dance", "paper"), "unknown task 'dance'; known"),
+    (lambda f: certified.load(None, "paper"), "unknown task None"),
+    (lambda f: certified.load("turn", "paper", f / "none.npz"), 'compute it with "ballbot certify --tasks turn"'),
+    (lambda f: certified.load(make_task("turn", duration=4.0), "paper"), "was computed for Turn("),
+    (lambda f: certified.load("stabilize", "paper", certified.path_of(make_task("turn"))), "was computed for Turn("),
+    (lambda f: certified.load("turn", "paper", f), "is no evaluation set"),
+    (written(b"garbage", lambda path: certified.load("turn", "paper", path)), "is no evaluation set"),
+    (written(bomb(), lambda path: certified.load("turn", "paper", path)), "unpacks to 2384 MiB"),
     (evaluation_set(costs=None), "it has no array costs"),
     (evaluation_set(states=np.zeros((200, 7))), "states has the shape (200, 7)"),
     (evaluation_set(costs=np.full(200, math.nan)), "costs must be finite numbers"),
@@ -627,6 +628,7 @@ def nothing(observation):
     return np.zeros(2)
 
 
+LIGHT = replace(default_params(), body_mass=7.5)
 EVALUATION = [
     (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, or a list of indices, not 0"),
     (lambda f: evaluate(nothing, episodes=201), "episodes must be 1 to 200"),
@@ -648,6 +650,9 @@ EVALUATION = [
     (lambda f: evaluate(nothing, episodes=itertools.count()), "names more than the 200 episodes"),
     (lambda f: evaluate(nothing, "dance"), "unknown task 'dance'"),
     (lambda f: evaluate(nothing, make_task("turn", duration=4.0)), "was computed for Turn("),
+    (lambda f: evaluate(nothing, robot=LIGHT), "was computed for BallbotParams("),
+    (lambda f: evaluate(nothing, robot="kugle"), "no evaluation set of BallbotStabilize-v0; compute it with"),
+    (lambda f: training.score(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
     (lambda f: evaluate(nothing, physics="real"), "unknown physics 'real'"),
     (lambda f: evaluate(nothing, randomization=3), "randomization must be a Randomization"),
     (lambda f: evaluate(None), "None is no policy: give a Controller"),

@@ -20,7 +20,7 @@ NO_CONSTANTS = np.zeros(0)
 
 @pytest.fixture(scope="module")
 def episodes():
-    return certified.load("stabilize")
+    return certified.load("stabilize", "paper")
 
 
 @pytest.fixture(scope="module")

@@ -1,15 +1,15 @@
 import json
-import re
-from dataclasses import dataclass, replace
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ballbot_gym import certified, dynamics
-from ballbot_gym.env import make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.robots import PAPER, named_robot
-from ballbot_gym.rollout import PlanError
+from ballbot_gym.rollout import FunctionController, PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 
@@ -39,7 +39,7 @@ def task(robot_and_task, robot):
 
 @pytest.fixture
 def evaluation(task, robot):
-    return certified.load(task, robot=robot)
+    return certified.load(task, robot)
 
 
 def test_set_has_200_episodes_and_20_trajectories(evaluation):
@@ -156,7 +156,7 @@ def test_set_with_a_missing_episode_is_refused():
 
 
 def test_set_survives_saving(task, robot, evaluation, tmp_path):
-    loaded = certified.load(task, evaluation.save(task, tmp_path / "set.npz", robot), robot)
+    loaded = certified.load(task, robot, evaluation.save(task, tmp_path / "set.npz", robot))
     np.testing.assert_array_equal(loaded.costs, evaluation.costs)
     np.testing.assert_array_equal(loaded.statuses, evaluation.statuses)
     for a, b in zip(loaded.trajectories, evaluation.trajectories, strict=True):
@@ -167,38 +167,74 @@ def test_set_survives_saving(task, robot, evaluation, tmp_path):
 def test_set_of_other_fields_is_refused(task, robot):
     other = replace(task, duration=2 * task.duration)
     with pytest.raises(certified.CertificateError, match=rf"{task.id}.*\.npz was computed for"):
-        certified.load(other, robot=robot)
+        certified.load(other, robot)
+
+
+class Nearer(Stabilize):
+    """Another problem under its parent's id."""
+
+
+class Dearer(Stabilize):
+    """Another cost under its parent's id, name and fields."""
+
+    def cost(self, x, u, c):
+        return 2 * super().cost(x, u, c)
+
+
+Dearer.__name__ = "Stabilize"
+
+ROLLING = named_robot("rolling")
+OTHERS = {
+    "half the mass": ("stabilize", replace(default_params(), body_mass=7.5), "--tasks stabilize --robot NAME"),
+    "more mass": ("stabilize", replace(default_params(), body_mass=20.0), "--tasks stabilize --robot NAME"),
+    "less force": ("orbit", replace(default_params(), force_limit=300.0), "--tasks orbit --robot NAME"),
+    "the moon": ("turn", replace(default_params(), gravity=1.62), "--tasks turn --robot NAME"),
+    "a smoother floor": ("turn", replace(ROLLING, friction=0.6), "--tasks turn --robot NAME"),
+    "a floor without limit": ("turn", replace(ROLLING, friction=math.inf), "--tasks turn --robot NAME"),
+    "no set": ("turn", "kugle", "--tasks turn --robot kugle"),
+    "nor by its parameters": ("turn", named_robot("kugle"), "--tasks turn --robot kugle"),
+    "control steps": (make_task("turn", control_dt=0.01), PAPER, "--tasks turn --robot NAME"),
+    "a weight": (make_task("turn", effort_weight=1e-3), PAPER, "--tasks turn --robot NAME"),
+    "draws": (make_task("stabilize", start_position=1.0), PAPER, "--tasks stabilize --robot NAME"),
+    "draws of another robot": (make_task("orbit", "rolling"), PAPER, "--tasks orbit --robot NAME"),
+    "a subclass": (Nearer(), PAPER, "--tasks sprint"),
+    "a subclass of the same name": (Dearer(), PAPER, "--tasks sprint"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_set_is_of_one_problem_and_one_robot(name):
+    task, robot, options = OTHERS[name]
+    with pytest.raises(certified.CertificateError, match=f'"ballbot certify {options} --install"'):
+        certified.load(task, robot)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_no_evaluation_divides_by_the_optimum_of_something_else(name):
+    """Certified episodes one by one, as `evaluate` and training measure them."""
+    task, robot, _ = OTHERS[name]
+    evaluate = pytest.importorskip("ballbot_train.evaluation.evaluate")
+    with pytest.raises(certified.CertificateError):
+        evaluate.evaluate(lambda observation: np.zeros(2), task, 1, "rk4", robot=robot)
+    env = BallbotEnv(task, physics="rk4", robot=robot)
+    idle = FunctionController(lambda t, x: np.zeros(2))
+    with pytest.raises(certified.CertificateError):
+        evaluate.run_episodes(env, idle, "idle", "stabilize", [0])
+
+
+def test_a_set_of_another_cost_is_refused_whatever_it_is_called(monkeypatch):
+    monkeypatch.setitem(TASKS, "stabilize", Dearer)
+    with pytest.raises(certified.CertificateError, match="its optimal trajectories do not move or cost"):
+        certified.load("stabilize", PAPER)
+
+
+def test_pay_and_arena_move_no_optimum():
+    assert len(certified.load(make_task("stabilize", arena_radius=50.0, survival_reward=10.0), default_params())) == 200
 
 
 def test_missing_set_says_how_to_make_one(task, tmp_path):
     with pytest.raises(certified.CertificateError, match=r"no evaluation set.*ballbot certify"):
-        certified.load(task, tmp_path / "none.npz")
-
-
-@dataclass(frozen=True)
-class OneOfMine(Stabilize):
-    id = "BallbotMine-v0"
-
-
-@pytest.mark.parametrize(
-    ("task", "robot", "advice"),
-    [
-        (Stabilize(), "kugle", '"ballbot certify --robot kugle --tasks stabilize --install"'),
-        (OneOfMine(), PAPER, "add OneOfMine, as docs/extending.md says"),
-        (Stabilize(duration=4.0), PAPER, "default fields alone; ballbot_baselines.find_optimum"),
-    ],
-    ids=["no set", "a task of one's own", "other fields"],
-)
-def test_what_is_advised_where_there_is_no_set_makes_one(task, robot, advice):
-    task = make_task("stabilize", robot) if robot != PAPER else task
-    with pytest.raises(certified.CertificateError, match=re.escape(advice)):
-        certified.load(task, robot=robot)
-
-
-def test_a_task_of_ones_own_is_advised_how_to_get_a_set(monkeypatch):
-    monkeypatch.setitem(TASKS, "mine", OneOfMine)
-    with pytest.raises(certified.CertificateError, match='"ballbot certify --tasks mine --install"'):
-        certified.load("mine")
+        certified.load(task, "paper", tmp_path / "none.npz")
 
 
 def test_all_sets_together_are_under_5_megabytes():

@@ -8,19 +8,24 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builders import result
 
 from ballbot_gym import certified
-from ballbot_gym.env import make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.lazy import load
-from ballbot_gym.rollout import PlanError
+from ballbot_gym.params import default_params
+from ballbot_gym.robots import ROBOTS, Robot
+from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands import COMMANDS, help_of
 from ballbot_train.commands.certify import certify
 from ballbot_train.commands.compare import compare
+from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.evaluation.results import leaderboard, write_leaderboard
 
 
@@ -273,7 +278,10 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     assert (len(solved), len(again)) == (2, 1)
     out = tmp_path / "runs" / "certify"
     assert [path.name for path in out.iterdir()] == ["BallbotTurn-v0.npz"]
-    made, known = certified.load(make_task("turn"), out / "BallbotTurn-v0.npz"), certified.load(make_task("turn"))
+    made, known = (
+        certified.load(make_task("turn"), "paper", out / "BallbotTurn-v0.npz"),
+        certified.load(make_task("turn"), "paper"),
+    )
     np.testing.assert_array_equal(made.states, known.states[:3])
     np.testing.assert_allclose(made.costs, known.costs[:3], rtol=1e-9)
     assert len(made.trajectories) == 3
@@ -300,36 +308,73 @@ def test_certify_goes_on_when_a_worker_dies(tmp_path):
     os.kill(int(workers[0]), signal.SIGKILL)
     printed, _ = run.communicate(timeout=120)
     assert run.returncode == 0, printed
-    made, known = certified.load("turn", tmp_path / "out" / "BallbotTurn-v0.npz"), certified.load("turn")
+    made, known = (
+        certified.load("turn", "paper", tmp_path / "out" / "BallbotTurn-v0.npz"),
+        certified.load("turn", "paper"),
+    )
     np.testing.assert_array_equal(made.states, known.states[:4])
     np.testing.assert_allclose(made.costs, known.costs[:4], rtol=1e-9)
 
 
 def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
     task = make_task("turn")
-    full = certified.load(task)
+    full = certified.load(task, "paper")
     monkeypatch.setattr(certified, "EPISODES", 2)
     monkeypatch.setattr(certified, "path_of", lambda task, robot: tmp_path / "package" / f"{task.id}.npz")
     certify(("turn",), 2, out=tmp_path / "out", workers=1)
     assert not (tmp_path / "package").exists()
     certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
-    np.testing.assert_array_equal(certified.load(task).states, full.states[:2])
+    np.testing.assert_array_equal(certified.load(task, "paper").states, full.states[:2])
 
 
 def test_certify_keeps_installed_optima_that_are_cheaper(tmp_path, monkeypatch, capsys):
     task, path = make_task("turn"), tmp_path / "package" / "set.npz"
     first = replace(
-        certified.load(task), **{name: getattr(certified.load(task), name)[:2] for name in certified._PER_EPISODE}
+        certified.load(task, "paper"),
+        **{name: getattr(certified.load(task, "paper"), name)[:3] for name in certified._PER_EPISODE},
     )
-    first = replace(first, costs=first.costs * [0.9, 1.1], trajectories=first.trajectories[:2])
-    first.save(task, path)
-    monkeypatch.setattr(certified, "EPISODES", 2)
+    first = replace(first, costs=first.costs * [1.0, 0.9, 1.1], trajectories=first.trajectories[:1])
+    first.save(task, path, "paper")
+    monkeypatch.setattr(certified, "EPISODES", 3)
     monkeypatch.setattr(certified, "path_of", lambda task, robot: path)
-    certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
-    assert "turn: 1 of 2 optima are cheaper than those installed" in capsys.readouterr().out
-    now = certified.load(task).costs / first.costs
-    assert now[0] == 1
-    assert now[1] == pytest.approx(1 / 1.1, rel=1e-6)
+    certify(("turn",), 3, install=True, out=tmp_path / "out", workers=1)
+    assert "turn: 1 of 3 optima are cheaper than those installed" in capsys.readouterr().out
+    now = certified.load(task, "paper").costs / first.costs
+    assert now[:2].tolist() == [1, 1]
+    assert now[2] == pytest.approx(1 / 1.1, rel=1e-6)
+
+
+def test_a_robot_that_is_given_a_name_and_certified_has_regrets(tmp_path, monkeypatch, typed):
+    """The advice that a refusal gives, followed. Optima are LQR's episodes here: finding true ones compiles for a minute."""
+    light = replace(default_params(), body_mass=7.5)
+    with pytest.raises(certified.CertificateError, match=r"give this robot.* a name in ballbot_gym/robots.py"):
+        evaluate("lqr", "stabilize", 2, "rk4", robot=light)
+    (tmp_path / "light.urdf").write_text(light.to_urdf())
+    monkeypatch.setitem(ROBOTS, "light", Robot("lighter than the paper's", tmp_path / "light.urdf"))
+    with pytest.raises(certified.CertificateError, match='"ballbot certify --tasks stabilize --robot light --install"'):
+        evaluate("lqr", "stabilize", 2, "rk4", robot=light)
+    certification = importlib.import_module("ballbot_baselines.certification")
+
+    def found(task, params, x, c, **options):
+        env = BallbotEnv(task, physics="rk4", robot=params)
+        run = rollout(env, make_controller("lqr", task, params), options={"state": x, "constants": c})
+        facts = {"violation": 0.0, "solver": "lqr", "solver_status": "none", "is_optimal": True}
+        return SimpleNamespace(cost=run.cost, trajectory=run.trajectory, **facts)
+
+    monkeypatch.setattr(certification, "find_optimum", found)
+    monkeypatch.setattr(certified, "EPISODES", 2)
+    monkeypatch.setattr(certified, "path_of", lambda task, robot: tmp_path / f"{task.id}-{robot}.npz")
+    certify(("stabilize",), 2, install=True, out=tmp_path / "out", workers=1, robot="light")
+    assert evaluate("lqr", "stabilize", 2, "rk4", robot=light).regret_mean == pytest.approx(0, abs=1e-9)
+
+
+def test_a_robot_without_certified_episodes_is_refused_and_blocks_nothing(typed, tmp_path):
+    for episodes in (2, 3):
+        arguments = ("--tasks", "turn", "--controllers", "lqr", "--robot", "kugle", "--physics", "rk4", "--workers", 1)
+        ended, printed = typed("benchmark", *arguments, "--episodes", episodes, "--out", "out")
+        assert ended == 1
+        assert 'compute it with "ballbot certify --tasks turn --robot kugle --install"' in printed
+    assert not any((tmp_path / "out").iterdir())
 
 
 def test_certify_says_which_episode_has_no_optimum_and_writes_no_set(tmp_path, monkeypatch):

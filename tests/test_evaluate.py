@@ -14,6 +14,7 @@ from builders import result
 
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
+from ballbot_gym import files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import Randomization
@@ -102,6 +103,24 @@ def test_a_file_without_episodes_is_refused(tmp_path):
     (tmp_path / "leaderboard.json").write_text('{"rows": []}')
     with pytest.raises(ValueError, match="holds no episodes"):
         read_results(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name", ["=cmd|' /C calc'!A0.json", "+1+1", "@SUM(A1)", "-x", "'=x", "\tx", "plain", 'a,"b"', "'x"]
+)
+def test_a_name_is_no_formula_in_csv_and_is_read_back_as_it_was(name, tmp_path):
+    results = [result(controller=name, note=name)]
+    write_leaderboard(leaderboard(results), results, {}, tmp_path)
+    with (tmp_path / "episodes.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert row["controller"][0] not in "=+-@\t\r"
+    assert float(row["cost"]) == results[0].cost
+    assert read_results(tmp_path / "episodes.csv")[1] == results
+
+
+def test_numbers_and_columns_in_csv(tmp_path):
+    files.write_csv(tmp_path / "a.csv", [{"=x": -1.5, "y": "-15", "z": "-"}])
+    assert (tmp_path / "a.csv").read_text() == "'=x,y,z\n-1.5,-15,'-\n"
 
 
 class Standing:

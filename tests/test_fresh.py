@@ -42,7 +42,7 @@ def test_fresh_episodes_are_neither_certified_nor_for_validation_nor_of_another_
         fresh.draw(task, range(count), 1),
         fresh.draw(task, range(count), 0, "validation"),
     ]
-    episodes = certified.load(task)
+    episodes = certified.load(task, "paper")
     sets.append((episodes.states, episodes.constants))
     starts = np.concatenate([np.column_stack(group) for group in sets])
     assert len(np.unique(starts, axis=0)) == 3 * count + len(episodes)

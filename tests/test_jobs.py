@@ -152,6 +152,29 @@ def test_a_folder_belongs_to_one_run_until_it_is_released(tmp_path):
     jobs.claim(tmp_path, {"episodes": 4, "policies": {}})
 
 
+def failing(items):
+    for item in items:
+        if item == 1:
+            raise ValueError("no episode 1")
+        yield {"value": item}
+
+
+def test_a_run_that_ends_before_anything_is_finished_leaves_its_folder_to_others(tmp_path):
+    jobs.claim(tmp_path, {"episodes": 3})
+    with pytest.raises(ValueError, match="no episode 1"):
+        jobs.run([jobs.Job("job", failing, (), (1, 2))], tmp_path, 1, ignore)
+    assert not any(tmp_path.iterdir())
+    jobs.claim(tmp_path, {"episodes": 4})
+    with pytest.raises(ValueError, match="no episode 1"):
+        jobs.run([jobs.Job("job", failing, (), (0, 1, 2))], tmp_path, 1, ignore)
+    with pytest.raises(ValueError, match="unfinished run of episodes 4, not 3"):  # an item is finished
+        jobs.claim(tmp_path, {"episodes": 3})
+    with pytest.raises(ValueError, match="no episode 1"):
+        jobs.run([jobs.Job("job", failing, (), (0, 1, 2))], tmp_path, 1, ignore)
+    assert (tmp_path / jobs.MARKER).exists()
+    jobs.release(tmp_path)
+
+
 def test_the_files_of_a_claim_keep_facts_that_are_not_compared(tmp_path):
     jobs.claim(tmp_path, {"seed": 1}, "config.json", {"about": {"commit": "a"}})
     jobs.claim(tmp_path, {"seed": 1}, "config.json", {"about": {"commit": "b"}})

@@ -22,7 +22,7 @@ EXACT = Backoff(goal=0.01)  # otherwise Turn's goal is missed or not by the solv
 
 def regret(make_env, task, episode, physics="rk4", wrap=lambda controller: controller, **options):
     """Of one certified episode, with the rollout and the controller."""
-    env, known = make_env(task, physics=physics), certified.load(task)
+    env, known = make_env(task, physics=physics), certified.load(task, "paper")
     controller = NmpcController(task, env.params, **options)
     run = rollout(env, wrap(controller), options=known.options(episode))
     return run.cost / known.costs[episode] - 1, run, controller
@@ -161,7 +161,7 @@ def test_recovers_from_a_push_that_lqr_does_not(params):
 def test_margins_are_kept_off_the_plan(params):
     """Beside an obstacle, pushed towards it."""
     task = Weave()
-    known = certified.load(task)
+    known = certified.load(task, "paper")
     x, c = known.states[0], known.constants[0]
     controller = NmpcController(task, params)
     controller.reset(0.0, x, c)
@@ -176,7 +176,7 @@ def test_margins_are_kept_off_the_plan(params):
 
 def test_missed_first_exit_goal_is_planned_anew(make_env):
     """A push just before the gate."""
-    env, known = make_env("turn", physics="rk4"), certified.load(Turn())
+    env, known = make_env("turn", physics="rk4"), certified.load(Turn(), "paper")
     x, c = known.states[1], known.constants[1]
     controller = NmpcController(env.task, env.params)
     controller.reset(0.0, x, c)
@@ -197,7 +197,7 @@ def test_delay_that_is_known_costs_little(make_env):
     task = Stabilize()
     aware, run, _ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2), delay=0.04)
     assert run.success
-    env, known = make_env(task, physics="rk4"), certified.load(task)
+    env, known = make_env(task, physics="rk4"), certified.load(task, "paper")
     late = find_optimum(task, env.params, coasted(env.params, known.states[2], 2), NO_CONSTANTS)
     # what cannot be avoided is the start without force
     unavoidable = late.cost / known.costs[2] - 1
@@ -306,7 +306,7 @@ def test_a_robot_like_the_model_shows_no_disturbance(make_env):
 
 def test_offset_free_nmpc_gets_through_the_gate_with_a_lower_centre_of_mass(make_env):
     lower = Randomization(com_height=(0.9, 0.9))
-    env, known = make_env("turn", physics="rk4", randomization=lower), certified.load(Turn())
+    env, known = make_env("turn", physics="rk4", randomization=lower), certified.load(Turn(), "paper")
     run = rollout(env, offset_free_nmpc(env.task, env.params), seed=1, options=known.options(1))
     assert run.success
     assert run.cost < 1.15 * known.costs[1]  # measured: 1.08; without it NMPC circles the gate until the end

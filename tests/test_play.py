@@ -58,7 +58,7 @@ def test_an_episode_without_pushes_costs_what_the_env_says(play, episode):
     playground = play(episode=episode)
     env = BallbotEnv("stabilize", physics="rk4")
     controller = CONTROLLERS["lqr"](env.task, env.params)
-    expected = rollout(env, controller, options=certified.load("stabilize").options(episode))
+    expected = rollout(env, controller, options=certified.load("stabilize", "paper").options(episode))
     while not playground.scores:
         playground.step()
     (score,) = playground.scores
@@ -69,7 +69,7 @@ def test_an_episode_without_pushes_costs_what_the_env_says(play, episode):
 
 def test_the_optimum_costs_what_is_certified(play):
     playground = play()
-    assert playground.optimum_cost == pytest.approx(certified.load("stabilize").costs[STANDING], rel=1e-4)
+    assert playground.optimum_cost == pytest.approx(certified.load("stabilize", "paper").costs[STANDING], rel=1e-4)
     early = playground.optimum_cost_so_far
     go(playground, 1.0)
     assert 0 < early < playground.optimum_cost_so_far < playground.optimum_cost

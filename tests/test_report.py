@@ -7,11 +7,14 @@ import time
 import numpy as np
 import pytest
 from browser import start_chromium
+from builders import result
 from markupsafe import Markup
 
+from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
+from ballbot_train.report.film import write_film
 from ballbot_train.report.page import (
     Line,
     Panel,
@@ -24,7 +27,7 @@ from ballbot_train.report.page import (
     write_report,
 )
 from ballbot_train.report.replay import Replay, Take
-from ballbot_train.report.sections import learning_section
+from ballbot_train.report.sections import leaderboard_sections, learning_section, replay_of
 
 LARGEST = 15e6  # bytes
 
@@ -119,6 +122,43 @@ def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
     for data in re.findall(r'<script type="application/json">(.*?)</script>', text, flags=re.DOTALL):
         assert not set("<>&'") & set(data)
         json.loads(data)
+
+
+def test_names_are_text_in_plotly_and_in_figures(tmp_path):
+    name = "<b><a href='https://x.y'>$\\frac{1}$ & $x"
+    section = curves_section("c", [Panel(name, "x", "y", [Line(name, [0, 1], [0, 1], "red")])])
+    (data,) = re.findall(r'<script type="application/json">(.*?)</script>', section.body, flags=re.DOTALL)
+    figure = json.loads(data)
+    assert figure["data"][0]["name"] == figure["layout"]["title"]["text"]
+    assert figure["data"][0]["name"].startswith("&lt;b&gt;&lt;a href=")
+    curve = figures.Curve(name, leaning(0.1, 0.1), "red")
+    assert figures.save(figures.trajectory_figure(name, [curve]), tmp_path / "a.png").stat().st_size > 1000
+    write_film(Replay(name, (Take(name, leaning(0.1, 0.1), "red", name),)), tmp_path / "a.gif", 0.1, width=64)
+
+
+def test_the_report_of_a_robot_shows_nothing_of_another(tmp_path):
+    for robot in ("paper", "rolling"):
+        run = tmp_path / robot
+        run.mkdir()
+        (run / "config.json").write_text(json.dumps({"task": "stabilize", "learner": robot, "robot": robot}))
+        (run / "evaluations.csv").write_text("iteration,seconds,regret_mean\n0,1.0,0.5\n1,2.0,0.25\n")
+    assert "rolling: rolling" in learning_section(tmp_path, "rolling").body
+    assert "paper: paper" not in learning_section(tmp_path, "rolling").body
+    assert "rolling" not in learning_section(tmp_path).body
+    results = [result(episode=0), result(episode=1)]
+    replays = {robot: replay_of("stabilize", ["lqr"], results, "rk4", robot) for robot in ("paper", "rolling")}
+    assert {robot: replay.params for robot, replay in replays.items()} == {r: named_robot(r) for r in replays}
+    (tmp_path / "basins").mkdir()
+    picture = figures.save(figures.trajectory_figure("t", []), tmp_path / "basins" / "basins.png")
+    (tmp_path / "basins" / "basins.json").write_text('{"about": {"robot": "rolling"}}')
+    arguments = (HEADER, ROWS, results, {"stabilize": ["lqr"]}, [], "rk4", tmp_path, "")
+    shown = {
+        robot: [section.title for section in leaderboard_sections(*arguments, robot) if section is not None]
+        for robot in ("paper", "rolling")
+    }
+    assert picture.exists()
+    assert "Basins of attraction" in shown["rolling"]
+    assert "Basins of attraction" not in shown["paper"]
 
 
 def test_learning_curves_come_from_what_training_wrote(tmp_path):

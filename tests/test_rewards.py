@@ -162,7 +162,7 @@ def test_driving_away_ends_at_the_arena(task):
 
 
 def test_every_stored_optimum_stays_inside_the_arena_by_far(task):
-    evaluation = certified.load(task)
+    evaluation = certified.load(task, "paper")
     for trajectory, c in zip(evaluation.trajectories, evaluation.constants, strict=False):
         x, y, radius = task.arena(tuple(c))
         assert np.hypot(trajectory.x[:, 0] - x, trajectory.x[:, 1] - y).max() < 0.8 * radius
@@ -176,7 +176,7 @@ def test_no_certified_optimum_can_leave_the_arena_for_what_it_costs(task):
     """
     if task.id not in ("BallbotStabilize-v0", "BallbotWeave-v0"):
         pytest.skip("its cost rate does not hold the distance")
-    evaluation = certified.load(task)
+    evaluation = certified.load(task, "paper")
     for x, c, cost in zip(evaluation.states, evaluation.constants, evaluation.costs, strict=True):
         x_centre, y_centre, radius = task.arena(tuple(c))
         start = (x[0] - x_centre) ** 2 + (x[1] - y_centre) ** 2
@@ -184,7 +184,7 @@ def test_no_certified_optimum_can_leave_the_arena_for_what_it_costs(task):
 
 
 def test_reward_threshold_is_the_mean_return_at_ten_percent_regret(task):
-    costs = certified.load(task).costs
+    costs = certified.load(task, "paper").costs
     assert task.reward_threshold == pytest.approx(np.mean(task.survival_pay - 1.1 * costs), abs=0.05)
     assert gymnasium.spec(task.id).reward_threshold == task.reward_threshold
 
@@ -194,7 +194,7 @@ def turning_less_waiting(gamma, bootstrapped):
 
     Time-outs end the sum, or, bootstrapped, standing still is worth what it would be for ever.
     """
-    task, evaluation = Turn(), certified.load(Turn())
+    task, evaluation = Turn(), certified.load(Turn(), "paper")
     steps, all_steps = np.round(evaluation.durations / task.control_dt), task.steps
     pay = task.survival_reward * task.control_dt
 
@@ -254,7 +254,7 @@ def test_pay_and_arena_are_no_part_of_the_problem(task):
     other = type(task)(survival_reward=50.0, **arena)
     assert other.problem() == task.problem()
     assert type(task)(duration=4.0).problem() != task.problem()
-    np.testing.assert_array_equal(certified.load(other).costs, certified.load(task).costs)
+    np.testing.assert_array_equal(certified.load(other, "paper").costs, certified.load(task, "paper").costs)
 
 
 def test_registry_is_complete():

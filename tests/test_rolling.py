@@ -414,12 +414,15 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
 
 def test_a_certified_set_is_of_one_robot(tmp_path):
     task = make_task("turn", "rolling")  # the very fields of the paper's
-    path = certified.load("turn").save(task, tmp_path / "set.npz", "rolling")
-    assert len(certified.load("turn", path, "rolling")) == 200
+    path = certified.load("turn", "rolling").save(task, tmp_path / "set.npz", "rolling")
+    assert len(certified.load("turn", "rolling", path)) == 200
     with pytest.raises(certified.CertificateError, match=r"was computed for BallbotParams\(.*ballbot certify"):
-        certified.load("turn", path)
-    with pytest.raises(certified.CertificateError, match="ballbot certify --robot rolling"):
-        certified.load("turn", certified.path_of(task), "rolling")
+        certified.load("turn", "paper", path)
+    with pytest.raises(certified.CertificateError, match="ballbot certify --tasks turn --robot rolling"):
+        certified.load("turn", "rolling", certified.path_of(task))
+    renamed = certified.load("turn", "paper").save(task, tmp_path / "renamed.npz", "rolling")
+    with pytest.raises(certified.CertificateError, match="its optimal trajectories do not move or cost"):
+        certified.load("turn", "rolling", renamed)
 
 
 def test_transfer_tells_who_was_made_for_what(tmp_path):
@@ -431,6 +434,9 @@ def test_transfer_tells_who_was_made_for_what(tmp_path):
         ("kugle", "paper", "2"),
     ]
     assert rows[0]["cost_mean"] != rows[1]["cost_mean"]
+    assert {"regret_mean_on_own_floor", "regret_median_on_own_floor"} <= set(rows[0])
+    assert not {"regret_mean", "optimum"} & set(rows[0])
+    assert "| regret over the optimum on the robot's own floor |" in (tmp_path / "transfer.md").read_text()
     assert (tmp_path / "transfer.png").stat().st_size > 1000
     with pytest.raises(ValueError, match="does not roll"):
         transfer(frictions=(0.8,), out=tmp_path, **arguments)

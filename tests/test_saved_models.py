@@ -3,23 +3,36 @@
 import io
 import json
 import pickle
+import re
 import zipfile
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers import (
+    DiscretizeAction,
+    DtypeObservation,
+    FlattenObservation,
+    FrameStackObservation,
+    NormalizeObservation,
+    RescaleAction,
+    RescaleObservation,
+    TimeAwareObservation,
+)
 from rsl_rl.models import MLPModel
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensordict import TensorDict
 
-import ballbot_gym  # noqa: F401
+from ballbot_gym import certified
 from ballbot_gym.env import make_task
+from ballbot_gym.params import default_params
 from ballbot_train import save_vecnormalize
 from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
 from ballbot_train.evaluation.evaluate import Predictor, evaluate
 from ballbot_train.evaluation.fresh import evaluate_fresh
+from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.saved_models import load_actor, statistics_of
 
@@ -33,7 +46,7 @@ def envs():
 
 def acts(path):
     with torch.no_grad():
-        return load_actor(path, TASK)(torch.as_tensor(OBSERVATIONS)).numpy()
+        return load_actor(path, TASK, default_params())(torch.as_tensor(OBSERVATIONS)).numpy()
 
 
 def louder(model):
@@ -76,7 +89,7 @@ def normalized(tmp_path):
 def test_statistics_of_vecnormalize_are_applied(normalized):
     model, path = normalized
     save_vecnormalize(model.get_vec_normalize_env(), path)
-    expected = Predictor(model)(OBSERVATIONS, begins=True)
+    expected = Predictor(model, TASK, default_params())(OBSERVATIONS, begins=True)
     np.testing.assert_allclose(acts(path), np.clip(expected, -1, 1), atol=1e-5)
     before = policy_digests({"stabilize": [str(path)]})
     statistics_of(path).write_bytes(b"other")
@@ -126,7 +139,78 @@ def test_a_saved_model_is_evaluated_by_its_path(tmp_path):
     with pytest.raises(ValueError, match="was made for a task with 8 observations, which is none of turn"):
         controllers_of(["turn"], [str(path)])
     with pytest.raises(PolicyError, match="takes 8 observations, BallbotTurn-v0 has 9"):
-        load_actor(path, make_task("turn"))
+        load_actor(path, make_task("turn"), default_params())
+
+
+def stacked(env):
+    return FlattenObservation(FrameStackObservation(env, 3))
+
+
+WRAPPERS = {
+    "RescaleAction": (
+        lambda env: RescaleAction(env, np.float32(-350), np.float32(350)),
+        "trained on actions (2,) float32 from -350 to 350",
+    ),
+    "RescaleObservation": (
+        lambda env: RescaleObservation(env, np.float32(-1), np.float32(1)),
+        "trained on observations (8,) float32 from -1 to 1, and those of BallbotStabilize-v0 are (8,) float32 from -12",
+    ),
+    "NormalizeObservation": (NormalizeObservation, "trained on observations (8,) float32 from -inf to inf"),
+    "float64": (lambda env: DtypeObservation(env, np.float64), "trained on observations (8,) float64"),
+    "stacked": (stacked, "24"),
+    "time": (TimeAwareObservation, "9"),
+    "discrete": (lambda env: DiscretizeAction(env, 5), "2"),
+    "another robot": (lambda env: make("rolling", 8.0), "from -17.7362 to 17.7362"),
+    "another duration": (lambda env: make("paper", 4.0), "from -7.4"),
+}
+
+
+def make(robot, duration):
+    return gymnasium.make("BallbotStabilize-v0", physics="rk4", robot=robot, duration=duration)
+
+
+@pytest.mark.filterwarnings("ignore")  # Gymnasium's of dtypes
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_a_model_of_other_spaces_is_not_scored_without_what_made_them(name, tmp_path):
+    wrap, said = WRAPPERS[name]
+    venv = DummyVecEnv([lambda: wrap(make("paper", 8.0))])
+    model = PPO("MlpPolicy", venv, policy_kwargs={"net_arch": [4]}, device="cpu")
+    model.save(tmp_path / "model.zip")
+    for evaluated in (evaluate, evaluate_fresh):
+        with pytest.raises(PolicyError, match=r"Where a wrapper changed them, give ballbot_train\.evaluate a function"):
+            evaluated(model, "stabilize", 1)
+        with pytest.raises(PolicyError, match=re.escape(said)):
+            evaluated(tmp_path / "model.zip", "stabilize", 1)
+    with pytest.raises(ValueError, match=r"Where a wrapper changed|which is none of stabilize|no network of linear"):
+        controllers_of(["stabilize"], [str(tmp_path / "model.zip")])
+
+
+def test_a_function_that_does_what_the_wrapper_did_is_scored_as_the_model_in_it():
+    venv = DummyVecEnv([lambda: RescaleAction(make("paper", 8.0), np.float32(-350), np.float32(350))])
+    model = louder(PPO("MlpPolicy", venv, policy_kwargs={"net_arch": [4]}, device="cpu"))
+    cost = evaluate(lambda observation: model.predict(observation, deterministic=True)[0] / 350, "stabilize", 1, "rk4")
+    env = RescaleAction(make("paper", 8.0), np.float32(-350), np.float32(350))
+    observation, _ = env.reset(options=certified.load("stabilize", "paper").options(0))
+    expected, done = 0.0, False
+    while not done:
+        observation, _, terminated, truncated, info = env.step(model.predict(observation, deterministic=True)[0])
+        expected, done = expected + info["cost"], terminated or truncated
+    assert cost.cost_mean == pytest.approx(expected, rel=1e-6)
+
+
+def test_models_of_our_own_vector_env_are_in_its_spaces(tmp_path):
+    venv = BallbotVecEnv(gymnasium.make_vec("BallbotStabilize-v0", num_envs=2).unwrapped)
+    model = PPO("MlpPolicy", venv, policy_kwargs={"net_arch": [4]}, device="cpu")
+    model.save(tmp_path / "model.zip")
+    assert evaluate(model, "stabilize", 1, "rk4").episodes == evaluate(tmp_path / "model.zip", "stabilize", 1).episodes
+
+
+def test_a_model_that_lost_its_vecnormalize_is_refused(normalized):
+    _, path = normalized
+    with pytest.raises(
+        PolicyError, match=r"PPO was trained with VecNormalize and has none now; load the model with it"
+    ):
+        evaluate(PPO.load(path, device="cpu"), "stabilize", 1, "rk4")
 
 
 class Bomb:

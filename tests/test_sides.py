@@ -14,7 +14,7 @@ from ballbot_gym.tasks.weave import Weave, sides_passed, split_constants
 @pytest.fixture
 def slaloms():
     """Start, constants and optimal path of certified slaloms."""
-    known = certified.load("weave")
+    known = certified.load("weave", "paper")
     return [(known.states[i], known.constants[i], known.trajectories[i].x[:, :2]) for i in range(20)]
 
 
@@ -53,7 +53,7 @@ def test_the_optimal_choice_is_predicted_among_the_best(slaloms, params):
 
 
 def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
-    task, known = Weave(), certified.load("weave")
+    task, known = Weave(), certified.load("weave", "paper")
     doubt = []
     for i in range(6):
         x0, c = known.states[i], known.constants[i]
@@ -67,7 +67,7 @@ def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
 
 def test_the_search_from_every_choice_finds_what_the_likely_ones_lead_to(params):
     """From rest to rest the solver comes to a worse optimum on the best sides of this certified episode."""
-    task, known = Weave(), certified.load("weave")
+    task, known = Weave(), certified.load("weave", "paper")
     x0, c = known.states[12], known.constants[12]
     likely, all_choices = (find_optimum(task, params, x0, c, guesses=guesses) for guesses in (5, ALL_GUESSES))
     assert likely.cost == pytest.approx(105.2216, abs=1e-3)

@@ -1,7 +1,9 @@
 """Certified evaluation sets: for every robot and task 200 fixed episodes with their optima.
 
-`load(task)` reads what `ballbot certify` computed: initial states, constants, optimal costs and the solver's status of each
-episode, and the optimal trajectories of the first 20 episodes. Costs hold for the env's discretization with physics="rk4".
+`load(task, robot)` reads what `ballbot certify` computed: initial states, constants, optimal costs and the solver's status of
+each episode, and the optimal trajectories of the first 20. Costs hold for the env's discretization with physics="rk4".
+A set says what it was made for, and `load` refuses it for any other task or robot: a cost divided by the optimum of something
+else is no regret.
 """
 
 from collections.abc import Mapping
@@ -10,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_gym import files
+from ballbot_gym import dynamics, files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, file_name, named_robot, robot_name
+from ballbot_gym.robots import PAPER, checked_robot, file_name, named_robot, robot_name
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -21,6 +23,8 @@ EPISODES = 200
 TRAJECTORIES = 20
 
 _CHEAPER = 1e-7  # relative: optima that differ by less are the same
+_ENDS = (slice(None, -1), slice(1, None))  # of control steps
+_SAME = 1e-6  # of states and, relative, of costs: what rounding differs by between machines is far less
 
 
 class CertificateError(ValueError):
@@ -68,11 +72,12 @@ class EvaluationSet:
         pairs = zip(better.tolist(), self.trajectories, other.trajectories, strict=False)
         return EvaluationSet(**chosen, trajectories=tuple(new if take else old for take, old, new in pairs))
 
-    def save(self, task: Task, path: Path, robot: str = PAPER) -> Path:
+    def save(self, task: Task, path: Path, robot: str | BallbotParams) -> Path:
         """Writes the set, with what defines its optima, so that it is never read for another problem or robot."""
+        params = checked_robot(robot)
         arrays = {
             "task": np.array(task.problem()),
-            **({} if robot == PAPER else {"robot": np.array(repr(named_robot(robot)))}),
+            **({} if params == named_robot(PAPER) else {"robot": np.array(repr(params))}),
             **{name: getattr(self, name) for name in _PER_EPISODE},
             "lengths": np.array([len(trajectory.u) for trajectory in self.trajectories]),
             "x": np.concatenate([trajectory.x for trajectory in self.trajectories]),
@@ -89,34 +94,35 @@ def path_of(task: Task, robot: str = PAPER) -> Path:
     return Path(__file__).parent / f"{file_name(task.id, robot)}.npz"
 
 
-def load(task: str | Task, path: str | Path | None = None, robot: str | BallbotParams = PAPER) -> EvaluationSet:
+def load(task: str | Task, robot: str | BallbotParams, path: str | Path | None = None) -> EvaluationSet:
     """The evaluation set of a task and a robot.
 
     Args:
         task: a name in `TASKS`, or a Task that is the very problem of the set; its pay and its arena may differ.
+        robot: whose optima: the params of the robot that runs, or a name in `ROBOTS`. Another friction is another robot.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
-        robot: a name in `ROBOTS`, or a robot that is one of them or a variant of it; see `robots.robot_name`.
 
     Raises:
-        CertificateError: there is none, it belongs to other fields of the task, or it is damaged.
-        ValueError: no task of that name.
+        CertificateError: there is none, it belongs to another robot, task or other fields of the task, or it is damaged.
+        ValueError: no task or robot of that name.
     """
-    robot = robot if isinstance(robot, str) else robot_name(robot)
-    task = make_task(task, robot)
-    remedy = _remedy(task, robot, install=path is None)
-    path = path_of(task, robot) if path is None else Path(path)
+    params, name = checked_robot(robot), robot if isinstance(robot, str) else robot_name(robot)
+    task = make_task(task, name)
+    again = _command(task, params, name) + (' --install"' if path is None else '"')
+    if path is None and type(task) not in TASKS.values():  # a subclass may have its parent's id and name
+        raise CertificateError(f"no evaluation set of {type(task).__name__}, which is none of TASKS; {again}")
+    path = path_of(task, name) if path is None else Path(path)
     if not path.exists():
-        raise CertificateError(f"{path}: no evaluation set of {task.id}; {remedy}")
+        raise CertificateError(f"{path}: no evaluation set of {task.id}; {again}")
     try:
         arrays = files.read_npz(path)
         missing = [name for name in ("task", "lengths", "x", "u", *_PER_EPISODE) if name not in arrays]
         if missing:
             raise ValueError(f"it has no array {', '.join(missing)}")
-        if str(arrays["task"]) != task.problem():
-            raise CertificateError(f"{path} was computed for {arrays['task']}, not for {task.problem()}; {remedy}")
-        made_for = str(arrays.get("robot", repr(named_robot(PAPER))))
-        if made_for != repr(named_robot(robot)):
-            raise CertificateError(f"{path} was computed for {made_for}, not for {named_robot(robot)!r}; {remedy}")
+        made_for = str(arrays["task"]), str(arrays.get("robot", repr(named_robot(PAPER))))
+        for made, wanted in zip(made_for, (task.problem(), repr(params)), strict=True):
+            if made != wanted:
+                raise CertificateError(f"{path} was computed for {made}, not for {wanted}; {again}")
         _check(task, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])
@@ -126,19 +132,39 @@ def load(task: str | Task, path: str | Path | None = None, robot: str | BallbotP
     except CertificateError:
         raise
     except ValueError as error:
-        raise CertificateError(f"{path} is no evaluation set: {error}; {remedy}") from error
-    return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
+        raise CertificateError(f"{path} is no evaluation set: {error}; {again}") from error
+    evaluation_set = EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
+    if not _holds(evaluation_set, task, params):
+        raise CertificateError(
+            f"{path}: its optimal trajectories do not move or cost in {task.problem()} as they did when they were computed, "
+            f"because cost, limits or equations have changed since; {again}"
+        )
+    return evaluation_set
 
 
-def _remedy(task: Task, robot: str, install: bool) -> str:
-    """What makes the evaluation set of a task and a robot, in the package where it is to be installed."""
-    name = next((name for name, kind in TASKS.items() if kind is type(task)), None)
-    if name is None:
-        return f"there are sets of the tasks in TASKS alone: add {type(task).__name__}, as docs/extending.md says"
-    if task.problem() != make_task(name, robot).problem():
-        return "there are sets of a task's default fields alone; ballbot_baselines.find_optimum finds any episode's optimum"
-    options = "" if robot == PAPER else f"--robot {robot} "
-    return f'compute it with "ballbot certify {options}--tasks {name}{" --install" * install}"'
+def _command(task: Task, params: BallbotParams, robot: str) -> str:
+    """How the set of a task and a robot is computed, in words."""
+    name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
+    first = [] if name else [f'give the task a name: TASKS["sprint"] = {type(task).__name__}']
+    if params != named_robot(robot) or (name and task.problem() != make_task(name, robot).problem()):
+        first.append("give this robot, with the fields of its tasks, a name in ballbot_gym/robots.py")
+        robot = "NAME"
+    given = f" --tasks {name or 'sprint'}" + ("" if robot == PAPER else f" --robot {robot}")
+    return "; ".join([*first, f'compute it with "ballbot certify{given}'])
+
+
+def _holds(evaluation_set: EvaluationSet, task: Task, params: BallbotParams) -> bool:
+    """Whether the stored trajectories move, cost and keep the limits here as they did where they were computed."""
+    trajectories, dt = evaluation_set.trajectories, task.control_dt
+    number = np.repeat(np.arange(len(trajectories)), [len(trajectory.u) for trajectory in trajectories])
+    before, after = (np.concatenate([trajectory.x[part] for trajectory in trajectories]) for part in _ENDS)
+    u, c = np.concatenate([trajectory.u for trajectory in trajectories]), evaluation_set.constants[number]
+    known = evaluation_set.costs[: len(trajectories)]
+    with np.errstate(all="ignore"):  # of damaged files
+        moved = np.abs(dynamics.step(params, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
+        costs = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, c), len(u)), len(known))
+        kept = all(np.min(margin) >= -_SAME for margin in task.margins(after, c))
+        return bool(moved.all() and (np.abs(costs - known) <= _SAME * known).all() and kept)
 
 
 def _check(task: Task, arrays: Mapping[str, np.ndarray]) -> None:

@@ -8,8 +8,9 @@ import sys
 from typing import Any
 
 try:
-    from rich.console import Console
     from rich.table import Table
+
+    from ballbot_train.escaping import PlainConsole
 except ImportError as error:
     sys.exit(f'ballbot: {error}; pip install "ballbot-gym[train]" installs what the commands need')
 
@@ -26,7 +27,7 @@ def main() -> None:
 
 def _run(arguments: list[str]) -> int:
     """Runs what was typed after `ballbot`, and gives the exit status."""
-    errors = Console(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)
+    errors = PlainConsole(stderr=True, highlight=False, soft_wrap=True)
     if not arguments:
         _print_help()
         return 2
@@ -83,7 +84,7 @@ def _is_expected(error: RuntimeError) -> bool:
 
 
 def _print_help() -> None:
-    console = Console(markup=False, emoji=False, highlight=False)
+    console = PlainConsole(highlight=False)
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")

@@ -6,13 +6,13 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ballbot_gym.lazy import missing
+from ballbot_gym.robots import ROBOTS
 from ballbot_gym.simulator import default_physics
 
 try:
-    from rich.console import Console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -25,18 +25,22 @@ try:
     )
     from rich.table import Table
     from rich.text import Text
+
+    from ballbot_train.escaping import PlainConsole, markdown_text, printable
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
 Physics = Literal["bullet", "rk4"]
 """What options called --physics take."""
 
-RobotName = Literal["paper", "rolling", "kugle"]
+if TYPE_CHECKING:
+    RobotName = str
+else:
+    RobotName = Literal[tuple(ROBOTS)]
 """What options called --robot take: the names in `ROBOTS`."""
 
 # A file or pipe has no width of its own: give it one that holds the widest table.
-# Names and paths are data: a "[b]" or ":x:" in them is printed as it is.
-console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
+console = PlainConsole(width=None if sys.stdout.isatty() else 160)
 
 
 LINE_SECONDS = 10.0
@@ -119,7 +123,7 @@ class Bars:
     def add(self, totals: Mapping[str, int]) -> None:
         """Adds a bar for every name; the number is how many steps it has."""
         for name, total in totals.items():
-            self._bars[name] = self._progress.add_task(name, total=total)
+            self._bars[name] = self._progress.add_task(printable(name), total=total)
 
     def advance(self, name: str, count: int) -> None:
         """Moves a bar on by a number of steps."""
@@ -146,9 +150,9 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """The same as a Markdown table."""
+    """The same as a Markdown table; cells are text."""
     lines = [header, ["---"] * len(header), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return "".join(f"| {' | '.join(map(markdown_text, line))} |\n" for line in lines)
 
 
 def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:

@@ -34,6 +34,7 @@ MARKER = "unfinished.json"
 _FOLDER = "unfinished"
 _LOCK = ".lock"
 _held: dict[Path, filelock.BaseFileLock] = {}
+_new: set[Path] = set()  # folders that this process claimed first, and in which nothing is finished yet
 _WORKER_DEATHS, _NODE_DEATHS = 2, 5  # of one item, after which it is not tried again
 
 
@@ -92,6 +93,8 @@ def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Map
     locked_before = _holds(out)
     _lock(out)
     try:
+        if not path.exists() and marker == MARKER:
+            _new.add(out.resolve())
         if path.exists():
             held = {key: value for key, value in _read_marker(path).items() if key not in facts}
             check_same(held, wanted, out, "an unfinished run" if marker == MARKER else "a run")
@@ -132,6 +135,7 @@ def release(out: Path, marker: str = MARKER) -> None:
     """Ends a run whose results are written: deletes what only served to continue it, and unlocks the folder."""
     shutil.rmtree(unfinished(out), ignore_errors=True)
     (out / marker).unlink(missing_ok=True)
+    _new.discard(out.resolve())
     unlock(out)
 
 
@@ -181,6 +185,17 @@ def _locked(out: Path) -> Iterator[None]:
         unlock(out)
 
 
+@contextmanager
+def _released_if_nothing_is_done(out: Path) -> Iterator[None]:
+    """Gives up the claim of a folder where the block fails before anything is finished."""
+    try:
+        yield
+    except BaseException:
+        if out.resolve() in _new:
+            release(out)
+        raise
+
+
 def run(
     jobs: Sequence[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]
 ) -> list[list[Entry]]:
@@ -200,7 +215,8 @@ def stream(
 
     The calling process writes every entry when it comes, whoever computed it. An item whose process dies is tried once
     more. If that process dies too, the item is left out, all others are done, and a WorkerError says which are missing. An
-    item whose node dies is tried on others, five times at most.
+    item whose node dies is tried on others, five times at most. A run that ends before its first item is finished leaves
+    no claim of the folder, because there is nothing to continue.
 
     Args:
         jobs: what there is to do. They are taken when workers have room for them.
@@ -229,7 +245,7 @@ def stream(
         else:
             yield progress.number, progress.entries()
 
-    with _locked(out), ExitStack() as stack:
+    with _locked(out), _released_if_nothing_is_done(out), ExitStack() as stack:
         pool: Pool | None = None  # a cluster takes seconds to start, and there may be nothing to do
         while True:
             while pool is None or pool.has_room():
@@ -248,6 +264,7 @@ def stream(
                 progress = running[event.key]
                 if event.kind == "yielded":
                     progress.write(*event.value)
+                    _new.discard(out.resolve())
                     on_progress(progress.job.group, 1)
                     continue
                 del running[event.key]

@@ -50,6 +50,7 @@ class RllibPolicy:
         module = trained.get_module() if hasattr(trained, "get_module") else trained
         self._module: Any = module
         self._distribution: Any = module.get_inference_action_dist_cls()
+        self.observation_space, self.action_space = module.observation_space, module.action_space
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True

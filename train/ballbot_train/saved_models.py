@@ -20,12 +20,15 @@ import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 
 from ballbot_gym import files
+from ballbot_gym.env import observation_space
 from ballbot_gym.lazy import missing
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.policy_files import PolicyError
 
@@ -47,6 +50,13 @@ _MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # wh
 _SUPPORTED = "give a model with MlpPolicy, or load the model yourself and give it to ballbot_train.evaluate"
 
 
+class Spaces(NamedTuple):
+    """What a model was trained on: a Box, or the name of a space of another kind."""
+
+    observation_space: spaces.Box | str
+    action_space: spaces.Box | str
+
+
 class SavedActor(torch.nn.Module):
     """Normalizes observations, runs the network, and brings its output into [−1, 1]."""
 
@@ -65,6 +75,48 @@ class SavedActor(torch.nn.Module):
         return torch.tanh(action) if "tanh" in self._output else action.clamp(-1.0, 1.0)
 
 
+def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> None:
+    """Refuses a model that was trained in other spaces, as behind a wrapper that rescales, stacks or converts.
+
+    Its `observation_space` and `action_space` are compared with the env's, if it has them.
+
+    Raises:
+        PolicyError: they differ; the message says what to evaluate instead.
+    """
+    own = {"observation": observation_space(task, params), "action": spaces.Box(-1.0, 1.0, (2,), np.float32)}
+    for kind, wanted in own.items():
+        found = getattr(model, f"{kind}_space", None)
+        if found is not None and not _alike(found, wanted):
+            raise PolicyError(
+                f"{name} was trained on {kind}s {_in_words(found, wanted)}, and those of {task.id} are "
+                f"{_in_words(wanted, found)}. Where a wrapper changed them, give ballbot_train.evaluate a function that does "
+                "what the wrapper did, for RescaleAction to ±350: lambda observation: "
+                "model.predict(observation, deterministic=True)[0] / 350. Give a function too, or train anew, where the "
+                "training had another robot, duration or arena"
+            )
+
+
+def _alike(found: Any, wanted: spaces.Box) -> bool:
+    """Whether a space has the shape, the dtype and, to a thousandth, as saved models round them, the bounds of another."""
+    return (
+        isinstance(found, spaces.Box)
+        and (found.shape, found.dtype) == (wanted.shape, wanted.dtype)
+        and all(np.allclose(getattr(found, end), getattr(wanted, end), rtol=1e-3) for end in ("low", "high"))
+    )
+
+
+def _in_words(space: Any, other: Any) -> str:
+    """A space, with its bounds where they differ first from those of another of the same shape."""
+    if not isinstance(space, spaces.Box):
+        return f"{space!s:.200}"
+    i = 0
+    if isinstance(other, spaces.Box) and space.shape == other.shape:
+        differs = ~np.isclose(space.low, other.low, rtol=1e-3) | ~np.isclose(space.high, other.high, rtol=1e-3)
+        i = int(np.argmax(differs))
+    low, high = space.low.ravel()[i], space.high.ravel()[i]
+    return f"{space.shape} {space.dtype} from {low:g} to {high:g}"
+
+
 def observations_of(path: str | Path) -> int:
     """The size of the observations that a saved model takes.
 
@@ -73,6 +125,19 @@ def observations_of(path: str | Path) -> int:
     """
     layers, *_ = _read(path)
     return layers[0][0].shape[1]
+
+
+def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
+    """Whether a saved model takes observations of a task's size.
+
+    Raises:
+        PolicyError: as `load_actor`; also where the size is the task's and the spaces are not.
+    """
+    layers, *_, trained = _read(path)
+    if layers[0][0].shape[1] != len(task.observation_scale):
+        return False
+    check_spaces(str(path), trained, task, params)
+    return True
 
 
 def digest(path: str | Path) -> str:
@@ -116,20 +181,23 @@ def save_vecnormalize(normalization: Any, model: str | Path) -> Path:
     return files.write_npz(statistics_of(model), arrays)
 
 
-def load_actor(path: str | Path, task: Task) -> SavedActor:
+def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActor:
     """The deterministic policy of a saved model: from observations (..., no), float32, to actions (..., 2) in [−1, 1].
 
     Args:
         path: of the file.
         task: what it is to do.
+        params: the robot.
 
     Raises:
-        PolicyError: the file is missing, damaged or of a kind that is not read; or its observations are not the task's.
+        PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
+            env's.
     """
-    layers, activation, output, normalization = _read(path)
+    layers, activation, output, normalization, trained = _read(path)
     size = layers[0][0].shape[1]
     if size != len(task.observation_scale):
         raise PolicyError(f"{path} takes {size} observations, {task.id} has {len(task.observation_scale)}")
+    check_spaces(str(path), trained, task, params)
     if normalization is not None and len(normalization["mean"]) != size:
         raise PolicyError(f"{path} takes {size} observations, its statistics are of {len(normalization['mean'])}")
     parts: list[torch.nn.Module] = []
@@ -140,10 +208,13 @@ def load_actor(path: str | Path, task: Task) -> SavedActor:
     return SavedActor(torch.nn.Sequential(*parts[:-1]), output, normalization).eval()
 
 
-def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None]:
-    """Layers (weight, bias), activation, what happens to the output, and the statistics of observations, or None."""
+def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces | None]:
+    """Layers (weight, bias), activation, what happens to the output, statistics of observations, or None, and the spaces.
+
+    rsl_rl saves no spaces: its own env has none.
+    """
     try:
-        return _read_sb3(Path(path)) if Path(path).suffix == ".zip" else _read_rsl(Path(path))
+        return _read_sb3(Path(path)) if Path(path).suffix == ".zip" else (*_read_rsl(Path(path)), None)
     except PolicyError:
         raise
     except files.FileError as error:
@@ -152,7 +223,7 @@ def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str,
         raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {error!r:.300}") from error
 
 
-def _read_sb3(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None]:
+def _read_sb3(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces]:
     with zipfile.ZipFile(io.BytesIO(files.read(path))) as archive:
         for name in ("data", "policy.pth"):
             if name not in archive.namelist():
@@ -187,7 +258,19 @@ def _read_sb3(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, A
     activation = named.group(1).lower() if named else ""
     if activation not in _ACTIVATIONS:
         raise PolicyError(f"{path} has the activation {options.get('activation_fn')}; known: {', '.join(_ACTIVATIONS)}")
-    return layers, activation, output, _statistics(path, data)
+    found = Spaces(_space(data["observation_space"]), _space(data["action_space"]))
+    return layers, activation, output, _statistics(path, data), found
+
+
+def _space(described: Mapping[str, Any]) -> spaces.Box | str:
+    """A space from the words that stand beside its pickled form, which is not read."""
+    kind = str(described[":type:"])
+    if not kind.endswith(".box.Box'>"):
+        return kind
+    shape, dtype = described.get("_shape", described.get("shape")), np.dtype(described["dtype"])
+    words = (str(described[end]).replace("[", " ").replace("]", " ").split() for end in ("low", "high"))
+    low, high = (np.array(each, np.float64).astype(dtype).reshape(shape) for each in words)
+    return spaces.Box(low, high, dtype=dtype.type)
 
 
 def _statistics(path: Path, data: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -72,7 +72,9 @@ def benchmark(
     pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
     table = [cells(row, busy) for row in rows]
     files.write(out / "leaderboard.md", markdown(HEADER, table) + (f"\n{BUSY_NOTE}\n" if busy else ""))
-    sections = leaderboard_sections(HEADER, table, done, chosen, pictures, physics, runs, BUSY_NOTE if busy else "")
+    sections = leaderboard_sections(
+        HEADER, table, done, chosen, pictures, physics, runs, BUSY_NOTE if busy else "", robot
+    )
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     page = write_report(title, sections, facts, out / "report.html")
     jobs.release(out)
@@ -88,7 +90,7 @@ def benchmark(
 def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path, robot: str) -> Path:
     """The first certified episode of a task under every controller, with its optimum."""
     replay = certified_replay(task, controllers, 0, physics, skip_planless=True, robot=robot)
-    optimum = certified.load(task, robot=robot).trajectories[0]
+    optimum = certified.load(task, robot).trajectories[0]
     curves = [figures.Curve("optimum", optimum, "0.35", "--")]
     curves += [figures.Curve(f"{take.label}, {take.note}", take.trajectory, take.color) for take in replay.takes]
     figure = figures.trajectory_figure(replay.title, curves, figures.marker_circles(replay.markers))

@@ -90,7 +90,7 @@ def certify(
             task = make_task(name, robot)
             path = certified.path_of(task, robot)
             try:
-                old = certified.load(task, robot=robot)
+                old = certified.load(task, robot)
             except certified.CertificateError:  # none, or of another problem
                 kept = evaluation_set
             else:

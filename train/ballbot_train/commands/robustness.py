@@ -80,7 +80,7 @@ def robustness(
         for name in stresses
         for controller in group
     ]
-    header = ["task", "disturbance", "controller", "severity", "success, %", "falls, %", "regret, %"]
+    header = ["task", "disturbance", "controller", "severity", "success, %", "falls, %", stressed.REGRET]
     files.write(out / "robustness.md", markdown(header, table) + (f"\n{_BUSY_NOTE}\n" if facts["busy"] else ""))
     jobs.release(out)
     print_table(f"{episodes} certified episodes per task and severity, physics={physics}", header, table)

@@ -170,20 +170,32 @@ def episode_job(
     randomization: Randomization | None = None,
     label: str = "",
     group: str = "",
-    robot: str | BallbotParams = PAPER,
+    robot: str = PAPER,
     made_for: str | None = None,
+    variant: BallbotParams | None = None,
 ) -> jobs.Job:
     """Some certified episodes of a robot under a controller by name, as a job whose entries are the fields of Results.
 
-    The controller is made for the robot, or for another one by name. The label tells jobs apart that differ in their
-    randomization or robots; progress counts for the group, or else the task.
+    The controller is made for the robot, or for another one by name. A variant of the robot may run in its place; regret is
+    over the robot's own optimum then too. The label tells jobs apart that differ in their randomization or robots; progress
+    counts for the group, or else the task.
     """
     what = f"{task}-{controller}-{physics}-{label}"
     slug = "".join(sign if sign.isalnum() else "-" for sign in what)
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(task, controller, registry.packed(controller), physics, seed, randomization, robot, made_for),
+        arguments=(
+            task,
+            controller,
+            registry.packed(controller),
+            physics,
+            seed,
+            randomization,
+            robot,
+            made_for,
+            variant,
+        ),
         items=tuple(episodes),
         group=group or task,
     )
@@ -196,13 +208,15 @@ def _episode_entries(
     physics: str,
     seed: int,
     randomization: Randomization | None,
-    robot: str | BallbotParams,
+    robot: str,
     made_for: str | None,
+    variant: BallbotParams | None,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
-    env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
+    env = BallbotEnv(task, physics=physics, randomization=randomization, robot=variant or robot)
     believed = (env.task, env.params) if made_for is None else (make_task(task, made_for), named_robot(made_for))
     made = registry.make_packed(controller, packed, *believed)
-    for result in iterate_episodes(env, made, controller, task, episodes, seed):
+    known = certified.load(task, robot)
+    for result in iterate_episodes(env, made, controller, task, episodes, seed, known):
         yield asdict(result)
     env.close()

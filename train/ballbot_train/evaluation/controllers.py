@@ -8,7 +8,7 @@ from ballbot_baselines import CONTROLLERS, VARIANTS
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, robot_name
+from ballbot_gym.robots import PAPER, named_robot, robot_name
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
@@ -39,15 +39,15 @@ def is_saved_model(name: str) -> bool:
 
 
 def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
-    """Whether the policy of a file is one for a task and a robot. A saved model tells only the size of its observations.
+    """Whether the policy of a file is one for a task and a robot. A saved model tells only its spaces.
 
     Raises:
-        PolicyError: the file is missing or damaged.
+        PolicyError: the file is missing or damaged, or a saved model has observations of the task's size and other spaces.
     """
     if is_saved_model(name):
-        from ballbot_train.saved_models import observations_of  # it imports torch
+        from ballbot_train.saved_models import fits  # it imports torch
 
-        return observations_of(name) == len(task.observation_scale)
+        return fits(name, task, named_robot(robot))
     spec = read_description(name)["spec"]
     return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
@@ -164,7 +164,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         from ballbot_train.policy import PolicyController  # it imports torch
         from ballbot_train.saved_models import load_actor
 
-        return PolicyController(task, params, load_actor(name, task))
+        return PolicyController(task, params, load_actor(name, task, params))
     from ballbot_train.policy import load_policy
 
     return load_policy(shipped.get(name, name), task, params)

@@ -21,27 +21,29 @@ from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.results import Result, Row, summarize
+from ballbot_train.policy_files import PolicyError
 
 
 def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
     """Anything that acts, as a Controller.
 
     Args:
-        policy: a Controller; a Stable-Baselines3 model, whose VecNormalize is applied where it was trained with one; a
-            function from observation (no,) float32 to action (2,) in [−1, 1]; or a name or file for `make_controller`.
+        policy: a Controller; a Stable-Baselines3 model that was trained in the env's own spaces, whose VecNormalize is
+            applied where it was trained with one; a function from observation (no,) float32 to action (2,) in [−1, 1]; or a
+            name or file for `make_controller`.
         task: what it is to do.
         params: the robot that it believes to control.
 
     Raises:
         TypeError: it is none of these.
-        ValueError, PolicyError: as `make_controller`.
+        ValueError, PolicyError: as `make_controller`; or the model was trained in other spaces than the env's.
     """
     if isinstance(policy, str | Path):
         return make_controller(str(policy), task, params)
     if callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None)):
         return policy
     if callable(getattr(policy, "predict", None)):
-        return ActionController(task, params, Predictor(policy))
+        return ActionController(task, params, Predictor(policy, task, params))
     if callable(policy):
         function = cast(Callable[[np.ndarray], np.ndarray], policy)
         return ActionController(task, params, lambda observation, begins: function(observation))
@@ -56,9 +58,19 @@ class Predictor:
     It keeps the recurrent state, and normalizes observations as in training.
     """
 
-    def __init__(self, model: Any):
+    def __init__(self, model: Any, task: Task, params: BallbotParams):
         self._model, self._state = model, None
+        if hasattr(model, "observation_space"):
+            from ballbot_train.saved_models import check_spaces  # it imports torch
+
+            check_spaces(type(model).__name__, model, task, params)
         normalization = getattr(model, "get_vec_normalize_env", lambda: None)()
+        # only on-policy algorithms leave this empty where there was no VecNormalize
+        if normalization is None and hasattr(model, "gae_lambda") and model._last_original_obs is not None:
+            raise PolicyError(
+                f"{type(model).__name__} was trained with VecNormalize and has none now; load the model with it: "
+                f'{type(model).__name__}.load("model.zip", env=VecNormalize.load("vecnormalize.pkl", venv))'
+            )
         self._seen = (lambda observation: observation) if normalization is None else normalization.normalize_obs
 
     def __call__(self, observation: np.ndarray, begins: bool) -> np.ndarray:
@@ -89,18 +101,20 @@ def evaluate(
         episodes: how many of the certified episodes, from the first, or their indices, each once.
         physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed, else "rk4" with a warning.
         name: of the row; default, the policy's own.
-        randomization: what disturbs it; default, nothing.
-        robot: a name in `ROBOTS`, or a variant of one, with the certified episodes of that.
+        randomization: what disturbs it; default, nothing. The regret is over the optimum of the undisturbed robot.
+        robot: a name in `ROBOTS`, or a BallbotParams that is one of them.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes.
-        CertificateError: the task has no certified set.
+        CertificateError: there is no certified set of this task and this robot; it says how to compute one.
     """
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
-        indices = episode_indices(episodes, len(certified.load(env.task, robot=env.params)))
+        known = certified.load(env.task, env.params)
+        indices = episode_indices(episodes, len(known))
         controller = as_controller(policy, env.task, env.params)
-        results = run_episodes(env, controller, name or _name(policy), task_name(env.task), indices)
+        named = task_name(env.task)
+        results = list(iterate_episodes(env, controller, name or _name(policy), named, indices, 0, known))
         return summarize(results)
     finally:
         env.close()
@@ -146,7 +160,7 @@ def _name(policy: Any) -> str:
 
 
 def task_name(task: Task) -> str:
-    """The task's name in `TASKS`."""
+    """The task's name in `TASKS`; a task that has a certified set is in it."""
     return next(name for name, kind in TASKS.items() if type(task) is kind)
 
 
@@ -162,15 +176,24 @@ def run_episodes(
         task: the task's name, in the results.
         episodes: their indices.
         seed: of what the env's randomization draws, episode i with seed + i.
+
+    Raises:
+        CertificateError: there is no certified set of the env's task and robot.
     """
-    return list(iterate_episodes(env, controller, name, task, episodes, seed))
+    known = certified.load(env.task, env.params)
+    return list(iterate_episodes(env, controller, name, task, episodes, seed, known))
 
 
 def iterate_episodes(
-    env: BallbotEnv, controller: Controller, name: str, task: str, episodes: Iterable[int], seed: int
+    env: BallbotEnv,
+    controller: Controller,
+    name: str,
+    task: str,
+    episodes: Iterable[int],
+    seed: int,
+    episode_set: certified.EvaluationSet,
 ) -> Iterator[Result]:
-    """As `run_episodes`, one by one."""
-    episode_set = certified.load(env.task, robot=env.params)
+    """As `run_episodes`, one by one, compared with the optima of any set."""
     for i in episodes:
         optimum = float(episode_set.costs[i])
         common: dict[str, Any] = {

@@ -279,11 +279,14 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         if name not in shipped and not is_file(name):
             raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
         network = (
-            load_actor(name, task) if is_saved_model(name) else load_network(shipped.get(name, name), task, robot)
+            load_actor(name, task, named_robot(robot))
+            if is_saved_model(name)
+            else load_network(shipped.get(name, name), task, robot)
         ).eval()
         return lambda observation: network(observation.float())
     if callable(getattr(policy, "predict", None)):
-        predictor, begins = Predictor(policy), itertools.chain([True], itertools.repeat(False))
+        predictor = Predictor(policy, task, named_robot(robot))
+        begins = itertools.chain([True], itertools.repeat(False))
         return lambda observation: torch.as_tensor(predictor(observation.float().numpy(), next(begins)))
     if callable(policy):
         function: Any = policy

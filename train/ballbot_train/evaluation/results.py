@@ -161,7 +161,7 @@ def _from_json(entry: Mapping[str, Any]) -> Result:
 
 def _from_csv(entry: Mapping[str, str]) -> Result:
     truths = {"True": True, "False": False}
-    read: dict[Any, Any] = {str: str, int: int, float: float, bool: truths.__getitem__}
+    read: dict[Any, Any] = {str: files.csv_text, int: int, float: float, bool: truths.__getitem__}
     kinds = {field.name: read[field.type] for field in fields(Result)}
     return Result(**{key: kinds[key](value) for key, value in entry.items()})
 

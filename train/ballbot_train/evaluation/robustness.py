@@ -69,6 +69,9 @@ STRESSES: dict[str, Stress] = {
 }
 """Every disturbance by its name on the command line."""
 
+REGRET = "regret over the undisturbed optimum, %"
+"""What tables and figures call it."""
+
 NONE = "none"
 """The name of no disturbance, severity 0 of every stress."""
 

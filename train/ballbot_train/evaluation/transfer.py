@@ -1,8 +1,8 @@
 """Sim-to-sim transfer: controllers that were made for one robot, run on another.
 
 The controller plans and observes as for its own robot. It meets the certified episodes of the robot that it runs on, and its
-cost is compared with that robot's optimum. In PyBullet a rolling robot's contact is simulated, and its friction may differ
-from what the controller was made for.
+cost is compared with that robot's optimum on its own floor, on other floors too. In PyBullet a rolling robot's contact is
+simulated, and its friction may differ from what the controller was made for.
 """
 
 import math
@@ -16,7 +16,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import named_robot
 from ballbot_train import jobs
 from ballbot_train.evaluation import benchmark
-from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
+from ballbot_train.evaluation.results import Result, Row, summarize, to_json
 from ballbot_train.executors import Workers
 
 _CHUNK = 5  # episodes of a job
@@ -57,7 +57,7 @@ def floor(robot: str, friction: float | None) -> BallbotParams:
 
 def episodes_of(task: str, robot: str, episodes: int) -> int:
     """How many certified episodes to run: at most as many as there are."""
-    return min(episodes, len(certified.load(task, robot=robot)))
+    return min(episodes, len(certified.load(task, robot)))
 
 
 def controllers_of(
@@ -118,7 +118,7 @@ def run(
                     for start in range(0, count, _CHUNK):
                         part = range(start, min(start + _CHUNK, count))
                         job = benchmark.episode_job(
-                            task, name, physics, part, seed, label=label, robot=params, made_for=made_for
+                            task, name, physics, part, seed, None, label, "", robot, made_for, params
                         )
                         work.append((job, of))
     done = jobs.run([job for job, _ in work], out, workers, on_progress)
@@ -139,12 +139,19 @@ def rows_of(results: Sequence[TransferResult], seed: int = 0) -> list[TransferRo
 
 def write(rows: Sequence[TransferRow], results: Sequence[TransferResult], facts: Mapping[str, Any], out: Path) -> None:
     """Writes transfer.csv, episodes.csv and transfer.json, which holds the facts as "about" and the rows."""
-    write_csv(out / "transfer.csv", rows)
-    write_csv(out / "episodes.csv", results)
-    files.write(out / "transfer.json", to_json({"about": facts, "rows": rows}))
+    for name, entries in (("transfer", rows), ("episodes", results)):
+        named = [{_NAMED.get(key, key): value for key, value in asdict(entry).items()} for entry in entries]
+        files.write_csv(out / f"{name}.csv", named)
+    files.write(out / "transfer.json", to_json({"about": {**facts, "regret": REGRET}, "rows": rows}))
 
 
-HEADER = ["task", "made for", "controller", "runs on", "friction", "success", "falls", "regret mean", "peak tilt"]
+REGRET = "regret over the optimum on the robot's own floor"
+"""What tables and figures call it."""
+HEADER = ["task", "made for", "controller", "runs on", "friction", "success", "falls", REGRET, "peak tilt"]
+_NAMED = {
+    name: f"{name}_on_own_floor" for name in ("regret_mean", "regret_low", "regret_high", "regret_median", "optimum")
+}
+"""Columns of the CSV files."""
 
 
 def cells(row: TransferRow) -> list[str]:

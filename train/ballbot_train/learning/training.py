@@ -139,7 +139,7 @@ class Score:
 
 def score(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Score:
     """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
-    episodes = certified.load(task, robot=robot)
+    episodes = certified.load(task, robot)
     (run,) = _runs(network, task, robot, (episodes.states, episodes.constants))
     return _score(run, task, episodes.costs)
 
@@ -191,7 +191,7 @@ def score_and_validate(
     network: PolicyNetwork, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES
 ) -> tuple[Score, Validation]:
     """`score` and `validate` in one batch, in half the time."""
-    known = certified.load(task, robot=robot)
+    known = certified.load(task, robot)
     sets = (known.states, known.constants), _validation_set(task, robot, episodes)
     scored, validated = _runs(network, task, robot, *sets)
     return _score(scored, task, known.costs), _validation(validated, task)

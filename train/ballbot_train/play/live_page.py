@@ -7,7 +7,6 @@ between two steps. So the playground itself needs no locks.
 import gc
 import math
 import queue
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from ballbot_gym import dynamics
 from ballbot_gym.viewer import Viewer
+from ballbot_train.escaping import markdown_text
 from ballbot_train.play import views
 from ballbot_train.play.clock import Clock
 from ballbot_train.play.controls import Controls, Steering
@@ -195,13 +195,11 @@ class PlayPage:
         playground, crew = self.playground, self.playground.crew
         main, best = playground.main, playground.optimum_cost_so_far
         cost = f"cost {main.cost:.2f}" + (f", the optimum's {best:.2f}" if math.isfinite(best) else "")
-        lines = [f"**{_plain(views.status(playground))}**", f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, {cost}"]
+        lines = [
+            f"**{markdown_text(views.status(playground))}**",
+            f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, {cost}",
+        ]
         lines += ["planning …"] * (crew.planning and not crew.preparing) + ["paused"] * self.paused
-        lines.append(f"*{_plain(crew.notice[:_NOTICE_LENGTH])}*" if crew.notice else _HELP)
+        lines.append(f"*{markdown_text(crew.notice[:_NOTICE_LENGTH])}*" if crew.notice else _HELP)
         self._status.content = "  \n".join(lines)
-        self._controls.show_scores([_plain(score.text) for score in playground.scores[-_SCORES_SHOWN:]])
-
-
-def _plain(text: str) -> str:
-    """Text as Markdown that shows it as it is. Names of files come into it, and Markdown may hold HTML."""
-    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))
+        self._controls.show_scores([markdown_text(score.text) for score in playground.scores[-_SCORES_SHOWN:]])

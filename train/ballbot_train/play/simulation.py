@@ -42,14 +42,17 @@ class Score(NamedTuple):
     seconds: float
     cost: float
     regret: float
-    """Cost over the optimum's, less 1; NaN without an optimum. Pushes count: the optimum had none."""
+    """Cost over the optimum's, less 1; NaN without an optimum. Pushes and hidden changes count: the optimum had none."""
     failure: str
     """The violated limit, or ""."""
+    changed: bool = False
+    """Whether something was hidden from the controllers, and from the optimum."""
 
     @property
     def text(self) -> str:
         """In words."""
-        regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %"
+        of = " to the optimum of the unchanged robot" * self.changed
+        regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %{of}"
         if self.failure:
             return f"{self.controller}: {failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
         return f"{self.controller}: {self.seconds:.1f} s, cost {self.cost:.1f}{regret}"
@@ -286,7 +289,8 @@ class Playground:
             return
         best = self.optimum_cost
         regret = main.cost / best - 1 if best > _LEAST_COST else math.nan
-        score = Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated)
+        changed = any(self.plant.values())
+        score = Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated, changed)
         self.scores = [*self.scores, score][-_EPISODES_KEPT:]
         if goes_on:
             self.start, self.episode, self.elapsed = (np.array(main.x), self.start[1]), None, 0

@@ -66,7 +66,7 @@ class World:
         self.controllers: list[str] = []
         """What can be chosen, experts first."""
         known = certified.path_of(self.base, robot).exists()
-        self.certified = certified.load(self.base, robot=robot) if known else None
+        self.certified = certified.load(self.base, robot) if known else None
         for policy in policies:
             made_for(policy)  # whether it can be read
         self.offer(*policies)

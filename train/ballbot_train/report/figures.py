@@ -13,13 +13,15 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.basins import AXES, BasinMap
 from ballbot_train.evaluation.results import Result
-from ballbot_train.evaluation.robustness import NONE, STRESSES, StressRow, curve_of
+from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, StressRow, curve_of
+from ballbot_train.evaluation.transfer import REGRET as REGRET_ON_OWN_FLOOR
 from ballbot_train.evaluation.transfer import TransferRow
 from ballbot_train.report.labels import COLORS as COLORS
 from ballbot_train.report.labels import LABELS, color, label
@@ -167,20 +169,23 @@ def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
         for axis in (above, below):
             axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("success, %")
-    axes[1][0].set_ylabel("regret, %")
+    axes[1][0].set_ylabel(REGRET)
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return figure
 
 
 def transfer_figure(rows: Sequence[TransferRow]) -> Figure:
-    """For every task, the success of controllers made for one robot on another, by its floors; below it their mean regret."""
+    """For every task, the success of controllers made for one robot on another, by its floors; below it their mean regret.
+
+    The regret is over that robot's optimum on its own floor.
+    """
     tasks = list(dict.fromkeys(row.task for row in rows))
     floors = sorted({row.friction for row in rows}, reverse=True)
     made = {task: list(dict.fromkeys((r.made_for, r.controller) for r in rows if r.task == task)) for task in tasks}
     most = max(map(len, made.values()))
     figure = Figure(figsize=((1.7 + 0.9 * len(floors)) * len(tasks) + 0.6, 1.6 + 0.45 * most), layout="constrained")
-    figure.suptitle(f"Success and mean regret of controllers that run on the robot {rows[0].robot}", fontsize=12)
+    figure.suptitle(f"Success on the robot {rows[0].robot}, and mean {REGRET_ON_OWN_FLOOR}", fontsize=12)
     for axis, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
         shares = np.full((len(made[task]), len(floors)), np.nan)
         for row in rows:
@@ -289,9 +294,16 @@ def add_circles(axis: Axes, circles: Sequence[Circle]) -> None:
 
 def save(figure: Figure, path: Path) -> Path:
     """Writes a figure as a PNG."""
+    plain(figure)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return files.write(path, buffer.getvalue())
+
+
+def plain(figure: Figure) -> None:
+    """Shows dollar signs as they are: a name is no formula, and one that is half a formula cannot be drawn."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _folded(text: str) -> str:

@@ -151,6 +151,7 @@ class _Film:
         self._add_traces(seconds)
         for artist in self._moving:
             artist.set_animated(True)
+        figures.plain(self._figure)
         self._canvas.draw()
         self._fixed = self._canvas.copy_from_bbox(self._figure.bbox)
 

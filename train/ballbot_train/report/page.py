@@ -21,6 +21,7 @@ from markupsafe import Markup
 
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
+from ballbot_train.escaping import plotly_text
 from ballbot_train.report.replay import Replay, Take
 
 if TYPE_CHECKING:
@@ -194,12 +195,12 @@ def _panel(panel: Panel) -> Figure:
         figure.add_scatter(
             x=np.asarray(line.x).tolist(),
             y=np.asarray(line.y).tolist(),
-            name=line.label,
+            name=plotly_text(line.label),
             mode="lines",
             line={"color": line.color, "width": 2, "shape": "hv" if line.steps else "linear"},
         )
     figure.update_layout(
-        title={"text": panel.title, "font": {"size": 14}, "x": 0.02, "y": 0.97},
+        title={"text": plotly_text(panel.title), "font": {"size": 14}, "x": 0.02, "y": 0.97},
         plot_bgcolor="white",
         margin={"l": 52, "r": 12, "t": 34, "b": 44},
         showlegend=False,

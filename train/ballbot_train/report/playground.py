@@ -187,7 +187,7 @@ def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
     task = make_task(scenario.task)
     state, constants, optimum = np.zeros(8), np.zeros(0), None
     if scenario.episode is not None:
-        episodes = certified.load(task)
+        episodes = certified.load(task, params)
         state, constants = episodes.states[scenario.episode], episodes.constants[scenario.episode]
         optimum = float(episodes.costs[scenario.episode])
     lqr = LqrController(task, params)

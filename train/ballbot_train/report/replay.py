@@ -142,7 +142,7 @@ def certified_replay(
         PlanError: a controller finds no plan, unless `skip_planless`.
     """
     problem, params = make_task(task, robot), named_robot(robot)
-    episode_set = certified.load(problem, robot=robot)
+    episode_set = certified.load(problem, robot)
     if not 0 <= episode < len(episode_set):
         raise ValueError(f"episode must be 0 to {len(episode_set) - 1}, not {episode}")
     takes = []
@@ -158,7 +158,10 @@ def certified_replay(
             env.close()
         if friction is not None:  # the floor gives the colour, because one controller runs on several
             label = f"friction {friction:g}" if len(controllers) == 1 else f"{take.label}, friction {friction:g}"
-            take = replace(take, label=label, color=labels.color("", len(takes)))
+            note = take.note
+            if friction != params.friction:
+                note = note.replace(" %", f" % to the optimum of friction {params.friction:g}", 1)
+            take = replace(take, label=label, note=note, color=labels.color("", len(takes)))
         takes.append(take)
     markers = tuple(problem.markers(episode_set.constants[episode]))
     return Replay(f"{task}, certified episode {episode}", tuple(takes), markers, params)
@@ -227,7 +230,7 @@ def with_ghosts(
     """
     env = BallbotEnv(task, physics=physics, robot=robot)
     try:
-        c = certified.load(env.task, robot=robot).constants[episode]
+        c = certified.load(env.task, robot).constants[episode]
         controller = CONTROLLERS[expert](env.task, env.params)
         takes = []
         for take in replay.takes:

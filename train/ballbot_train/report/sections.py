@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ballbot_gym import files
+from ballbot_gym.robots import PAPER
 from ballbot_train.console import console
 from ballbot_train.evaluation.results import Result
 from ballbot_train.report import figures, labels
@@ -34,6 +35,7 @@ def leaderboard_sections(
     physics: str,
     runs: Path,
     note: str = "",
+    robot: str = PAPER,
 ) -> list[Section | None]:
     """The page of `ballbot benchmark`.
 
@@ -46,8 +48,9 @@ def leaderboard_sections(
         physics: "bullet" or "rk4".
         runs: folder in which other commands have left theirs: basins, robustness, transfer, paper, and any training.
         note: about the leaderboard.
+        robot: by name; what other commands have left of other robots is left out.
     """
-    replays = [replay_of(task, names, results, physics) for task, names in controllers.items()]
+    replays = [replay_of(task, names, results, physics, robot) for task, names in controllers.items()]
     return [
         table_section(
             "Leaderboard",
@@ -65,29 +68,41 @@ def leaderboard_sections(
         regret_section(results),
         pictures_section(
             "Basins of attraction",
-            [path for path in (runs / "basins" / "basins.png",) if path.exists()],
+            [path for path in (runs / "basins" / "basins.png",) if path.exists() and _is_of(path, robot)],
             "From where each controller recovers, within what the robot allows.",
         ),
-        folder_section("Robustness", runs / "robustness" / "figures", "The same episodes under growing disturbances."),
+        folder_section("Robustness", runs / "robustness" / "figures", "The same episodes under growing disturbances.")
+        if _is_of(runs / "robustness" / "robustness.json", robot)
+        else None,
         pictures_section(
             "From one robot to another",
             [path for path in (runs / "transfer" / "transfer.png",) if path.exists()],
             "Controllers that plan for one robot, or learnt on it, on another and on its floors.",
         ),
-        learning_section(runs),
+        learning_section(runs, robot),
         pictures_section("One certified episode of each task", pictures),
         folder_section("The paper's figures", runs / "paper", "High lean angle trajectory optimization, reproduced."),
     ]
 
 
-def replay_of(task: str, controllers: Sequence[str], results: Sequence[Result], physics: str) -> Replay:
+def _is_of(path: Path, robot: str) -> bool:
+    """Whether the results that a command left as PATH.json are of a robot, as far as they say."""
+    try:
+        return files.read_json(path.with_suffix(".json"))["about"].get("robot", PAPER) == robot
+    except (ValueError, KeyError, TypeError, AttributeError):  # missing or damaged: they do not say
+        return robot == PAPER
+
+
+def replay_of(
+    task: str, controllers: Sequence[str], results: Sequence[Result], physics: str, robot: str = PAPER
+) -> Replay:
     """A telling episode of a task: the first in which one controller fails and another does not, else the first."""
     failures: dict[int, set[bool]] = {}
     for result in results:
         if result.task == task:
             failures.setdefault(result.episode, set()).add(result.failure)
     episode = next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
-    return certified_replay(task, controllers, episode, physics, skip_planless=True)
+    return certified_replay(task, controllers, episode, physics, skip_planless=True, robot=robot)
 
 
 def playground_section() -> Section:
@@ -109,8 +124,8 @@ def regret_section(results: Sequence[Result]) -> Section | None:
     return curves_section("How close to the optimum", panels, lead)
 
 
-def learning_section(runs: Path) -> Section | None:
-    """Regret against wall time of every training run below a folder."""
+def learning_section(runs: Path, robot: str = PAPER) -> Section | None:
+    """Regret against wall time of every training run of a robot below a folder."""
     tasks: dict[str, list[Line]] = {}
     for path in sorted(runs.rglob("evaluations.csv")):
         config = path.with_name("config.json")
@@ -118,6 +133,8 @@ def learning_section(runs: Path) -> Section | None:
             continue
         try:
             described = files.read_json(config)
+            if described.get("robot", PAPER) != robot:
+                continue
             task, learner = str(described.get("task")), str(described.get("learner"))
             rows = list(csv.DictReader(files.read(path).decode().splitlines()))
             points = [(float(row["seconds"]), 100 * float(row["regret_mean"])) for row in rows]

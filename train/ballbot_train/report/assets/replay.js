@@ -214,7 +214,7 @@ class Replay {
     const plot = (name, title, valuesOf) => {
       const lines = takes.map((take) => {
         const y = valuesOf(take);
-        return { x: y.map((_, n) => n * dt), y, mode: "lines", name: take.label, line: { color: take.color, width: 2 } };
+        return { x: y.map((_, n) => n * dt), y, mode: "lines", name: take.label.replaceAll("&", "&amp;").replaceAll("<", "&lt;"), line: { color: take.color, width: 2 } };
       });
       const layout = {
         title: { text: title, font: { size: 13 }, x: 0.02, y: 0.97 }, margin: { l: 42, r: 10, t: 28, b: 36 }, showlegend: false,
