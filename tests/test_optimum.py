@@ -12,16 +12,9 @@ import casadi
 from ballbot_baselines import compiled
 from ballbot_baselines import optimum as optimum_module
 from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
-from ballbot_baselines.optimum import (
-    FEASIBLE,
-    Backoff,
-    find_optimum,
-    is_feasible,
-    plan_to_track,
-    shooting_ocp,
-    shooting_parameters,
-)
+from ballbot_baselines.ocp import FEASIBLE, Bounds, Ocp, OcpSolver
+from ballbot_baselines.optimum import Backoff, find_optimum, plan_to_track
+from ballbot_baselines.shooting import shooting_ocp, shooting_parameters
 from ballbot_gym import dynamics, machine_code
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
@@ -284,7 +277,7 @@ def solve_toy_by_casadi(p=0.4):
 def test_staged_problem_has_the_solution_of_the_problem_written_out(solver, p):
     cost, states, inputs, _ = solve_toy_by_casadi(p)
     staged = solve_toy(solver, p)
-    assert is_feasible(staged)
+    assert staged.is_optimal
     assert staged.cost == pytest.approx(cost, rel=1e-7)
     np.testing.assert_allclose(staged.states, states, atol=1e-4)
     np.testing.assert_allclose(staged.inputs, inputs, atol=1e-4)
@@ -304,7 +297,7 @@ def test_violation_is_the_largest_of_constraints_and_bounds():
     s, w = solution.states, solution.inputs
     defects = [s[k + 1] - np.array(ocp.next(*(casadi.DM(v) for v in (s[k], w[k])), 0.4)).ravel() for k in range(N)]
     assert not solution.success
-    assert not is_feasible(solution)
+    assert not solution.is_optimal
     assert "Maximum_Iterations" in solution.status
     assert solution.violation >= np.abs(defects).max()
     assert solution.violation >= abs(s[0] @ ocp.initial_matrix[0])
@@ -424,7 +417,7 @@ def test_problems_with_different_parameters_share_their_compiled_dynamics(monkey
         solution = OcpSolver(ocp, N).solve(
             np.zeros((N + 1, 2)), np.zeros((N, 1)), from_rest_to_rest(ocp), np.ones(params)
         )
-        assert is_feasible(solution)
+        assert solution.is_optimal
     assert sum(library.name.startswith("dynamics-") for library in tmp_path.iterdir()) == 1
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
+from ballbot_baselines.optimum import ALL_GUESSES, find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
@@ -68,7 +68,17 @@ def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: i
     if not optimum.is_optimal:
         reason = f"only a feasible episode of cost {optimum.cost:.6g} was found ({optimum.solver_status})"
         return {"episode": index, "error": reason}
-    return _entry(index, optimum) | ({"draw": draw} if draw else {})
+    trajectory = optimum.trajectory
+    return {
+        "episode": index,
+        "cost": optimum.cost,
+        "violation": optimum.violation,
+        "solver": optimum.solver,
+        "status": optimum.solver_status,
+        "t": trajectory.t.tolist(),
+        "x": trajectory.x.tolist(),
+        "u": trajectory.u.tolist(),
+    } | ({"draw": draw} if draw else {})
 
 
 def _start(task: Task, params: BallbotParams, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +91,6 @@ def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) 
 
     Args:
         task: the task that the entries were computed for.
-        params: the robot.
         entries: one for each episode, from episode 0 on, in order.
 
     Raises:
@@ -139,18 +148,4 @@ def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[
         "u": joined("u", 2),
         "failed": np.array([entry["episode"] for entry in failed], np.int64),
         "errors": np.array([entry["error"] for entry in failed], str),
-    }
-
-
-def _entry(index: int, optimum: Optimum) -> Entry:
-    trajectory = optimum.trajectory
-    return {
-        "episode": index,
-        "cost": optimum.cost,
-        "violation": optimum.violation,
-        "solver": optimum.solver,
-        "status": optimum.solver_status,
-        "t": trajectory.t.tolist(),
-        "x": trajectory.x.tolist(),
-        "u": trajectory.u.tolist(),
     }

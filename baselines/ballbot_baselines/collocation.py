@@ -21,8 +21,7 @@ import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import ACCEPTABLE, Bounds, Ocp, OcpSolution, OcpSolver, no_final_path
-from ballbot_baselines.optimum import FEASIBLE
+from ballbot_baselines.ocp import ACCEPTABLE, Bounds, Ocp, OcpSolution, OcpSolver, no_path
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
@@ -149,19 +148,14 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
         cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
         equalities=lambda s, w, p: casadi.vertcat(interval(s, w)[1], path(problem.equalities, s)),
         inequalities=lambda s, w, p: inequalities(s),
-        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_final_path,
+        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_path,
         final_inequalities=lambda s, p: inequalities(s),
         initial_matrix=initial,
     )
 
 
 def solve(
-    problem: Problem,
-    params: BallbotParams,
-    guess: Guess,
-    solver: str = "ipopt",
-    tolerance: float = 1e-8,
-    max_iterations: int = 500,
+    problem: Problem, params: BallbotParams, guess: Guess, solver: str = "ipopt", max_iterations: int = 500
 ) -> Plan:
     """Solves a problem from a guess.
 
@@ -175,19 +169,18 @@ def solve(
     n, at = problem.intervals, _Layout(len(problem.free), problem.periodic)
     ocp = hermite_simpson(problem, params)
     bounds = _bounds(problem, ocp, at)
-    _check_bounds(problem, bounds)
     knots = np.column_stack([guess.x, guess.u / params.force_limit])
     start = guess.x[0] if problem.periodic else ()
     constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
     states, inputs = np.hstack([knots, constant]), knots[1:, at.inputs]
-    optimizer = OcpSolver(ocp, n, solver, tolerance, max_iterations)
+    optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
     started = time.perf_counter()
     if not _is_motion(guess):
         states, inputs = optimizer.toward_consistency(states, inputs, _with_given_times(bounds, states, at))
     result = optimizer.solve(states, inputs, bounds)
     seconds = time.perf_counter() - started
     converged = result.success or result.status == ACCEPTABLE
-    if not (converged and result.violation < FEASIBLE):
+    if not (converged and result.is_within_limits):
         raise PlanError(
             f"{problem.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
             f"violated by {result.violation:.1e}. Try another guess or more time."
@@ -222,16 +215,12 @@ def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:
     lower[0, at.h], upper[0, at.h] = problem.step
     for i, (low, high) in enumerate(problem.free):
         lower[0, at.q.start + i], upper[0, at.q.start + i] = low, high
-    return bounds
-
-
-def _check_bounds(problem: Problem, bounds: Bounds) -> None:
-    for knot, i in np.argwhere(bounds.state_lower > bounds.state_upper)[:1]:
-        name = dynamics.STATE[i][0] if i < 8 else "a decision variable"
-        low, high = bounds.state_lower[knot, i], bounds.state_upper[knot, i]
+    for knot, i in np.argwhere(lower > upper)[:1]:
+        name, low, high = dynamics.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
         raise PlanError(
             f"{problem.name}: at knot {knot}, {name} has lower bound {low:g} above its upper bound {high:g}"
         )
+    return bounds
 
 
 def _plan(params: BallbotParams, result: OcpSolution, at: _Layout, seconds: float) -> Plan:
