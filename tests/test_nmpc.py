@@ -4,7 +4,7 @@ import pytest
 pytest.importorskip("casadi")
 
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
-from ballbot_baselines.disturbance import Disturbance
+from ballbot_baselines.disturbance import DisturbanceEstimator
 from ballbot_baselines.horizon import Grid, HorizonQp
 from ballbot_gym import certified, dynamics
 from ballbot_gym.randomization import Randomization
@@ -226,7 +226,7 @@ def test_controllers_of_one_task_do_not_disturb_each_other(params):
 
 def test_disturbance_in_lean_and_force_is_found(rng):
     true = np.array([[[0.3, -0.1], [2.5, -1.5], [-4.0, 2.5]], [[0.0, 0.2], [1.5, -1.0], [-3.0, 2.0]]])
-    found = Disturbance(force_limit=350.0)
+    found = DisturbanceEstimator(force_limit=350.0)
     for _ in range(200):
         x, a = rng.normal(size=8), rng.uniform(-1, 1, 2)
         errors = true[:, 0] + x[2:4, None] * true[:, 1] + a[:, None] * true[:, 2]

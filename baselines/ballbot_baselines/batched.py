@@ -1,16 +1,16 @@
-"""Optima of thousands of episodes, by iLQR with force limits in compiled code, for tasks that come to rest freely.
+"""Optima of thousands of episodes, by iLQR with force limits in compiled code, for tasks that end at rest without obstacles.
 
-Every episode starts from its cheapest simulated recovery (`righting.steering`). Each iteration sweeps backwards with the
-box-constrained Riccati recursion of Tassa et al., "Control-limited differential dynamic programming" (2014), and rolls the
-new feedback out, with shorter steps where the cost rises. Each of both is one call of compiled code, which takes a fraction
-of a millisecond.
+Every episode starts from its cheapest simulated recovery (`righting.steering`). Each iteration first sweeps backwards with
+the box-constrained Riccati recursion of Tassa et al., "Control-limited differential dynamic programming" (2014). Then it
+simulates the new feedback, with shorter steps where the cost rises. Sweep and simulation are one call of compiled code each,
+which takes a fraction of a millisecond.
 
-An episode is optimized for its first seconds, and LQR's cost-to-go counts for what is left: there the robot is nearly at
-rest. The cost that is returned is that of the whole episode in the closed form, under these forces and LQR's after them. So
-it is the cost of an episode that exists, and never below the optimum.
+Only the first seconds of an episode are optimized. LQR's cost-to-go stands for the rest, where the robot is nearly at rest.
+The returned cost is that of the whole episode, simulated in the closed form under these forces and then LQR's. So it is never
+below the optimum.
 
-It knows no margins: episodes that violate one, and those that no recovery survives, are not solved. Measured on Stabilize:
-see `benchmarks/batched_optima.py`.
+Margins are not part of the optimization. Episodes that violate one, or that no recovery survives, are not solved.
+`benchmarks/batched_optima.py` measures it on Stabilize.
 """
 
 import functools
@@ -56,7 +56,7 @@ class BatchOptima:
     | forces | (B, n, 2) | N |
     | gains | (B, n, 2, 8) | K of the feedback u − K (x' − x) about the optimum, N per unit of the state |
     | slopes | (B, n, 8) | of the remaining cost with respect to each state but the last |
-    | iterations | (B,) | until it converged |
+    | iterations | (B,) | |
     """
 
     costs: np.ndarray

@@ -39,8 +39,8 @@ def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tup
 def entries(task_name: str, indices: Iterable[int], robot: str = PAPER, guesses: int = ALL_GUESSES) -> Iterator[Entry]:
     """Solves episodes of a task with default settings for a robot by name, and yields one entry for each, in order.
 
-    An episode without an optimum is drawn again where the robot's friction is limited: there is none where it cannot but
-    slip, and no other test tells such starts.
+    If the robot's friction is limited, an episode without an optimum is drawn again: some starts make the robot slip whatever
+    it does, and only the search tells which.
 
     Args:
         task_name: in `TASKS`.
@@ -82,16 +82,12 @@ def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: i
 
 
 def _start(task: Task, params: BallbotParams, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
-    """Initial state and constants of the episode of an entry, of whichever draw it is."""
+    """Initial state and constants of the episode of an entry."""
     return episode(task, params, entry["episode"], entry.get("draw", 0))
 
 
 def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) -> EvaluationSet:
-    """The set of the first episodes.
-
-    Args:
-        task: the task that the entries were computed for.
-        entries: one for each episode, from episode 0 on, in order.
+    """The set of the first episodes, from their entries in order, from episode 0 on.
 
     Raises:
         PlanError: an entry has no optimum; the message names the episodes.

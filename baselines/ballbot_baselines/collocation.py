@@ -8,8 +8,8 @@
                 bounds on x_0, x_N, leans, forces, step h and free variables q;   x_N = x_0 if periodic
 
 This module writes the problem as a staged `Ocp`, and `ocp.OcpSolver` solves it. The input of a stage is the next knot without
-its position, which follows: nothing else depends on where the ball is. The step h and the free variables q are states that do
-not change.
+its position, which follows from the other components, because the dynamics do not depend on it. The step h and the free
+variables q are states that do not change.
 """
 
 import time
@@ -28,8 +28,8 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
 _UNLIKE = 0.2
-"""Largest share of a guess's changes that its velocities may fail to explain, for the guess to count as a motion. Measured:
-smooth paths and solutions up to 0.09, straight lines 0.54 to 1."""
+"""A guess counts as a motion if its velocities explain all but this share of its changes. Measured: smooth paths and
+solutions leave up to 0.09 unexplained, straight lines 0.54 to 1."""
 _INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation error is measured
 
 

@@ -6,8 +6,8 @@ _FORGETTING = 0.98  # per control step: the estimate remembers about a second
 _TRUST = np.array([1e-1, 1e1, 1e-3])  # variances of its constant, lean and force parts before the first step; SI units
 
 
-class Disturbance:
-    """What is added to the model's accelerations: for each axis a constant, a part of its lean, and a part of its force.
+class DisturbanceEstimator:
+    """Estimates what to add to the model's accelerations: for each axis a constant, a part of its lean, and of its force.
 
     `coefficients` (2 axes, 3, 2) say how much the constant, the lean (rad) and the force (as a fraction of its limit) add to
     the ball's acceleration, m/s², and to the lean's, rad/s². They are fitted by recursive least squares, and start at 0.

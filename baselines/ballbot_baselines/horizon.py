@@ -11,7 +11,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines.compiled import LANES, InPlace, in_lanes
-from ballbot_baselines.disturbance import Disturbance
+from ballbot_baselines.disturbance import DisturbanceEstimator
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -98,7 +98,7 @@ class HorizonQp:
         """Differentiates the stage and builds the solver; compiles on first use on a machine."""
         count = len(task.margins((0.0,) * 8, (1.0,) * len(task.constant_names)))
         self.distinct = np.arange(count)
-        self.disturbance: Disturbance | None = None
+        self.disturbance: DisturbanceEstimator | None = None
         self.curvature = np.zeros(nodes)
         grips = len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0)))
         # of the cone in an input, per multiplier

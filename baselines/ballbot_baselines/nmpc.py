@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballbot_baselines.disturbance import Disturbance
+from ballbot_baselines.disturbance import DisturbanceEstimator
 from ballbot_baselines.horizon import Grid, horizon_qp
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.lqr import final_weight
@@ -156,7 +156,7 @@ class NmpcController:
         self._qp = horizon_qp(task, params, len(self._grid.lengths))
         self.plan: Optimum | None = None
         self.predicted: np.ndarray | None = None
-        self.disturbance: Disturbance | None = None
+        self.disturbance: DisturbanceEstimator | None = None
         self.counts = Counts()
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
@@ -166,7 +166,7 @@ class NmpcController:
     def start(self, t: float, c: np.ndarray, prepared: PreparedPlan) -> None:
         """As `reset`, with a plan that `prepared_plan` has made before, for instance in another process."""
         self._c, self._lost = np.asarray(c, np.float64), False
-        self.disturbance = Disturbance(self._params.force_limit) if self._offset_free else None
+        self.disturbance = DisturbanceEstimator(self._params.force_limit) if self._offset_free else None
         self._before: tuple[np.ndarray, np.ndarray] | None = None
         self._follow(t, prepared)
 

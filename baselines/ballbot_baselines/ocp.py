@@ -34,9 +34,9 @@ ACCEPTABLE = "Solved_To_Acceptable_Level"
 
 _DAMPING = 1e-8  # of the Newton step toward consistency: constraints may repeat each other, or have no free variables
 _FAR = 5.0
-"""Largest change of a variable by a Newton step toward consistency, from which a second step follows. Measured on 33 turns
-and stops from straight lines: where the first changes more, a second one saves fatrop a third of its iterations on turns and
-costs it two on stops; where it changes less it saves nothing."""
+"""A second Newton step toward consistency follows where the first changes a variable by at least this much. Measured on 33
+turns and stops from straight lines: there the second saves fatrop a third of its iterations on turns and costs it two on
+stops. After smaller changes it saves nothing."""
 
 
 def no_path(*arguments: casadi.SX) -> casadi.SX:
@@ -265,7 +265,7 @@ class OcpSolver:
     def toward_consistency(
         self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A guess moved by the shortest Newton step toward all equality constraints, and by a second one where that is far.
+        """A guess moved by the shortest Newton step toward all equality constraints; after a large step, by a second one.
 
         Use it for guesses that violate the dynamics, such as a straight line between two states: the step bends them toward
         the nearest motion. Guesses that obey the constraints do not change. A step takes as long as one or two iterations.

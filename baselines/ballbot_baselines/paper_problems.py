@@ -155,33 +155,27 @@ def state(x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0) -> n
     return np.array([x, y, 0.0, 0.0, vx, vy, 0.0, 0.0])
 
 
+def _point_to_point(
+    name: str, title: str, figure: str, x0: np.ndarray, x1: np.ndarray, duration: float
+) -> PaperProblem:
+    guess = partial(hermite_guess, x0=x0, x1=x1, duration=duration)
+    return PaperProblem(title, figure, between_states(name, x0, x1), guess)
+
+
 def _stabilization(speed: float, figure: str, duration: float) -> PaperProblem:
-    x0, x1 = state(x=-1.0, vy=speed), state()
-    return PaperProblem(
-        title=f"Stabilization from x = −1 m, ẏ = {speed:g} m/s",
-        figure=figure,
-        problem=between_states(f"stabilize-{speed:g}", x0, x1),
-        guess=partial(hermite_guess, x0=x0, x1=x1, duration=duration),
-    )
+    title = f"Stabilization from x = −1 m, ẏ = {speed:g} m/s"
+    return _point_to_point(f"stabilize-{speed:g}", title, figure, state(x=-1.0, vy=speed), state(), duration)
 
 
 def _turn(speed: float, figure: str, duration: float) -> PaperProblem:
     x0, x1 = state(y=-1.0, vy=speed), state(x=1.0, vx=speed)
-    return PaperProblem(
-        title=f"90° turn at {speed:g} m/s",
-        figure=figure,
-        problem=between_states(f"turn-{speed:g}", x0, x1),
-        guess=partial(hermite_guess, x0=x0, x1=x1, duration=duration),
-    )
+    return _point_to_point(f"turn-{speed:g}", f"90° turn at {speed:g} m/s", figure, x0, x1, duration)
 
 
 def _orbit(speed: float, figure: str, radius: float) -> PaperProblem:
-    return PaperProblem(
-        title=f"Circular orbit at {speed:g} m/s",
-        figure=figure,
-        problem=circular_orbit(f"orbit-{speed:g}", speed),
-        guess=partial(_orbit_guess, speed=speed, radius=radius),
-    )
+    problem = circular_orbit(f"orbit-{speed:g}", speed)
+    guess = partial(_orbit_guess, speed=speed, radius=radius)
+    return PaperProblem(f"Circular orbit at {speed:g} m/s", figure, problem, guess)
 
 
 def _weave(figure: str) -> PaperProblem:

@@ -1,8 +1,8 @@
-"""A second guess for optimizers: feedback under which the robot rights itself, simulated.
+"""Guesses for optimizers: simulated episodes in which feedback brings the robot upright.
 
 Where a guessed path asks for leans and forces that the robot cannot have, optimizers do not converge. These guesses obey the
-dynamics and the force limit, because they are simulated. A cascade steers the ball to a point by its lean, and the lean by
-the force, which is clipped. A family of gains runs at once.
+dynamics and the force limit, because they are simulated. The feedback is a cascade: the lean steers the ball to a point, and
+the clipped force steers the lean. A family of gains is simulated at once.
 
 The force limit is a square: along its diagonal there is √2 times the force of an axis. So a robot that falls along an axis
 recovers more cheaply, and from farther, if it also leans to the side. The episode that stays in the vertical plane of such a
@@ -72,9 +72,9 @@ def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, fo
         totals = [(not safe[-1, i], costs[:, i].sum() * task.control_dt, i) for i in mine]
         if totals:
             _, cost, i = min(totals)
-            righted = int(np.argmax(upright[:, i]))
-            last = len(u) if safe[-1, i] else righted
-            found.append(Member(side, x[: last + 1, i], u[:last, i], float(cost), righted))
+            first_upright = int(np.argmax(upright[:, i]))
+            last = len(u) if safe[-1, i] else first_upright
+            found.append(Member(side, x[: last + 1, i], u[:last, i], float(cost), first_upright))
     return found
 
 

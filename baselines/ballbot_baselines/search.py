@@ -23,16 +23,20 @@ ALL_GUESSES = 2**10
 """`guesses` that make `find_optimum` solve every guess."""
 
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
-_HIGH_BARRIER = 1.0  # with the other, fatrop goes in circles from one start in thousands
+_HIGH_BARRIER = 1.0  # from one start in thousands fatrop goes in circles with the usual one, and not with this
 _COARSE = 2  # control steps per interval when several guesses are compared
 _COARSEST = 4  # the same when choices of sides are compared first
 _ROUGH = 1e-4  # tolerance there: costs are then right to 1e-5 of their value, in four iterations less
-_BASIN_DOUBT = 0.01  # relative: relaxed costs that differ by less may be ordered differently on the env's grid
-_SIDE_DOUBT = 0.01  # relative: choices of sides that are predicted to cost more than the best by more are not solved
+_BASIN_DOUBT = (
+    0.01  # paths whose coarse costs differ by less than this share may be ordered differently on the env's grid
+)
+_SIDE_DOUBT = 0.01  # choices of sides whose predicted cost exceeds the best by more than this share are not solved
 _COARSEST_DOUBT = 0.005  # relative: how differently the coarsest grid may order choices of sides; 0.0035 was measured
 _GRID_DOUBT = 0.002  # the same of the coarse grid; 0.0007 was measured
 _GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip: 130 to 270 are common
-_GRIPPING_DOUBT = 0.02  # in place of both doubts: predictions leave friction out, coarse grids are rough about it
+_GRIPPING_DOUBT = (
+    0.02  # for such robots in place of `_SIDE_DOUBT` and `_GRID_DOUBT`, because predictions ignore friction
+)
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 
 Found = tuple[int, OcpSolution]

@@ -1,17 +1,16 @@
 """What every choice of sides in a slalom will cost, predicted without solving it.
 
-Across the way, the robot is nearly linear and moves nearly on its own: the sides hardly change how it moves along the way. So
-the times at which it passes the obstacles are taken from one solution, such as that of the slalom without its obstacles. The
-rest is a small quadratic program: the linear motion across the way of least cost that clears every obstacle on its side at
-that time.
+Across the way, the robot is nearly linear, and the sides hardly change how it moves along the way. So the times at which it
+passes the obstacles are taken from one solution, such as that of the slalom without its obstacles. A small quadratic program
+then finds the cheapest linear motion across the way that is on the right side of every obstacle at these times.
 
 Without obstacles the optimal force is LQR's, u = −K y. Forces v added to it cost Σ s·v², with s = R + BᵀPB, and move the
 position by the impulse response g of the closed loop. So the cheapest way to move by d at the times t costs dᵀ k(t, t)⁻¹ d,
 with the kernel k(t, t') = Σ_r g(t − r) g(t' − r) / s. The program over d is solved for all choices at once, active set by
 active set.
 
-The prediction is no bound. Measured on 350 drawn slaloms, all of whose choices were solved: from the motion without
-obstacles, the best choice, or one that costs at most 0.1 % more, is predicted within 0.7 % of the first.
+The prediction is no bound. It was measured on 350 random slaloms, with every choice solved. Each time the best choice, or one
+that costs at most 0.1 % more, had a predicted cost at most 0.7 % above the lowest.
 """
 
 import itertools
