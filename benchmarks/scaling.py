@@ -7,10 +7,9 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballbot_baselines.collocation import Guess, solve
-from ballbot_baselines.guess import along_path, cubic_hermite
+from ballbot_baselines.collocation import solve
 from ballbot_baselines.optimum import find_optimum
-from ballbot_baselines.paper import between_states, state
+from ballbot_baselines.paper_problems import between_states, hermite_guess, state
 from ballbot_gym import files
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -47,10 +46,7 @@ def collocation_of(params: BallbotParams, intervals: int, repeats: int) -> Point
     problem = between_states(f"scaling-{intervals}", _START, _END, intervals=intervals)
     summed, share = problem.cost, 40 / intervals  # so that the cost stays what it is with 40 intervals
     problem = replace(problem, step=(_SECONDS / intervals,) * 2, cost=lambda *knot: share * summed(*knot))
-    h = _SECONDS / intervals
-    x, _ = along_path(params, cubic_hermite(_START, _END, _SECONDS, intervals), h)
-    x[0], x[-1] = _START, _END
-    guess = Guess(x, np.zeros((intervals + 1, 2)), h)
+    guess = hermite_guess(params, _START, _END, _SECONDS, intervals)
     plans = [solve(problem, params, guess, "fatrop") for _ in range(repeats)]
     seconds = float(np.median([plan.seconds for plan in plans]))
     return Point("paper's problem, Hermite–Simpson", intervals, seconds, plans[0].iterations)

@@ -21,9 +21,8 @@ from pydrake.planning import DirectCollocation
 from pydrake.solvers import SnoptSolver
 
 from ballbot_baselines.collocation import Guess, Problem, hermite_simpson, solve
-from ballbot_baselines.guess import straight_line
 from ballbot_baselines.ocp import OcpSolver
-from ballbot_baselines.paper import PAPER_PROBLEMS
+from ballbot_baselines.paper_problems import PAPER_PROBLEMS, straight_guess
 from ballbot_gym import files
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
 from ballbot_gym.rollout import PlanError
@@ -57,8 +56,9 @@ def main(out: Path = Path("runs/trajopt_vs_drake"), repeats: int = 5, quick: boo
     repeats = 1 if quick else repeats
     for name in PROBLEMS[:2] if quick else PROBLEMS:
         entry = PAPER_PROBLEMS[name]
-        smooth = entry.guess(params)
-        for label, guess in (("straight line", _straight(entry.problem, smooth)), ("cubic Hermite", smooth)):
+        smooth, ends = entry.guess(params), (entry.problem.initial[0], entry.problem.final[0])
+        straight = straight_guess(params, *ends, smooth.h * entry.problem.intervals)
+        for label, guess in (("straight line", straight), ("cubic Hermite", smooth)):
             drake = time_drake(entry.problem, params, guess, repeats)
             ours = time_ours(entry.problem, params, guess, repeats)
             for program, timing in (("Drake + SNOPT", drake), ("ballbot, fatrop", ours)):
@@ -176,11 +176,6 @@ def ratios(rows: list[Timing]) -> list[str]:
     means = np.exp(np.mean(np.log(found), axis=0))  # NaN where a program found no optimum
     each = ", ".join(f"{mean:.0f} from the {guess}" for mean, guess in zip(means, same, strict=False))
     return [*lines, f"geometric means: {each}; straight line / our best {means[-2]:.0f}; best / best {means[-1]:.0f}"]
-
-
-def _straight(problem: Problem, like: Guess) -> Guess:
-    n = problem.intervals
-    return Guess(straight_line(problem.initial[0], problem.final[0], n), np.zeros((n + 1, 2)), like.h)
 
 
 def _set_guess(collocation: DirectCollocation, guess: Guess) -> None:

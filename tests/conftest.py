@@ -45,10 +45,14 @@ def interpreted(monkeypatch):
 
     For a problem that no other test solves, compiling takes longer than solving without machine code.
     """
-    compiled, optimum = (pytest.importorskip(f"ballbot_baselines.{name}") for name in ("compiled", "optimum"))
-    monkeypatch.setattr(compiled, "_loaded", lambda *_: None)
-    for made in ("shooting_ocp", "_solver", "_free_time_solver"):
-        monkeypatch.setattr(optimum, made, functools.cache(getattr(optimum, made).__wrapped__))
+    compiled, search, shooting = (
+        pytest.importorskip(f"ballbot_baselines.{name}") for name in ("compiled", "search", "shooting")
+    )
+    monkeypatch.setattr(compiled, "loaded", lambda *_: None)
+    for name in ("shooting_ocp", "shooting_solver", "free_time_solver"):
+        own = functools.cache(getattr(shooting, name).__wrapped__)
+        for module in (search, shooting):
+            monkeypatch.setattr(module, name, own, raising=False)
 
 
 @pytest.fixture

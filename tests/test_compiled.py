@@ -11,6 +11,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines import compiled
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
 from ballbot_gym import codegen, machine_code
 
 needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
@@ -80,9 +81,28 @@ def test_lanes_work_without_machine_code_of_their_own(folder, monkeypatch, missi
 
 
 @needs_compiler
-def test_nothing_but_the_library_is_left_in_the_cache(folder):
+def test_functions_are_compiled_once_and_then_read_from_the_cache(folder, monkeypatch):
     compiled.compiled("powers", powers())
-    assert [path.suffix for path in folder.iterdir()] == [".so"]
+    (library,) = folder.iterdir()  # nothing else is left there
+    assert library.name.startswith("powers-")
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: pytest.fail("compiled again"))
+    assert values(compiled.compiled("powers", powers())) == [9.0, 27.0]
+
+
+@needs_compiler
+def test_problems_with_different_parameters_share_their_compiled_dynamics(folder):
+    for params in (0, 1, 3):
+        ocp = Ocp(
+            name=f"integrator-{params}",
+            states=2,
+            inputs=1,
+            params=params,
+            next=lambda s, w, p: casadi.vertcat(s[0] + 0.1 * s[1], s[1] + 0.1 * w[0]),
+            cost=lambda s, w, p: (1 + casadi.sumsqr(p)) * (casadi.sumsqr(s) + w[0] ** 2),
+        )
+        solution = OcpSolver(ocp, 8).solve(np.ones((9, 2)), np.zeros((8, 1)), Bounds.free(ocp, 8), np.ones(params))
+        assert solution.is_optimal
+    assert sum(library.name.startswith("dynamics-") for library in folder.iterdir()) == 1
 
 
 @needs_compiler
@@ -273,6 +293,14 @@ def test_cache_that_is_no_absolute_path_is_refused(monkeypatch, given):
     monkeypatch.setenv("BALLBOT_CACHE", given)
     with pytest.raises(ValueError, match="BALLBOT_CACHE must be an absolute path"):
         compiled.compiled("powers", powers())
+
+
+def test_cache_lies_in_the_users_cache_folder_unless_told_otherwise(monkeypatch, tmp_path):
+    monkeypatch.delenv("BALLBOT_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert machine_code.cache_folder() == tmp_path / "ballbot-gym"
+    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "other"))
+    assert machine_code.cache_folder() == tmp_path / "other"
 
 
 def test_relative_xdg_cache_home_is_ignored(monkeypatch, tmp_path):

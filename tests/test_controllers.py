@@ -8,11 +8,9 @@ import pytest
 pytest.importorskip("casadi")
 
 import ballbot_baselines
-from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.lqr import LqrController, discrete_lqr
+from ballbot_baselines import CONTROLLERS, LqrController, TrajoptController, TvlqrController
+from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.optimum import find_optimum
-from ballbot_baselines.trajopt import TrajoptController
-from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import FunctionController, PlanError, rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -174,8 +172,10 @@ assert "casadi" in sys.modules
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_find_optimum_has_a_short_import_path():
+def test_what_users_need_has_a_short_import_path():
     assert ballbot_baselines.find_optimum is find_optimum
+    for name in ballbot_baselines.__all__:
+        assert getattr(ballbot_baselines, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'find_minimum'"):
         ballbot_baselines.find_minimum  # noqa: B018
 

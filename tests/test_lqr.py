@@ -9,7 +9,6 @@ from ballbot_baselines.linearize import discretize, goal_weight, linearize, quad
 from ballbot_baselines.lqr import (
     LqrController,
     closed_gains,
-    continuous_lqr,
     discrete_lqr,
     equilibrium_gain,
     final_weight,
@@ -18,7 +17,7 @@ from ballbot_baselines.lqr import (
 )
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import dynamics
-from ballbot_gym.rollout import FunctionController, rollout
+from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
@@ -87,25 +86,6 @@ def test_measured_cost_from_small_states_is_the_riccati_cost(make_env, physics, 
         # measured: below 1e-4 with rk4, 1.7e-3 with Bullet's 1 ms steps
         assert episode.cost == pytest.approx(predicted, rel=5e-3)
         assert episode.success
-
-
-def test_measured_cost_with_short_steps_is_the_continuous_riccati_cost(make_env, physics, params, rng):
-    task = Stabilize(control_dt=0.001)
-    k, p = continuous_lqr(task, params, ORIGIN, NO_FORCE, NO_CONSTANTS)
-    env = make_env(task, physics=physics)
-    for x, predicted in small_starts(rng, p, 0.003, 2):
-        episode = rollout(env, FunctionController(lambda t, x: -k @ x), options={"state": x})
-        assert episode.cost == pytest.approx(predicted, rel=5e-3)  # measured: 7e-4, the first-order sum
-
-
-def test_discrete_lqr_tends_to_the_continuous_one(params):
-    args = (params, ORIGIN, NO_FORCE, NO_CONSTANTS)
-    task = Stabilize(control_dt=0.001)
-    _, p = continuous_lqr(task, *args)
-    excess = discrete_lqr(task, *args)[1] - p
-    assert np.abs(excess).max() < 1e-4 * p.max()  # measured: 3.8e-5, and 6.8e-3 at 20 ms
-    # a sum over steps counts the first state ½·control_dt longer than the integral does
-    assert excess[0, 0] == pytest.approx(0.5 * task.position_weight * task.control_dt, rel=0.01)
 
 
 def test_discrete_lqr_solves_its_riccati_equation_and_is_stable(params):

@@ -1,5 +1,3 @@
-import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -12,17 +10,10 @@ import casadi
 from ballbot_baselines import compiled
 from ballbot_baselines import optimum as optimum_module
 from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.ocp import Bounds, Ocp, OcpSolver
-from ballbot_baselines.optimum import (
-    FEASIBLE,
-    Backoff,
-    find_optimum,
-    is_feasible,
-    plan_to_track,
-    shooting_ocp,
-    shooting_parameters,
-)
-from ballbot_gym import dynamics, machine_code
+from ballbot_baselines.ocp import FEASIBLE, Bounds, Ocp, OcpSolver
+from ballbot_baselines.optimum import Backoff, find_optimum, plan_to_track
+from ballbot_baselines.shooting import shooting_ocp, shooting_parameters
+from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
@@ -284,7 +275,7 @@ def solve_toy_by_casadi(p=0.4):
 def test_staged_problem_has_the_solution_of_the_problem_written_out(solver, p):
     cost, states, inputs, _ = solve_toy_by_casadi(p)
     staged = solve_toy(solver, p)
-    assert is_feasible(staged)
+    assert staged.is_optimal
     assert staged.cost == pytest.approx(cost, rel=1e-7)
     np.testing.assert_allclose(staged.states, states, atol=1e-4)
     np.testing.assert_allclose(staged.inputs, inputs, atol=1e-4)
@@ -304,47 +295,35 @@ def test_violation_is_the_largest_of_constraints_and_bounds():
     s, w = solution.states, solution.inputs
     defects = [s[k + 1] - np.array(ocp.next(*(casadi.DM(v) for v in (s[k], w[k])), 0.4)).ravel() for k in range(N)]
     assert not solution.success
-    assert not is_feasible(solution)
+    assert not solution.is_optimal
     assert "Maximum_Iterations" in solution.status
     assert solution.violation >= np.abs(defects).max()
     assert solution.violation >= abs(s[0] @ ocp.initial_matrix[0])
 
 
-def test_infeasible_bounds_are_reported_not_hidden():
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_infeasible_bounds_are_reported_not_hidden(solver):
     ocp = toy()
     bounds = toy_bounds(ocp)
     bounds.state_lower[3:, 0] = 2.0  # where 0.3 − s₀² ≥ 0 cannot hold
-    for solver in ("ipopt", "fatrop"):
-        solution = OcpSolver(ocp, N, solver, max_iterations=50).solve(
-            np.zeros((N + 1, 3)), np.zeros((N, 2)), bounds, [0.4]
-        )
-        assert not solution.success
-        assert solution.violation > 1e-3
-        assert solution.status
-
-
-def double_integrator(params=0):
-    """Linear dynamics without parameters, cost and limits with as many as there are."""
-    return Ocp(
-        name=f"integrator-{params}",
-        states=2,
-        inputs=1,
-        params=params,
-        next=lambda s, w, p: casadi.vertcat(s[0] + 0.1 * s[1], s[1] + 0.1 * w[0]),
-        cost=lambda s, w, p: (1 + casadi.sumsqr(p)) * (casadi.sumsqr(s) + w[0] ** 2),
-    )
-
-
-def from_rest_to_rest(ocp):
-    bounds = Bounds.free(ocp, N)
-    bounds.state_lower[[0, -1]] = bounds.state_upper[[0, -1]] = [[0, 0], [1, 0]]
-    return bounds
+    solution = OcpSolver(ocp, N, solver, max_iterations=50).solve(np.zeros((N + 1, 3)), np.zeros((N, 2)), bounds, [0.4])
+    assert not solution.success
+    assert solution.violation > 1e-3
+    assert solution.status
 
 
 def test_straight_line_is_bent_into_the_nearest_motion(rng):
     # of linear dynamics: no other motion between the ends is nearer, and motions stay as they are (but for the damping)
-    ocp = double_integrator()
-    solver, bounds = OcpSolver(ocp, N), from_rest_to_rest(ocp)
+    ocp = Ocp(
+        name="integrator",
+        states=2,
+        inputs=1,
+        params=0,
+        next=lambda s, w, p: casadi.vertcat(s[0] + 0.1 * s[1], s[1] + 0.1 * w[0]),
+        cost=lambda s, w, p: casadi.sumsqr(s) + w[0] ** 2,
+    )
+    solver, bounds = OcpSolver(ocp, N), Bounds.free(ocp, N)
+    bounds.state_lower[[0, -1]] = bounds.state_upper[[0, -1]] = [[0, 0], [1, 0]]
     line, still = np.linspace([0, 0], [1, 0], N + 1), np.zeros((N, 1))
     states, inputs = solver.toward_consistency(line, still, bounds)
     np.testing.assert_array_equal(states[[0, -1]], line[[0, -1]])
@@ -380,52 +359,13 @@ def test_step_toward_consistency_brings_a_rough_guess_nearer_and_respects_bounds
     assert states[-1, 2] ** 2 + states[-1, 2] == pytest.approx(0.2, abs=1e-6)
 
 
-# --- compiled derivatives ---
-
-
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_compiled_and_interpreted_functions_lead_to_the_same_solution(monkeypatch, solver):
     fast = solve_toy(solver)
-    monkeypatch.setattr(machine_code, "_compiler", lambda: None)
+    monkeypatch.setattr(compiled, "loaded", lambda *_: None)
     slow = solve_toy(solver)
     assert slow.cost == pytest.approx(fast.cost, rel=1e-12)
     np.testing.assert_allclose(slow.states, fast.states, atol=1e-9)
-
-
-def square():
-    x = casadi.SX.sym("x")
-    return (casadi.Function("square", [x], [x * x]), casadi.Function("cube", [x], [x**3]))
-
-
-needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
-
-
-@needs_compiler
-def test_functions_are_compiled_once_and_then_read_from_the_cache(monkeypatch, tmp_path):
-    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "cache"))
-    first = compiled.compiled("powers", square())
-    assert [float(f(3.0)) for f in first] == [9.0, 27.0]
-    (library,) = (tmp_path / "cache").iterdir()
-    assert library.name.startswith("powers-")
-
-    def refuse(*args, **kwargs):
-        raise AssertionError("compiled again")
-
-    monkeypatch.setattr(subprocess, "run", refuse)
-    again = compiled.compiled("powers", square())
-    assert [float(f(3.0)) for f in again] == [9.0, 27.0]
-
-
-@needs_compiler
-def test_problems_with_different_parameters_share_their_compiled_dynamics(monkeypatch, tmp_path):
-    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
-    for params in (0, 1, 3):
-        ocp = double_integrator(params)
-        solution = OcpSolver(ocp, N).solve(
-            np.zeros((N + 1, 2)), np.zeros((N, 1)), from_rest_to_rest(ocp), np.ones(params)
-        )
-        assert is_feasible(solution)
-    assert sum(library.name.startswith("dynamics-") for library in tmp_path.iterdir()) == 1
 
 
 def test_the_dynamics_of_a_task_depend_on_how_long_forces_are_held_and_on_nothing_else_that_is_its_own(task, params):
@@ -440,39 +380,6 @@ def test_the_dynamics_of_a_task_depend_on_how_long_forces_are_held_and_on_nothin
         np.testing.assert_allclose(
             reached, dynamics.step(params, x, params.force_limit * a, held), rtol=1e-13, atol=1e-13
         )
-
-
-@needs_compiler
-def test_other_functions_get_another_library(monkeypatch, tmp_path):
-    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
-    x = casadi.SX.sym("x")
-    compiled.compiled("powers", square())
-    compiled.compiled("powers", (casadi.Function("square", [x], [2 * x * x]),))
-    assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_without_a_compiler_functions_stay_as_they_are(monkeypatch):
-    monkeypatch.setattr(machine_code, "_compiler", lambda: None)
-    functions = square()
-    assert compiled.compiled("powers", functions) is functions
-
-
-@pytest.mark.skipif(shutil.which("false") is None, reason="a program that fails")
-def test_compiler_that_fails_is_logged_and_functions_stay_as_they_are(monkeypatch, tmp_path, caplog):
-    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path))
-    monkeypatch.setattr(machine_code, "_compiler", lambda: "false")
-    functions = square()
-    assert compiled.compiled("powers", functions) is functions
-    assert "stay interpreted" in caplog.text
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_cache_lies_in_the_users_cache_folder_unless_told_otherwise(monkeypatch, tmp_path):
-    monkeypatch.delenv("BALLBOT_CACHE", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert machine_code.cache_folder() == tmp_path / "ballbot-gym"
-    monkeypatch.setenv("BALLBOT_CACHE", str(tmp_path / "other"))
-    assert machine_code.cache_folder() == tmp_path / "other"
 
 
 def test_other_robot_has_another_optimum(params, interpreted):

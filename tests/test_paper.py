@@ -7,7 +7,7 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import guess as guesses
 from ballbot_baselines.collocation import Guess, collocation_error, solve
-from ballbot_baselines.paper import PAPER_PROBLEMS, between_states, circular_orbit, state, straight_guess
+from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, circular_orbit, state, straight_guess
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.orbit import orbit_tilt
@@ -143,7 +143,7 @@ LINES = {"stabilize-1": 2.0, "stabilize-5": 3.0, "turn-3": 2.0, "turn-10": 6.0} 
 
 def line_of(name, params, seconds):
     problem = PAPER_PROBLEMS[name].problem
-    return straight_guess(problem.initial[0], problem.final[0], seconds)(params)
+    return straight_guess(params, problem.initial[0], problem.final[0], seconds)
 
 
 @pytest.mark.parametrize("name", LINES)
@@ -193,7 +193,7 @@ def test_problem_without_a_solution_raises_with_status_and_violation(params, sol
     x0 = state(x=-1.0, vy=5.0)
     hurried = replace(between_states("hurried", x0, state()), step=(0.005, 0.01))  # 0.4 s to stop from 5 m/s
     with pytest.raises(PlanError, match=rf"hurried: {solver} found no plan: \w+.*violated by \d\.\de[+-]\d\d"):
-        solve(hurried, params, straight_guess(x0, state(), 0.4)(params), solver, max_iterations=60)
+        solve(hurried, params, straight_guess(params, x0, state(), 0.4), solver, max_iterations=60)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -201,7 +201,7 @@ def test_start_beyond_the_lean_limit_raises_a_plan_error(params, solver):
     x0 = state(x=-1.0, vy=1.0)
     x0[2] = 1.2  # the limit is 1
     with pytest.raises(PlanError, match="leaning"):
-        solve(between_states("leaning", x0, state()), params, straight_guess(x0, state(), 2.0)(params), solver)
+        solve(between_states("leaning", x0, state()), params, straight_guess(params, x0, state(), 2.0), solver)
 
 
 def test_guess_along_an_accelerating_path_is_the_motion_itself(params):

@@ -8,11 +8,17 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines import certification, optimum, righting
-from ballbot_baselines.lqr import LqrController
-from ballbot_baselines.nmpc import NmpcController
-from ballbot_baselines.optimum import FEASIBLE, FROM_RIGHTING, find_optimum
-from ballbot_baselines.trajopt import TrajoptController
+from ballbot_baselines import (
+    LqrController,
+    NmpcController,
+    TrajoptController,
+    certification,
+    find_optimum,
+    righting,
+    search,
+    shooting,
+)
+from ballbot_baselines.ocp import FEASIBLE
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -36,7 +42,7 @@ def steep(params):
 
 def test_leaning_by_60_degrees_is_recovered_at_less_than_the_cost_of_staying_in_the_plane(steep):
     assert steep.is_optimal
-    assert steep.guess == FROM_RIGHTING
+    assert steep.guess == search.FROM_RIGHTING
     assert steep.cost == pytest.approx(78.088156, rel=1e-6)
     # 99.31 is the stationary episode in the plane of the fall: a saddle point
     assert steep.cost < 99.31
@@ -77,21 +83,32 @@ def test_no_member_rights_what_the_whole_force_cannot(params):
     assert righting.righted(task, params, leaning(75, lean_rate=3.0), NO_CONSTANTS, params.force_limit) == []
 
 
-class Unconverged:
-    """A solver that keeps its start."""
+class Altered:
+    """A solver whose solutions are changed."""
 
-    def __init__(self, solver, status="stopped"):
-        self.ocp, self._solver, self._status = solver.ocp, solver, status
+    def __init__(self, solver, change):
+        self.ocp, self.solver, self.change = solver.ocp, solver, change
 
     def solve(self, *args):
-        return replace(self._solver.solve(*args), success=False, status=self._status)
+        return replace(self.solver.solve(*args), success=False, **self.change)
 
 
 @pytest.fixture
-def unconverged(monkeypatch):
+def altered(monkeypatch):
+    """Has every solver fail, with given fields of its solutions."""
+
+    def alter(**change):
+        make = shooting.shooting_solver
+        for module in (search, shooting):
+            monkeypatch.setattr(module, "shooting_solver", lambda *args, **kw: Altered(make(*args, **kw), change))
+
+    return alter
+
+
+@pytest.fixture
+def unconverged(altered):
     """No solver meets its tolerance, although all find the optimum."""
-    made = optimum._solver
-    monkeypatch.setattr(optimum, "_solver", lambda *args, **options: Unconverged(made(*args, **options)))
+    altered(status="stopped")
 
 
 def test_feasible_episode_without_an_optimum_is_returned_and_says_so(unconverged, params):
@@ -115,15 +132,8 @@ def test_feasible_episode_gets_no_certificate(unconverged):
     assert "only a feasible episode" in entry["error"]
 
 
-def test_simulated_recovery_is_a_plan_where_no_solver_finds_one(monkeypatch, make_env, params):
-    class Lost:
-        ocp = None
-
-        def solve(self, x, a, bounds, p):
-            return optimum.OcpSolution(False, "lost", 0.0, x, a, 1.0, 1, 0.0, "fatrop", np.zeros((len(a), 8)))
-
-    monkeypatch.setattr(optimum, "_solver", lambda *args, **options: Lost())
-    monkeypatch.setattr(optimum, "_bounds", lambda *args: None)
+def test_simulated_recovery_is_a_plan_where_no_solver_finds_one(altered, make_env, params):
+    altered(status="lost", violation=1.0)
     env = make_env(physics="rk4")
     controller = TrajoptController(env.task, params)
     run = rollout(env, controller, options={"state": leaning(30)})

@@ -18,7 +18,7 @@ from ballbot_baselines.linearize import linearize
 from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.paper import between_states
+from ballbot_baselines.paper_problems import between_states
 from ballbot_gym import certified, dynamics
 from ballbot_gym.env import BallbotEnv, limit_names, make_task
 from ballbot_gym.params import BallbotParams, UrdfError, default_params

@@ -1,7 +1,7 @@
 """Experts that know the model: linear control, trajectory optimization, and the optima that regret is measured against.
 
-`from ballbot_baselines import find_optimum` is the short path to `optimum.find_optimum`. Importing this package is light:
-CasADi and SciPy are imported when a controller is made or `find_optimum` is first asked for.
+`from ballbot_baselines import find_optimum` and the like are short paths to what users need. Importing this package is light:
+CasADi and SciPy are imported when one of them is first asked for, or a controller is made.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,12 @@ from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
-    from ballbot_baselines.optimum import find_optimum
+    from ballbot_baselines.lqr import LqrController
+    from ballbot_baselines.nmpc import NmpcController, offset_free_nmpc
+    from ballbot_baselines.optimum import Optimum, find_optimum, plan_to_track
+    from ballbot_baselines.shooting import Backoff
+    from ballbot_baselines.trajopt import TrajoptController
+    from ballbot_baselines.tvlqr import TvlqrController
 
 need(__name__, "casadi", "scipy")
 
@@ -29,9 +34,30 @@ VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 }
 """Controllers that run where they are named, and in the robustness track. They have no row on the leaderboard."""
 
-_LAZY = {"find_optimum": "ballbot_baselines.optimum:find_optimum"}
+_MODULES = {
+    "lqr": ("LqrController",),
+    "nmpc": ("NmpcController", "offset_free_nmpc"),
+    "optimum": ("Optimum", "find_optimum", "plan_to_track"),
+    "shooting": ("Backoff",),
+    "trajopt": ("TrajoptController",),
+    "tvlqr": ("TvlqrController",),
+}
+_LAZY = {name: f"{__name__}.{module}:{name}" for module, names in _MODULES.items() for name in names}
 
-__all__ = ["CONTROLLERS", "VARIANTS", "Controller", "find_optimum"]
+__all__ = [
+    "CONTROLLERS",
+    "VARIANTS",
+    "Backoff",
+    "Controller",
+    "LqrController",
+    "NmpcController",
+    "Optimum",
+    "TrajoptController",
+    "TvlqrController",
+    "find_optimum",
+    "offset_free_nmpc",
+    "plan_to_track",
+]
 
 
 def __getattr__(name: str) -> Any:

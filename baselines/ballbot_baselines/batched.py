@@ -1,16 +1,16 @@
-"""Optima of thousands of episodes, by iLQR with force limits in compiled code, for tasks that come to rest freely.
+"""Optima of thousands of episodes, by iLQR with force limits in compiled code, for tasks that end at rest without obstacles.
 
-Every episode starts from its cheapest simulated recovery (`righting.steering`). Each iteration sweeps backwards with the
-box-constrained Riccati recursion of Tassa et al., "Control-limited differential dynamic programming" (2014), and rolls the
-new feedback out, with shorter steps where the cost rises. Each of both is one call of compiled code, which takes a fraction
-of a millisecond.
+Every episode starts from its cheapest simulated recovery (`righting.steering`). Each iteration first sweeps backwards with
+the box-constrained Riccati recursion of Tassa et al., "Control-limited differential dynamic programming" (2014). Then it
+simulates the new feedback, with shorter steps where the cost rises. Sweep and simulation are one call of compiled code each,
+which takes a fraction of a millisecond.
 
-An episode is optimized for its first seconds, and LQR's cost-to-go counts for what is left: there the robot is nearly at
-rest. The cost that is returned is that of the whole episode in the closed form, under these forces and LQR's after them. So
-it is the cost of an episode that exists, and never below the optimum.
+Only the first seconds of an episode are optimized. LQR's cost-to-go stands for the rest, where the robot is nearly at rest.
+The returned cost is that of the whole episode, simulated in the closed form under these forces and then LQR's. So it is never
+below the optimum.
 
-It knows no margins: episodes that violate one, and those that no recovery survives, are not solved. Measured on Stabilize:
-see `benchmarks/batched_optima.py`.
+Margins are not part of the optimization. Episodes that violate one, or that no recovery survives, are not solved.
+`benchmarks/batched_optima.py` measures it on Stabilize.
 """
 
 import functools
@@ -23,7 +23,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines import righting
-from ballbot_baselines.compiled import LANES, in_lanes
+from ballbot_baselines.compiled import LANES, InPlace, in_lanes
 from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
 from ballbot_gym import dynamics, ops
 from ballbot_gym.params import BallbotParams
@@ -37,7 +37,7 @@ _MOST_ITERATIONS = 15
 _SHORTER_STEPS = (0.5, 0.2, 0.05, 0.01)  # shares of a step that are tried in turn where the whole step raises the cost
 _TOLERANCE = 1e-5  # relative: an iteration that promises to lower the cost by less is the last
 _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
-_FORCE_BACKOFF = 1e-7  # of the force limit, as in `optimum.Backoff`
+_FORCE_BACKOFF = 1e-7  # of the force limit, as in `shooting.Backoff`
 _AT_ONCE = 256  # episodes in memory between iterations
 _NO_GAINS, _NO_STATES, _NO_FORCES = np.zeros((1, 1, 16)), np.zeros((1, 1, 8)), np.zeros((1, 1, 2))
 
@@ -56,7 +56,7 @@ class BatchOptima:
     | forces | (B, n, 2) | N |
     | gains | (B, n, 2, 8) | K of the feedback u − K (x' − x) about the optimum, N per unit of the state |
     | slopes | (B, n, 8) | of the remaining cost with respect to each state but the last |
-    | iterations | (B,) | until it converged |
+    | iterations | (B,) | |
     """
 
     costs: np.ndarray
@@ -83,7 +83,6 @@ def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.nd
 
     Args:
         task: one that `solves` admits.
-        params: the robot.
         x0: (B, 8) initial states.
         forces: (B, k, 2) N, of episodes to start from where they are cheaper than the simulated recoveries, as those of a
             policy; k at least `optimized_steps(task)`.
@@ -302,22 +301,17 @@ def _solver(task: Task, params: BallbotParams) -> _Solver:
 class _Call:
     """A function of `LANES` episodes and one control step, for n steps of any number of episodes.
 
-    Its first result is its first argument in the next step. Arguments and results are arrays (n, B, k); of arguments n and B
-    may be 1. CasADi sees them as (k, n · LANES).
+    Its first result is its first argument in the next step. Arguments and results are arrays (n, B, k). Arguments may have
+    n = 1 or B = 1: the same for all steps or episodes. CasADi sees them as (k, n · LANES).
     """
 
     def __init__(self, step: casadi.Function, n: int, last_alone: bool = False):
-        """Args: last_alone: whether of the first result only that of the last step is wanted."""
+        """Makes it. With `last_alone`, the first result is returned for the last step alone."""
         function = step.mapaccum(n)
-        self._buffer, self._evaluate = function.buffer()
         self._arguments = [self._array(function.size_in(i)) for i in range(function.n_in())]
-        self._results = [self._array(function.size_out(i)) for i in range(function.n_out())]
-        # CasADi's type stubs ask for a size too, and NumPy's do not know that arrays are buffers.
-        for i, array in enumerate(self._arguments):
-            self._buffer.set_arg(i, memoryview(array))  # pyright: ignore[reportArgumentType, reportCallIssue]
-        for i, array in enumerate(self._results):
-            self._buffer.set_res(i, memoryview(array))  # pyright: ignore[reportArgumentType, reportCallIssue]
-        self._wanted = [self._results[0][-1:] if last_alone else self._results[0], *self._results[1:]]
+        first, *others = results = [self._array(function.size_out(i)) for i in range(function.n_out())]
+        self._evaluate = InPlace(function, self._arguments, results)
+        self._wanted = [first[-1:] if last_alone else first, *others]
 
     @staticmethod
     def _array(size: tuple[int, int]) -> np.ndarray:

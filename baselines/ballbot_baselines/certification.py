@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
+from ballbot_baselines.optimum import ALL_GUESSES, find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
@@ -39,8 +39,8 @@ def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tup
 def entries(task_name: str, indices: Iterable[int], robot: str = PAPER, guesses: int = ALL_GUESSES) -> Iterator[Entry]:
     """Solves episodes of a task with default settings for a robot by name, and yields one entry for each, in order.
 
-    An episode without an optimum is drawn again where the robot's friction is limited: there is none where it cannot but
-    slip, and no other test tells such starts.
+    If the robot's friction is limited, an episode without an optimum is drawn again: some starts make the robot slip whatever
+    it does, and only the search tells which.
 
     Args:
         task_name: in `TASKS`.
@@ -68,21 +68,26 @@ def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: i
     if not optimum.is_optimal:
         reason = f"only a feasible episode of cost {optimum.cost:.6g} was found ({optimum.solver_status})"
         return {"episode": index, "error": reason}
-    return _entry(index, optimum) | ({"draw": draw} if draw else {})
+    trajectory = optimum.trajectory
+    return {
+        "episode": index,
+        "cost": optimum.cost,
+        "violation": optimum.violation,
+        "solver": optimum.solver,
+        "status": optimum.solver_status,
+        "t": trajectory.t.tolist(),
+        "x": trajectory.x.tolist(),
+        "u": trajectory.u.tolist(),
+    } | ({"draw": draw} if draw else {})
 
 
 def _start(task: Task, params: BallbotParams, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
-    """Initial state and constants of the episode of an entry, of whichever draw it is."""
+    """Initial state and constants of the episode of an entry."""
     return episode(task, params, entry["episode"], entry.get("draw", 0))
 
 
 def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) -> EvaluationSet:
-    """The set of the first episodes.
-
-    Args:
-        task: the task that the entries were computed for.
-        params: the robot.
-        entries: one for each episode, from episode 0 on, in order.
+    """The set of the first episodes, from their entries in order, from episode 0 on.
 
     Raises:
         PlanError: an entry has no optimum; the message names the episodes.
@@ -139,18 +144,4 @@ def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[
         "u": joined("u", 2),
         "failed": np.array([entry["episode"] for entry in failed], np.int64),
         "errors": np.array([entry["error"] for entry in failed], str),
-    }
-
-
-def _entry(index: int, optimum: Optimum) -> Entry:
-    trajectory = optimum.trajectory
-    return {
-        "episode": index,
-        "cost": optimum.cost,
-        "violation": optimum.violation,
-        "solver": optimum.solver,
-        "status": optimum.solver_status,
-        "t": trajectory.t.tolist(),
-        "x": trajectory.x.tolist(),
-        "u": trajectory.u.tolist(),
     }

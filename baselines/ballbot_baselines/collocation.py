@@ -8,8 +8,8 @@
                 bounds on x_0, x_N, leans, forces, step h and free variables q;   x_N = x_0 if periodic
 
 This module writes the problem as a staged `Ocp`, and `ocp.OcpSolver` solves it. The input of a stage is the next knot without
-its position, which follows: nothing else depends on where the ball is. The step h and the free variables q are states that do
-not change.
+its position, which follows from the other components, because the dynamics do not depend on it. The step h and the free
+variables q are states that do not change.
 """
 
 import time
@@ -21,16 +21,15 @@ import casadi
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ballbot_baselines.ocp import ACCEPTABLE, Bounds, Ocp, OcpSolution, OcpSolver, no_final_path
-from ballbot_baselines.optimum import FEASIBLE
+from ballbot_baselines.ocp import ACCEPTABLE, Bounds, Ocp, OcpSolution, OcpSolver, no_path
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
 _UNLIKE = 0.2
-"""Largest share of a guess's changes that its velocities may fail to explain, for the guess to count as a motion. Measured:
-smooth paths and solutions up to 0.09, straight lines 0.54 to 1."""
+"""A guess counts as a motion if its velocities explain all but this share of its changes. Measured: smooth paths and
+solutions leave up to 0.09 unexplained, straight lines 0.54 to 1."""
 _INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation error is measured
 
 
@@ -149,19 +148,14 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
         cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
         equalities=lambda s, w, p: casadi.vertcat(interval(s, w)[1], path(problem.equalities, s)),
         inequalities=lambda s, w, p: inequalities(s),
-        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_final_path,
+        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_path,
         final_inequalities=lambda s, p: inequalities(s),
         initial_matrix=initial,
     )
 
 
 def solve(
-    problem: Problem,
-    params: BallbotParams,
-    guess: Guess,
-    solver: str = "ipopt",
-    tolerance: float = 1e-8,
-    max_iterations: int = 500,
+    problem: Problem, params: BallbotParams, guess: Guess, solver: str = "ipopt", max_iterations: int = 500
 ) -> Plan:
     """Solves a problem from a guess.
 
@@ -175,19 +169,18 @@ def solve(
     n, at = problem.intervals, _Layout(len(problem.free), problem.periodic)
     ocp = hermite_simpson(problem, params)
     bounds = _bounds(problem, ocp, at)
-    _check_bounds(problem, bounds)
     knots = np.column_stack([guess.x, guess.u / params.force_limit])
     start = guess.x[0] if problem.periodic else ()
     constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
     states, inputs = np.hstack([knots, constant]), knots[1:, at.inputs]
-    optimizer = OcpSolver(ocp, n, solver, tolerance, max_iterations)
+    optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
     started = time.perf_counter()
     if not _is_motion(guess):
         states, inputs = optimizer.toward_consistency(states, inputs, _with_given_times(bounds, states, at))
     result = optimizer.solve(states, inputs, bounds)
     seconds = time.perf_counter() - started
     converged = result.success or result.status == ACCEPTABLE
-    if not (converged and result.violation < FEASIBLE):
+    if not (converged and result.is_within_limits):
         raise PlanError(
             f"{problem.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
             f"violated by {result.violation:.1e}. Try another guess or more time."
@@ -222,16 +215,12 @@ def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:
     lower[0, at.h], upper[0, at.h] = problem.step
     for i, (low, high) in enumerate(problem.free):
         lower[0, at.q.start + i], upper[0, at.q.start + i] = low, high
-    return bounds
-
-
-def _check_bounds(problem: Problem, bounds: Bounds) -> None:
-    for knot, i in np.argwhere(bounds.state_lower > bounds.state_upper)[:1]:
-        name = dynamics.STATE[i][0] if i < 8 else "a decision variable"
-        low, high = bounds.state_lower[knot, i], bounds.state_upper[knot, i]
+    for knot, i in np.argwhere(lower > upper)[:1]:
+        name, low, high = dynamics.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
         raise PlanError(
             f"{problem.name}: at knot {knot}, {name} has lower bound {low:g} above its upper bound {high:g}"
         )
+    return bounds
 
 
 def _plan(params: BallbotParams, result: OcpSolution, at: _Layout, seconds: float) -> Plan:

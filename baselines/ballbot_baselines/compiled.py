@@ -7,6 +7,7 @@ results to rounding.
 import logging
 
 import casadi
+import numpy as np
 
 from ballbot_gym import codegen, machine_code
 
@@ -29,7 +30,10 @@ def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
     Raises:
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
-    return _loaded(name, _source(functions), functions, ("-O2",)) or functions
+    generator = casadi.CodeGenerator("stage.c")
+    for function in functions:
+        generator.add(function)
+    return loaded(name, generator.dump(), functions, ("-O2",)) or functions
 
 
 def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.Function, ...]:
@@ -41,14 +45,39 @@ def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
     try:
-        found = _loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, _SIMD)
+        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, _SIMD)
     except NotImplementedError:  # an operation that only CasADi knows as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)
     return found or tuple(function.map(LANES) for function in functions)
 
 
-def _loaded(
+class InPlace:
+    """A function that reads and writes given arrays. A call through `casadi.DM` would take twice as long."""
+
+    def __init__(self, function: casadi.Function, inputs: list[np.ndarray], outputs: list[np.ndarray]):
+        self._buffer = function.buffer()[0]
+        self._inputs, self._outputs = ([array.data for array in arrays] for arrays in (inputs, outputs))
+
+    def __call__(self) -> bool:
+        """Whether it ran without an error."""
+        buffer = self._buffer
+        # HPIPM's interface uses up the pointers it is given (seen in CasADi 3.8.2), so they are given anew.
+        # The type stubs ask for a size, but memory views bring their own.
+        for i, view in enumerate(self._inputs):
+            buffer.set_arg(i, view)  # pyright: ignore[reportCallIssue]
+        for i, view in enumerate(self._outputs):
+            buffer.set_res(i, view)  # pyright: ignore[reportCallIssue]
+        buffer._eval()
+        return buffer.ret() == 0
+
+    @property
+    def solved(self) -> bool:
+        """Whether a solver reports success."""
+        return bool(self._buffer.stats()["success"])
+
+
+def loaded(
     name: str, source: str, functions: tuple[casadi.Function, ...], flags: tuple[str, ...]
 ) -> tuple[casadi.Function, ...] | None:
     """The functions of a library of C code; None where there is none."""
@@ -56,14 +85,6 @@ def _loaded(
         library = machine_code.library(name, source, flags)
         return tuple(casadi.external(function.name(), str(library)) for function in functions)
     except RuntimeError as error:  # it cannot be compiled, or not be loaded
-        reason = str(error)[-300:]
-    if reason:
-        _log.warning("derivatives of %s stay interpreted: %s", name, reason)
+        if str(error):
+            _log.warning("derivatives of %s stay interpreted: %s", name, str(error)[-300:])
     return None
-
-
-def _source(functions: tuple[casadi.Function, ...]) -> str:
-    generator = casadi.CodeGenerator("stage.c")
-    for function in functions:
-        generator.add(function)
-    return generator.dump()

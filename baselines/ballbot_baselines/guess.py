@@ -3,14 +3,8 @@
 import numpy as np
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.paths import cubic
 
 _SMOOTHING = 0.15  # s: shorter turns of a guessed path are rounded off, because the body cannot follow them
-
-
-def straight_line(x0: np.ndarray, x1: np.ndarray, intervals: int) -> np.ndarray:
-    """(intervals+1, 8) the paper's guess: a straight line from state to state, which no motion of the robot follows."""
-    return np.linspace(x0, x1, intervals + 1)
 
 
 def along_path(
@@ -22,7 +16,6 @@ def along_path(
     acceleration. For other paths the solver corrects it.
 
     Args:
-        params: the robot.
         path: (n+1, 2) ball positions, m, one every dt s.
         dt: s.
         start: (8,) the true initial state, put in place of the first guessed one.
@@ -40,11 +33,6 @@ def along_path(
         x[0] = start
     u = np.clip(params.moving_mass * acceleration[:-1], -params.force_limit, params.force_limit)
     return x, u
-
-
-def cubic_hermite(x0: np.ndarray, x1: np.ndarray, duration: float, intervals: int) -> np.ndarray:
-    """(intervals+1, 2) ground path by the cubic through both states' positions and velocities, over duration s."""
-    return cubic(x0[:2], x0[4:6], x1[:2], x1[4:6], intervals, duration / intervals)
 
 
 def resampled(values: np.ndarray, intervals: int) -> np.ndarray:

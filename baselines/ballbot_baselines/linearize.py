@@ -21,7 +21,7 @@ def linearize(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> tuple[np.n
     Returns:
         A: (8, 8) and B: (8, 2), with d(xdot) = A dx + B du. At the origin they are the paper's (5) and (6).
     """
-    a, b = _derivative_jacobians(params)(x, u)
+    a, b = _jacobians(params, None)(x, u)
     return np.array(a), np.array(b)
 
 
@@ -29,7 +29,6 @@ def discretize(params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float) -
     """Linearizes the control step (force held for dt s, RK4) about points of a trajectory.
 
     Args:
-        params: the robot.
         x: (n, 8) states.
         u: (n, 2) forces, N.
         dt: s.
@@ -37,9 +36,8 @@ def discretize(params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float) -
     Returns:
         A: (n, 8, 8) and B: (n, 8, 2), with dx⁺ = A dx + B du.
     """
-    n = len(x)
-    a, b = _step_jacobians(params, dt)(np.asarray(x).T, np.asarray(u).T)
-    return _blocks(a, n), _blocks(b, n)
+    a, b = _jacobians(params, dt)(np.asarray(x).T, np.asarray(u).T)
+    return _blocks(a, len(x)), _blocks(b, len(x))
 
 
 def quadratic_cost(task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,17 +59,12 @@ def goal_weight(task: Task, x: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _derivative_jacobians(params: BallbotParams) -> casadi.Function:
+def _jacobians(params: BallbotParams, dt: float | None) -> casadi.Function:
+    """Of the state after a control step of dt, s; of the state's derivative for None."""
     x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
-    xdot = dynamics.derivative(params, x, u)
-    return casadi.Function("jacobians", [x, u], [casadi.jacobian(xdot, x), casadi.jacobian(xdot, u)])
-
-
-@cache
-def _step_jacobians(params: BallbotParams, dt: float) -> casadi.Function:
-    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
-    after = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
-    outputs = [casadi.densify(casadi.jacobian(after, x)), casadi.densify(casadi.jacobian(after, u))]
+    held = dt is not None
+    out = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt)) if held else dynamics.derivative(params, x, u)
+    outputs = [casadi.densify(casadi.jacobian(out, x)), casadi.densify(casadi.jacobian(out, u))]
     return casadi.Function("jacobians", [x, u], outputs, {"cse": True})
 
 

@@ -1,7 +1,7 @@
 """Linear-quadratic regulators: about an equilibrium, along a trajectory, and around a closed motion.
 
 All use the env's own discretization: force held for control_dt, cost summed over control steps. So near an equilibrium the
-cost of an endless episode is xᵀPx. `continuous_lqr` is the continuous-time limit, as in the paper.
+cost of an endless episode is xᵀPx.
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from ballbot_baselines.linearize import discretize, goal_weight, linearize, quadratic_cost
+from ballbot_baselines.linearize import discretize, goal_weight, quadratic_cost
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Reference, Task
@@ -24,16 +24,6 @@ class Gains:
 
     k: np.ndarray
     p: np.ndarray
-
-
-def continuous_lqr(
-    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """K (2, 8) and P (8, 8) of continuous-time LQR about an equilibrium: ∫cost dt = xᵀPx under u = −Kx."""
-    a, b = linearize(params, x, u)
-    q, r = (weight[0] for weight in quadratic_cost(task, x[None], u[None], c))
-    p = scipy.linalg.solve_continuous_are(a, b, q, r)
-    return np.linalg.solve(r, b.T @ p), p
 
 
 def discrete_lqr(

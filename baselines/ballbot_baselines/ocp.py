@@ -25,33 +25,23 @@ from ballbot_baselines.nlp import Stage, StagedNlp
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
 
+FEASIBLE = 1e-6
+"""Largest constraint violation of a solution, in SI units."""
 SUCCEEDED = "Solve_Succeeded"
 """The status of a solver that met its tolerance."""
 ACCEPTABLE = "Solved_To_Acceptable_Level"
 """The status of ipopt where it stopped early, at its acceptable tolerance."""
 
-_DAMPING = (
-    1e-8  # of the Newton step toward consistency, for constraints that repeat each other or have no free variables
-)
+_DAMPING = 1e-8  # of the Newton step toward consistency: constraints may repeat each other, or have no free variables
 _FAR = 5.0
-"""Largest change of a variable by a Newton step toward consistency, from which a second step follows. Measured on 33 turns
-and stops from straight lines: where the first changes more, a second one saves fatrop a third of its iterations on turns and
-costs it two on stops; where it changes less it saves nothing."""
+"""A second Newton step toward consistency follows where the first changes a variable by at least this much. Measured on 33
+turns and stops from straight lines: there the second saves fatrop a third of its iterations on turns and costs it two on
+stops. After smaller changes it saves nothing."""
 
 
-def no_path(s: casadi.SX, w: casadi.SX, p: casadi.SX) -> casadi.SX:
-    """No constraint at the stages."""
+def no_path(*arguments: casadi.SX) -> casadi.SX:
+    """No constraint."""
     return casadi.SX(0, 1)
-
-
-def no_final_path(s: casadi.SX, p: casadi.SX) -> casadi.SX:
-    """No constraint at the end."""
-    return casadi.SX(0, 1)
-
-
-def no_final_cost(s: casadi.SX, p: casadi.SX) -> casadi.SX:
-    """No cost at the end."""
-    return casadi.SX(0)
 
 
 @dataclass(frozen=True)
@@ -70,11 +60,11 @@ class Ocp:
     """(s, w, p) -> (ne,), each 0."""
     inequalities: StageFunction = no_path
     """(s, w, p) -> (ni,), each ≥ 0."""
-    final_cost: FinalFunction = no_final_cost
+    final_cost: FinalFunction = lambda s, p: casadi.SX(0)
     """(s, p) -> scalar."""
-    final_equalities: FinalFunction = no_final_path
+    final_equalities: FinalFunction = no_path
     """(s, p) -> (me,), each 0."""
-    final_inequalities: FinalFunction = no_final_path
+    final_inequalities: FinalFunction = no_path
     """(s, p) -> (mi,), each ≥ 0."""
     initial_matrix: np.ndarray | None = None
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
@@ -144,6 +134,16 @@ class OcpSolution:
     solver: str
     costates: np.ndarray
 
+    @property
+    def is_within_limits(self) -> bool:
+        """Whether it is within `FEASIBLE` of every constraint, converged or not."""
+        return bool(self.violation < FEASIBLE and np.isfinite(self.cost))
+
+    @property
+    def is_optimal(self) -> bool:
+        """Whether the solver converged to a solution within `FEASIBLE` of every constraint."""
+        return self.success and self.is_within_limits
+
 
 class _Spent(threading.local):
     """Wall time, s, that this thread has spent so far on making solvers, and in them."""
@@ -191,12 +191,11 @@ class OcpSolver:
         of_stage = _equality(ocp.states + stages.equalities, ocp.states + paths)
         of_end = _equality(stages.final_equalities, finals)
         equality = of_stage + [True] * initials + of_stage * (intervals - 1) + of_end
-        self._g_lower = np.zeros(len(equality))
-        self._g_upper = np.where(equality, 0.0, np.inf)
-
+        self._g_lower, self._g_upper = np.zeros(len(equality)), np.where(equality, 0.0, np.inf)
         nlp = StagedNlp(stages.dynamics, stages.running, stages.final, intervals, ocp.params, initial_matrix)
         oracle, derivatives, for_ipopt = nlp.functions()
         options: dict = {"print_time": False, "error_on_fail": False, "calc_lam_p": False, "cache": derivatives}
+        own = {"print_level": 0, "tol": tolerance, "max_iter": max_iterations, "mu_init": barrier}
         if solver == "fatrop":
             options |= {
                 "structure_detection": "manual",
@@ -205,17 +204,10 @@ class OcpSolver:
                 "nu": [ocp.inputs] * intervals + [0],
                 "ng": [paths + initials] + [paths] * (intervals - 1) + [finals],
                 "equality": equality,
-                "fatrop": {"print_level": 0, "tol": tolerance, "max_iter": max_iterations, "mu_init": barrier},
+                "fatrop": own,
             }
         else:
-            options |= for_ipopt
-            options["ipopt"] = {
-                "print_level": 0,
-                "sb": "yes",
-                "tol": tolerance,
-                "max_iter": max_iterations,
-                "mu_init": barrier,
-            }
+            options |= for_ipopt | {"ipopt": own | {"sb": "yes"}}
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
         self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
         spent.setup += time.perf_counter() - began
@@ -273,15 +265,13 @@ class OcpSolver:
     def toward_consistency(
         self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A guess moved by the shortest Newton step toward all equality constraints, and by a second one where that is far.
+        """A guess moved by the shortest Newton step toward all equality constraints; after a large step, by a second one.
 
         Use it for guesses that violate the dynamics, such as a straight line between two states: the step bends them toward
         the nearest motion. Guesses that obey the constraints do not change. A step takes as long as one or two iterations.
 
         Args:
-            states: as `solve` takes them.
-            inputs: as `solve` takes them.
-            p: as `solve` takes them.
+            states, inputs, p: as `solve` takes them.
             bounds: as `solve` takes them; variables with equal bounds do not change.
 
         Returns:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.collocation import Plan
-from ballbot_baselines.paper import EFFORT_WEIGHT, REST_WEIGHT, PaperProblem
+from ballbot_baselines.paper_problems import EFFORT_WEIGHT, REST_WEIGHT, PaperProblem
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams

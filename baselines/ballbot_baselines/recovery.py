@@ -20,7 +20,7 @@ import numpy as np
 
 from ballbot_baselines import guess, righting
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
-from ballbot_baselines.optimum import Backoff, shooting_ocp, shooting_parameters
+from ballbot_baselines.shooting import Backoff, shooting_ocp, shooting_parameters
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
@@ -39,7 +39,6 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
 
     Args:
         task: without constants and with a goal at its end, as Stabilize.
-        params: the robot.
         component: index of a state component other than γ.
         values: (n,) ascending, in the component's SI unit.
 

@@ -1,8 +1,8 @@
-"""A second guess for optimizers: feedback under which the robot rights itself, simulated.
+"""Guesses for optimizers: simulated episodes in which feedback brings the robot upright.
 
 Where a guessed path asks for leans and forces that the robot cannot have, optimizers do not converge. These guesses obey the
-dynamics and the force limit, because they are simulated. A cascade steers the ball to a point by its lean, and the lean by
-the force, which is clipped. A family of gains runs at once.
+dynamics and the force limit, because they are simulated. The feedback is a cascade: the lean steers the ball to a point, and
+the clipped force steers the lean. A family of gains is simulated at once.
 
 The force limit is a square: along its diagonal there is √2 times the force of an axis. So a robot that falls along an axis
 recovers more cheaply, and from farther, if it also leans to the side. The episode that stays in the vertical plane of such a
@@ -48,27 +48,21 @@ class Member:
 def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, force: float) -> list[Member]:
     """The cheapest member for each side of the fall that rights the robot without violating a margin, if there is one.
 
-    Args:
-        task: gives cost, margins and the point to go to.
-        params: the robot.
-        x0: (8,) initial state.
-        c: (nc,) constants.
-        force: largest force per axis, N.
+    From state x0 (8,), with constants c (nc,) and at most this force per axis, N.
     """
-    family = [(0.0, 0.3), *((sign * lean, fade) for lean in _SIDEWAYS for fade in _FADES for sign in (-1, 1))]
-    members = [
-        (bandwidth, seconds, lean, fade)
-        for bandwidth, seconds, (lean, fade) in itertools.product(_LEAN_BANDWIDTHS, _TIME_CONSTANTS, family)
-    ]
-    gains = np.array(members).T
+    aside = [(0.0, 0.3), *((sign * lean, fade) for lean in _SIDEWAYS for fade in _FADES for sign in (-1, 1))]
+    gains = np.array([(*loops, *a) for *loops, a in itertools.product(_LEAN_BANDWIDTHS, _TIME_CONSTANTS, aside)]).T
+    target = task.reference(x0, c, params).x[-1, :2] if _has_point(task, x0, c, params) else np.array(x0[:2])
     with np.errstate(all="ignore"):  # members that fall may overflow, and are left out
         if params.grips:
             force = min(force, _GRIPPING * params.friction * params.weight)
-        x, u = simulate(params, x0, gains, _target(task, x0, c, params), task.steps, task.control_dt, force)
-        margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in _margins(task, x, c)], axis=0)
+        x, u = simulate(params, x0, gains, target, task.steps, task.control_dt, force)
+        margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in task.margins(x, c)], axis=0)
         safe = np.logical_and.accumulate(margins >= 0, axis=0)
         if params.grips:
-            safe[1:] &= np.logical_and.accumulate(_gripping(params, x[:-1], u, task.control_dt), axis=0)
+            limits = dynamics.limits(params, x[:-1], u, hold=task.control_dt)
+            gripping = np.logical_and.reduce([limit >= 0 for limit in limits])
+            safe[1:] &= np.logical_and.accumulate(gripping, axis=0)
         costs = np.asarray(task.cost(x[:-1], u, c))
         upright = (np.abs(x[..., 2:4]).max(-1) < _UPRIGHT) & (np.abs(x[..., 6:8]).max(-1) < _STEADY) & safe
     found = []
@@ -78,18 +72,17 @@ def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, fo
         totals = [(not safe[-1, i], costs[:, i].sum() * task.control_dt, i) for i in mine]
         if totals:
             _, cost, i = min(totals)
-            last = len(u) if safe[-1, i] else int(np.argmax(upright[:, i]))
-            found.append(
-                Member(side, x[: last + 1, i], u[:last, i], float(cost), righted=int(np.argmax(upright[:, i])))
-            )
+            first_upright = int(np.argmax(upright[:, i]))
+            last = len(u) if safe[-1, i] else first_upright
+            found.append(Member(side, x[: last + 1, i], u[:last, i], float(cost), first_upright))
     return found
 
 
 def guesses(task: Task, params: BallbotParams, member: Member, c: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """States (n+1, 8) and forces (n, 2) to start from.
+    """At most one pair of states (n+1, 8) and forces (n, 2) to start from.
 
-    They are the member itself where it is a whole episode to the task's point of rest. Else they are its righting, followed
-    by the first of the task's guessed paths from there.
+    It is the member itself where that is a whole episode to the task's point of rest. Otherwise it is the member until it is
+    upright, followed by the first of the task's guessed paths from there.
     """
     if len(member.u) == task.steps and _has_point(task, member.x[0], c, params):
         return [(member.x, member.u)]
@@ -102,18 +95,11 @@ def guesses(task: Task, params: BallbotParams, member: Member, c: np.ndarray) ->
 
 
 def simulate(
-    params: BallbotParams,
-    x0: np.ndarray,
-    gains: np.ndarray,
-    target: np.ndarray,
-    steps: int,
-    dt: float,
-    force: float,
+    params: BallbotParams, x0: np.ndarray, gains: np.ndarray, target: np.ndarray, steps: int, dt: float, force: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Runs members of the family.
 
     Args:
-        params: the robot.
         x0: (8,) or (n, 8) initial state.
         gains: (4, n) of each member: the bandwidth of the lean's loop, rad/s; the time constant of the ball's loop, s; how
             far it leans to the left of the fall at first, rad; and the time in which that fades, s.
@@ -130,9 +116,8 @@ def simulate(
     x = np.array(np.broadcast_to(np.asarray(x0, np.float64), (gains.shape[1], 8)))
     states, forces = [x], []
     for k in range(steps):
-        u = np.stack(
-            steering(params, tuple(x.T), aside * np.exp(-k * dt / fade), bandwidth, seconds, target, force), -1
-        )
+        leaning = aside * np.exp(-k * dt / fade)
+        u = np.stack(steering(params, tuple(x.T), leaning, bandwidth, seconds, target, force), -1)
         forces.append(u)
         x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
         states.append(x)
@@ -154,7 +139,6 @@ def steering(
     """The cascade's force (Fx, Fy), N, for floats, arrays and tensors: components of one shape.
 
     Args:
-        params: the robot.
         x: 8 components of the state.
         aside: 2 components of what is added to the leans that the ball's loop asks for, rad.
         bandwidth: of the lean's loop, rad/s.
@@ -177,19 +161,6 @@ def steering(
     return tuple(forces)
 
 
-def _gripping(params: BallbotParams, x: np.ndarray, u: np.ndarray, hold: float) -> np.ndarray:
-    """(n, k) whether members grip in each step."""
-    return np.logical_and.reduce([limit >= 0 for limit in dynamics.limits(params, x, u, hold=hold)])
-
-
 def _has_point(task: Task, x0: np.ndarray, c: np.ndarray, params: BallbotParams) -> bool:
+    """Whether the task ends at a point of rest."""
     return not task.first_exit and len(task.reference(x0, c, params).x) == 1
-
-
-def _target(task: Task, x0: np.ndarray, c: np.ndarray, params: BallbotParams) -> np.ndarray:
-    """(2,) where to steer the ball: the task's point of rest, if it has one; else where the ball is."""
-    return task.reference(x0, c, params).x[-1, :2] if _has_point(task, x0, c, params) else np.array(x0[:2])
-
-
-def _margins(task: Task, x: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, ...]:
-    return tuple(np.asarray(margin) for margin in task.margins(x, c))

@@ -1,17 +1,16 @@
 """What every choice of sides in a slalom will cost, predicted without solving it.
 
-Across the way, the robot is nearly linear and moves nearly on its own: the sides hardly change how it moves along the way. So
-the times at which it passes the obstacles are taken from one solution, such as that of the slalom without its obstacles. The
-rest is a small quadratic program: the linear motion across the way of least cost that clears every obstacle on its side at
-that time.
+Across the way, the robot is nearly linear, and the sides hardly change how it moves along the way. So the times at which it
+passes the obstacles are taken from one solution, such as that of the slalom without its obstacles. A small quadratic program
+then finds the cheapest linear motion across the way that is on the right side of every obstacle at these times.
 
 Without obstacles the optimal force is LQR's, u = −K y. Forces v added to it cost Σ s·v², with s = R + BᵀPB, and move the
 position by the impulse response g of the closed loop. So the cheapest way to move by d at the times t costs dᵀ k(t, t)⁻¹ d,
 with the kernel k(t, t') = Σ_r g(t − r) g(t' − r) / s. The program over d is solved for all choices at once, active set by
 active set.
 
-The prediction is no bound. Measured on 350 drawn slaloms, all of whose choices were solved: from the motion without
-obstacles, the best choice, or one that costs at most 0.1 % more, is predicted within 0.7 % of the first.
+The prediction is no bound. It was measured on 350 random slaloms, with every choice solved. Each time the best choice, or one
+that costs at most 0.1 % more, had a predicted cost at most 0.7 % above the lowest.
 """
 
 import itertools
@@ -51,24 +50,18 @@ def predict(
     """Predicts every choice of sides.
 
     Args:
-        task: the slalom.
-        params: the robot.
-        x0: (8,) initial state.
-        c: (nc,) constants.
+        task, params: the slalom and the robot.
+        x0, c: (8,) initial state and (nc,) constants.
         path: (steps+1, 2) ground positions of one solution, m.
         obstacles: (n, 3) as `Task.passed_obstacles` gives.
     """
     goal_y = task.reference(x0, c, params).x[-1, 1]
     model = _model(task, params)
     passed = np.array([int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]])
-    responses = model.responses[passed]
-    kernel = responses @ responses.T + _REGULARIZATION * np.eye(len(passed))
     free = goal_y + model.free @ (np.asarray(x0)[_ACROSS] - [goal_y, 0, 0, 0])
+    (prices,), (costs,) = _priced(model, passed[None], obstacles[None, :, 1:], free[passed][None])
     sides = choices(len(passed))
-    wanted = obstacles[:, 1] + sides * obstacles[:, 2]
-    prices = _prices(kernel * sides[:, :, None] * sides[:, None, :], sides * (wanted - free[passed]))
-    costs = np.einsum("ni,ij,nj->n", sides * prices, kernel, sides * prices)
-    return Prediction(sides, costs, free + (sides * prices) @ responses @ model.responses.T)
+    return Prediction(sides, costs, free + (sides * prices) @ model.responses[passed] @ model.responses.T)
 
 
 def choices(obstacles: int) -> np.ndarray:
@@ -82,8 +75,7 @@ def predict_costs(
     """What every choice of sides costs more than the motion without obstacles, of many slaloms at once.
 
     Args:
-        task: the slalom.
-        params: the robot.
+        task, params: the slalom and the robot.
         across: (B, 4) y relative to the goal, θ, ẏ and θ̇ at the start.
         obstacles: (B, n, 2) y relative to the goal, and how near the ball's centre may come, m.
         passed: (B, n) control steps at which the robot passes them.
@@ -91,15 +83,8 @@ def predict_costs(
     Returns:
         (B, 2^n), in the order of `choices`.
     """
-    model, sides = _model(task, params), choices(passed.shape[1])
-    responses = model.responses[passed]
-    kernels = np.einsum("bik,bjk->bij", responses, responses) + _REGULARIZATION * np.eye(passed.shape[1])
-    free = np.einsum("bnk,bk->bn", model.free[passed], across)
-    least = sides * (obstacles[:, None, :, 0] + sides * obstacles[:, None, :, 1] - free[:, None])
-    matrices = kernels[:, None] * sides[:, :, None] * sides[:, None, :]
-    shape = (-1, passed.shape[1])
-    prices = _prices(matrices.reshape(*shape, passed.shape[1]), least.reshape(shape)).reshape(least.shape)
-    return np.einsum("bsi,bsij,bsj->bs", prices, matrices, prices)
+    model = _model(task, params)
+    return _priced(model, passed, obstacles, np.einsum("bnk,bk->bn", model.free[passed], across))[1]
 
 
 @dataclass(frozen=True)
@@ -129,6 +114,26 @@ def _model(task: Task, params: BallbotParams) -> _Model:
     impulse = np.array([0.0, *((power @ b)[0, 0] for power in powers[:-1])])
     responses = scipy.linalg.toeplitz(impulse, np.zeros(task.steps))
     return _Model(np.array([power[0] for power in powers]), responses / np.sqrt(price[0, 0]))
+
+
+def _priced(
+    model: _Model, passed: np.ndarray, obstacles: np.ndarray, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The multipliers (B, 2^n, n) and the costs (B, 2^n) of every choice of sides, of many slaloms.
+
+    Args:
+        model: of the motion across the way.
+        passed: (B, n) control steps at which obstacles are passed.
+        obstacles: (B, n, 2) y, and how near the ball's centre may come, m.
+        free: (B, n) y without obstacles at these steps, m.
+    """
+    n = passed.shape[1]
+    sides, responses = choices(n), model.responses[passed]
+    kernels = responses @ responses.transpose(0, 2, 1) + _REGULARIZATION * np.eye(n)
+    least = sides * (obstacles[:, None, :, 0] + sides * obstacles[:, None, :, 1] - free[:, None])
+    matrices = kernels[:, None] * sides[:, :, None] * sides[:, None, :]
+    prices = _prices(matrices.reshape(-1, n, n), least.reshape(-1, n)).reshape(least.shape)
+    return prices, np.einsum("bsi,bsij,bsj->bs", prices, matrices, prices)
 
 
 def _prices(matrices: np.ndarray, least: np.ndarray) -> np.ndarray:

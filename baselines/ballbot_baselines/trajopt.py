@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ballbot_baselines.optimum import Backoff, Optimum, plan_to_track
+from ballbot_baselines.optimum import Optimum, plan_to_track
+from ballbot_baselines.shooting import Backoff
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task

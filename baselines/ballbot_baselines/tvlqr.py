@@ -29,18 +29,15 @@ class TvlqrController:
         """Computes the gains.
 
         Args:
-            params: the robot.
             trajectory: what to track.
             dt: s, the control step.
             q, r: (8, 8) and (2, 2) weights of a control step, or (n, …) one for each of the trajectory's n steps.
             p_final: (8, 8) cost-to-go at the end.
             end_gain: (2, 8) for what comes after the end; default, the last of the trajectory's.
         """
-        times = sample_times(trajectory, dt)
-        self.x = np.array([trajectory.state(t) for t in times])
-        self.u = np.array([_step_force(trajectory, t, dt) for t in times])
+        self.x, self.u = _sampled(trajectory, dt)
         a, b = discretize(params, self.x, self.u, dt)
-        n = len(times)
+        n = len(self.x)
         self.gains = riccati(a, b, np.broadcast_to(q, (n, 8, 8)), np.broadcast_to(r, (n, 2, 2)), p_final)
         self._end, self._end_gain = trajectory.x[-1], self.gains.k[-1] if end_gain is None else end_gain
         self._dt, self._start = dt, 0.0
@@ -51,9 +48,7 @@ class TvlqrController:
     ) -> "TvlqrController":
         """With weights from the task's own cost; c (nc,) are the constants the trajectory was planned for."""
         c, dt, end = np.asarray(c, np.float64), task.control_dt, trajectory.x[-1]
-        times = sample_times(trajectory, dt)
-        x = np.array([trajectory.state(t) for t in times])
-        q, r = quadratic_cost(task, x, np.array([trajectory.force(t) for t in times]), c)
+        q, r = quadratic_cost(task, *_sampled(trajectory, dt), c)
         rest = is_equilibrium(params, end, np.zeros(2))
         end_gain = discrete_lqr(task, params, end, np.zeros(2), c)[0] if rest else None
         return cls(params, trajectory, dt, q * dt, r * dt, final_weight(task, params, end, c), end_gain)
@@ -81,11 +76,11 @@ class TvlqrController:
         return -self._end_gain @ (x - self._end)
 
 
-def sample_times(trajectory: Trajectory, dt: float) -> np.ndarray:
-    """The starts, s, of the control steps that make up a trajectory."""
-    return trajectory.t[0] + dt * np.arange(max(1, round(trajectory.duration / dt)))
+def _sampled(trajectory: Trajectory, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 8) at the starts of a trajectory's control steps, and the forces (n, 2) to hold over them.
 
-
-def _step_force(trajectory: Trajectory, t: float, dt: float) -> np.ndarray:
-    """The force to hold over a control step for one that may vary within it: its value at mid-step."""
-    return trajectory.force(t) if trajectory.held else trajectory.force(t + 0.5 * dt)
+    A force that varies within a step is represented by its value at mid-step.
+    """
+    times = trajectory.t[0] + dt * np.arange(max(1, round(trajectory.duration / dt)))
+    middle = 0.0 if trajectory.held else 0.5 * dt
+    return np.array([trajectory.state(t) for t in times]), np.array([trajectory.force(t + middle) for t in times])

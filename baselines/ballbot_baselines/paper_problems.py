@@ -6,14 +6,16 @@ time step, costs summed over knots and not multiplied by the step, and a final-t
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from ballbot_baselines import guess as guesses
 from ballbot_baselines.collocation import Guess, Plan, Problem, solve
+from ballbot_baselines.guess import along_path
 from ballbot_gym import ops
 from ballbot_gym.ops import squared
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.paths import cubic
 from ballbot_gym.tasks.orbit import steady_orbit
 
 DISTANCE_WEIGHT = 1.0  # Q0, of the squared ground distance from the destination
@@ -31,7 +33,6 @@ WEAVE_INTERVALS = 80  # obstacles bind at knots only: with 40 the path cuts 3 cm
 class PaperProblem:
     """One of the paper's experiments: the problem, the guess it is solved from, and the figure it is in."""
 
-    name: str
     title: str
     figure: str
     problem: Problem
@@ -56,7 +57,6 @@ def between_states(
     intervals: int = INTERVALS,
 ) -> Problem:
     """The paper's optimizations 1 and, with obstacles, 3: from state x0 to state x1, (8,) each."""
-    steps = intervals
 
     def cost(x: ops.Vector, u: ops.Vector, h: float, q: ops.Vector) -> float:
         px, py, *rest = ops.components(x)
@@ -64,7 +64,7 @@ def between_states(
             DISTANCE_WEIGHT * squared(px - x1[0], py - x1[1])
             + REST_WEIGHT * squared(*rest)
             + EFFORT_WEIGHT * squared(*ops.components(u))
-            + TIME_WEIGHT * h * steps
+            + TIME_WEIGHT * h * intervals
         )
 
     def clearances(x: ops.Vector, u: ops.Vector, q: ops.Vector) -> tuple:
@@ -94,9 +94,9 @@ def circular_orbit(name: str, speed: float, intervals: int = INTERVALS) -> Probl
         px, py, _, _, vx, vy, _, _ = ops.components(x)
         return squared(px, py) - squared(*ops.components(q)), squared(vx, vy) - speed**2
 
-    lower, upper = np.full(8, -np.inf), np.full(8, np.inf)
-    lower[0] = upper[0] = lower[1] = 0.0
     everywhere = np.full(8, np.inf)
+    lower, upper = -everywhere, everywhere.copy()
+    lower[0] = upper[0] = lower[1] = 0.0
     return Problem(
         name=name,
         cost=cost,
@@ -110,52 +110,44 @@ def circular_orbit(name: str, speed: float, intervals: int = INTERVALS) -> Probl
     )
 
 
-def hermite_guess(x0: np.ndarray, x1: np.ndarray, duration: float) -> Callable[[BallbotParams], Guess]:
-    """A smooth guess: a cubic ground path, the leans that balance its accelerations, and zero forces."""
-
-    def make(params: BallbotParams) -> Guess:
-        h = duration / INTERVALS
-        x, _ = guesses.along_path(params, guesses.cubic_hermite(x0, x1, duration, INTERVALS), h)
-        x[0], x[-1] = x0, x1
-        return Guess(x, np.zeros((INTERVALS + 1, 2)), h)
-
-    return make
+def hermite_guess(
+    params: BallbotParams, x0: np.ndarray, x1: np.ndarray, duration: float, intervals: int = INTERVALS
+) -> Guess:
+    """A smooth guess: a cubic ground path, the leans that balance its accelerations, and zero forces; duration in s."""
+    path = cubic(x0[:2], x0[4:6], x1[:2], x1[4:6], intervals, duration / intervals)
+    return _along(params, path, x0, x1, duration)
 
 
-def straight_guess(x0: np.ndarray, x1: np.ndarray, duration: float) -> Callable[[BallbotParams], Guess]:
-    """The paper's guess: a straight line from state to state."""
-    return lambda params: Guess(
-        guesses.straight_line(x0, x1, INTERVALS), np.zeros((INTERVALS + 1, 2)), duration / INTERVALS
-    )
+def straight_guess(params: BallbotParams, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
+    """The paper's guess: a straight line from state to state, which no motion of the robot follows; duration in s."""
+    return Guess(np.linspace(x0, x1, INTERVALS + 1), np.zeros((INTERVALS + 1, 2)), duration / INTERVALS)
 
 
-def _orbit_guess(speed: float, radius: float) -> Callable[[BallbotParams], Guess]:
-    def make(params: BallbotParams) -> Guess:
-        bearings = np.pi / 2 + np.linspace(0, 2 * np.pi, INTERVALS + 1)
-        x, u = steady_orbit(params, radius, speed, bearings)
-        return Guess(x, u, 2 * np.pi * radius / speed / INTERVALS, (radius,))
+def _along(params: BallbotParams, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
+    """Zero forces, and states along a ground path (intervals+1, 2), m, from x0 to x1."""
+    h = duration / (len(path) - 1)
+    x, _ = along_path(params, path, h)
+    x[0], x[-1] = x0, x1
+    return Guess(x, np.zeros((len(path), 2)), h)
 
-    return make
+
+def _orbit_guess(params: BallbotParams, speed: float, radius: float) -> Guess:
+    bearings = np.pi / 2 + np.linspace(0, 2 * np.pi, INTERVALS + 1)
+    x, u = steady_orbit(params, radius, speed, bearings)
+    return Guess(x, u, 2 * np.pi * radius / speed / INTERVALS, (radius,))
 
 
 def _weave_guess(
-    x0: np.ndarray, x1: np.ndarray, via: tuple[tuple[float, float], ...], duration: float
-) -> Callable[[BallbotParams], Guess]:
+    params: BallbotParams, x0: np.ndarray, x1: np.ndarray, via: tuple[tuple[float, float], ...], duration: float
+) -> Guess:
     """A spline that passes each obstacle on a chosen side, leans from its accelerations, zero forces."""
+    from scipy.interpolate import CubicSpline
 
-    def make(params: BallbotParams) -> Guess:
-        from scipy.interpolate import CubicSpline
-
-        h = duration / WEAVE_INTERVALS
-        points = np.array([x0[:2], *via, x1[:2]])
-        s = np.linspace(0, 1, WEAVE_INTERVALS + 1)
-        along = s**3 * (10 - 15 * s + 6 * s**2)
-        spline = CubicSpline((points[:, 0] - points[0, 0]) / np.ptp(points[:, 0]), points)
-        x, _ = guesses.along_path(params, spline(along), h)
-        x[0], x[-1] = x0, x1
-        return Guess(x, np.zeros((WEAVE_INTERVALS + 1, 2)), h)
-
-    return make
+    points = np.array([x0[:2], *via, x1[:2]])
+    s = np.linspace(0, 1, WEAVE_INTERVALS + 1)
+    along = s**3 * (10 - 15 * s + 6 * s**2)
+    spline = CubicSpline((points[:, 0] - points[0, 0]) / np.ptp(points[:, 0]), points)
+    return _along(params, spline(along), x0, x1, duration)
 
 
 def state(x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0) -> np.ndarray:
@@ -163,36 +155,27 @@ def state(x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0) -> n
     return np.array([x, y, 0.0, 0.0, vx, vy, 0.0, 0.0])
 
 
+def _point_to_point(
+    name: str, title: str, figure: str, x0: np.ndarray, x1: np.ndarray, duration: float
+) -> PaperProblem:
+    guess = partial(hermite_guess, x0=x0, x1=x1, duration=duration)
+    return PaperProblem(title, figure, between_states(name, x0, x1), guess)
+
+
 def _stabilization(speed: float, figure: str, duration: float) -> PaperProblem:
-    x0 = state(x=-1.0, vy=speed)
-    return PaperProblem(
-        name=f"stabilize-{speed:g}",
-        title=f"Stabilization from x = −1 m, ẏ = {speed:g} m/s",
-        figure=figure,
-        problem=between_states(f"stabilize-{speed:g}", x0, state()),
-        guess=hermite_guess(x0, state(), duration),
-    )
+    title = f"Stabilization from x = −1 m, ẏ = {speed:g} m/s"
+    return _point_to_point(f"stabilize-{speed:g}", title, figure, state(x=-1.0, vy=speed), state(), duration)
 
 
 def _turn(speed: float, figure: str, duration: float) -> PaperProblem:
     x0, x1 = state(y=-1.0, vy=speed), state(x=1.0, vx=speed)
-    return PaperProblem(
-        name=f"turn-{speed:g}",
-        title=f"90° turn at {speed:g} m/s",
-        figure=figure,
-        problem=between_states(f"turn-{speed:g}", x0, x1),
-        guess=hermite_guess(x0, x1, duration),
-    )
+    return _point_to_point(f"turn-{speed:g}", f"90° turn at {speed:g} m/s", figure, x0, x1, duration)
 
 
 def _orbit(speed: float, figure: str, radius: float) -> PaperProblem:
-    return PaperProblem(
-        name=f"orbit-{speed:g}",
-        title=f"Circular orbit at {speed:g} m/s",
-        figure=figure,
-        problem=circular_orbit(f"orbit-{speed:g}", speed),
-        guess=_orbit_guess(speed, radius),
-    )
+    problem = circular_orbit(f"orbit-{speed:g}", speed)
+    guess = partial(_orbit_guess, speed=speed, radius=radius)
+    return PaperProblem(f"Circular orbit at {speed:g} m/s", figure, problem, guess)
 
 
 def _weave(figure: str) -> PaperProblem:
@@ -200,17 +183,16 @@ def _weave(figure: str) -> PaperProblem:
     obstacles = ((1.5, 0.25, 0.6), (3.0, -0.25, 0.6), (4.5, 0.25, 0.6))
     via = tuple((x, y - np.sign(y) * (distance + 0.1)) for x, y, distance in obstacles)
     return PaperProblem(
-        name="weave",
         title="Weave through three obstacles",
         figure=figure,
         problem=between_states("weave", x0, x1, obstacles, WEAVE_INTERVALS),
-        guess=_weave_guess(x0, x1, via, 3.0),
+        guess=partial(_weave_guess, x0=x0, x1=x1, via=via, duration=3.0),
         obstacles=obstacles,
     )
 
 
 PAPER_PROBLEMS: dict[str, PaperProblem] = {
-    entry.name: entry
+    entry.problem.name: entry
     for entry in (
         _stabilization(1, "Fig. 2", 2.0),
         _stabilization(5, "Fig. 3", 3.0),

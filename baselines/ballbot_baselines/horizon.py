@@ -1,0 +1,312 @@
+"""The horizon of model predictive control: its grid in time, and the quadratic program of one iteration.
+
+The horizon's intervals are whole numbers of control steps. The first is one step, because the env holds its force that long.
+Where there are more control steps than nodes, the later intervals hold theirs longer.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache, partial
+
+import casadi
+import numpy as np
+
+from ballbot_baselines.compiled import LANES, InPlace, in_lanes
+from ballbot_baselines.disturbance import DisturbanceEstimator
+from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+_SLACK_PRICE = 100.0  # per unit of violation of a margin at a node: more than any violation saves
+_SLACK_CURVATURE = 100.0  # keeps the program strictly convex, and HPIPM at few iterations
+_MARGINS = 2  # considered per node: the least ones. The others are far from violated, and each costs time
+_GRIP_UNIT = 0.1  # of `dynamics.limits`; this much costs as much as a unit of a margin
+_LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of length 0 has no cost
+_RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
+_QP_ITERATIONS = 30
+
+# Variables of an inner stage: changes of the state and of the input, and the slack of margins and grip.
+_X, _A, _SLACK, _VARIABLES = slice(0, 8), slice(8, 10), 10, 11
+# Its Hessian, one dense block after the other: of the state (8, 8), of the input (2, 2), of the slack.
+_Q, _R, _OF_SLACK, _HESSIAN = slice(0, 64), slice(64, 68), 68, 69
+# Its constraints: the gap to the next state, then the margins, then the limits of the robot's grip.
+_GAP, _LIMITS = slice(0, 8), slice(8, None)
+# Column of a state in the constraints' matrix: −1 in the gap of the stage before, the slopes of the next state, and the
+# slopes of the margins and of the grip.
+_BEFORE, _NEXT, _SLOPES = 0, slice(1, 9), slice(9, None)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The horizon in control steps: node j lies `offsets[j]` after now, (N+1,); interval j is `lengths[j]` long, (N,)."""
+
+    lengths: np.ndarray
+    offsets: np.ndarray
+
+    @classmethod
+    def make(cls, steps: int, nodes: int) -> "Grid":
+        """`nodes` intervals over a number of control steps: the first one step, the rest as equal as can be.
+
+        Raises:
+            ValueError: fewer than 2 nodes, or fewer control steps than nodes.
+        """
+        if not 2 <= nodes <= steps:
+            raise ValueError(f"a horizon of {steps} control steps takes 2 to {steps} nodes, not {nodes}")
+        base, longer = divmod(steps - 1, nodes - 1)
+        lengths = np.array([1] + [base] * (nodes - 1 - longer) + [base + 1] * longer)
+        return cls(lengths, np.concatenate([[0], np.cumsum(lengths)]))
+
+    def shift_states(self) -> np.ndarray:
+        """(N+1, N+1) takes values at the nodes to the values one control step later, linear between, constant beyond."""
+        return np.array([np.interp(self.offsets + 1, self.offsets, unit) for unit in np.eye(len(self.offsets))]).T
+
+    def shift_inputs(self) -> np.ndarray:
+        """(N, N) takes values held over the intervals to their means one control step later; beyond the end they are 0."""
+        held = np.repeat(np.eye(len(self.lengths)), self.lengths, axis=0)  # (steps, N)
+        later = np.vstack([held[1:], np.zeros((1, len(self.lengths)))])
+        return np.add.reduceat(later, self.offsets[:-1], axis=0) / self.lengths[:, None]
+
+
+class _Stages:
+    """An array of the solver; parts of it belong to the first stage, to the inner stages (count, width), and to the last."""
+
+    def __init__(self, first: int, count: int, width: int, last: int, value: float = 0.0):
+        end = first + count * width
+        self.all = np.full(end + last, value)
+        self.first, self.last = self.all[:first], self.all[end:]
+        self.inner = self.all[first:end].reshape(count, width)
+
+
+class HorizonQp:
+    """The quadratic program of one iteration, for N intervals; arrays are allocated once and filled in place.
+
+    Variables are changes δa_0, δx_1, δa_1, s_1, … δx_N: x_0 is known and no variable, inputs a are fractions of the force
+    limit. (Changes, because HPIPM starts from 0.) Constraints of stage j are its dynamics, then its margins, then the limits
+    of the robot's grip, if it has any; then there is an s_0 too. The last stage has no margins, because CasADi's interface
+    allows no slack there.
+
+    | attribute | shape | meaning |
+    |---|---|---|
+    | `x`, `a` | (N+1, 8), (N+1, 2) | where to linearize, and after `iterate` the solution; the last input is unused |
+    | `h`, `c` | (N+1,), (N+1, nc) | length of each interval, s, and the episode's constants |
+    | `reserve` | (N+1,) | of normal force, as a fraction of the weight, where the robot's grip is limited |
+    | `distinct` | (m,) | indices of the task's margins that are considered |
+    | `disturbance` | | what is added to the model; None for nothing |
+    | `curvature` | (N,) | of the friction cone in the inputs, by the multipliers of the last program; 0 before the first |
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, nodes: int):
+        """Differentiates the stage and builds the solver; compiles on first use on a machine."""
+        count = len(task.margins((0.0,) * 8, (1.0,) * len(task.constant_names)))
+        self.distinct = np.arange(count)
+        self.disturbance: DisturbanceEstimator | None = None
+        self.curvature = np.zeros(nodes)
+        grips = len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0)))
+        # of the cone in an input, per multiplier
+        self._cone_curvature = 2 * (params.force_limit / (params.friction * params.weight)) ** 2 / _GRIP_UNIT
+        self._margins = min(count, _MARGINS)
+        self._make_stage(task, params, nodes, count, grips)
+        self._make_program(nodes, self._margins, grips)
+
+    def _make_stage(self, task: Task, params: BallbotParams, n: int, m: int, grips: int) -> None:
+        blocks = -(-n // LANES)  # of intervals; the last one is filled up with zeros
+        computed = slice(0, blocks * LANES)
+
+        def rows(*shape: int) -> np.ndarray:
+            return np.zeros((max(n + 1, computed.stop), *shape))
+
+        inputs = [rows(8), rows(2), rows(), rows(len(task.constant_names)), *([rows()] if grips else [])]
+        outputs = [rows(8), rows(10, 8), rows(10), rows(m), rows(8, m)]
+        outputs += [rows(grips), rows(10, grips)] if grips else []
+        self._stage = InPlace(
+            _stage_function(task, params).map(blocks),
+            [array[computed] for array in inputs],
+            [array[computed] for array in outputs],
+        )
+        self.x, self.a, self.h, self.c, *reserve = (array[: n + 1] for array in inputs)
+        self.reserve = reserve[0] if grips else np.zeros(n + 1)
+        self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian, *grip = (
+            array[: n + 1] for array in outputs
+        )
+        self._grip, self._grip_jacobian = grip if grips else (np.zeros((n + 1, 0)), np.zeros((n + 1, 10, 0)))
+
+    def _make_program(self, n: int, m: int, grips: int) -> None:
+        rows, slack = m + grips, int(grips > 0)  # of the first stage, if there is a grip
+        variables = partial(_Stages, 2 + slack, n - 1, _VARIABLES, 8)
+        constraints = partial(_Stages, 8 + grips, n - 1, 8 + rows, 0)
+        of_states, of_inputs = 8 * (9 + rows), 2 * (8 + grips)  # entries of the constraints' matrix
+        a = _Stages(of_inputs + grips, n - 1, of_states + of_inputs + rows, 8)
+        self._h, self._g, self._z = _Stages(4 + slack, n - 1, _HESSIAN, 64), variables(), variables()
+        self._low, self._high = constraints(), constraints()
+        self._lower, self._upper = variables(-np.inf), variables(np.inf)
+        self._cost, multipliers = np.zeros(1), constraints()
+        self._grip_multipliers = multipliers.first[8:], multipliers.inner[:, 8 + m :]  # of the last program, ≤ 0
+        self._program = InPlace(
+            _solver(n, m, grips),
+            # HPIPM's interface reads every input and writes every output, so all have an array.
+            [
+                *(array.all for array in (self._h, self._g, a, self._low, self._high, self._lower, self._upper)),
+                *(array.all for array in (variables(), variables(), constraints())),
+            ],
+            [self._z.all, self._cost, multipliers.all, variables().all],
+        )
+        self._a0 = a.first[:of_inputs].reshape(2, 8 + grips)
+        self._a_x = a.inner[:, :of_states].reshape(n - 1, 8, 9 + rows)
+        self._a_u = a.inner[:, of_states : of_states + of_inputs].reshape(n - 1, 2, 8 + grips)
+        # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
+        self._a_x[:, :, _BEFORE], a.last[:] = -1.0, -1.0
+        a.first[of_inputs:], a.inner[:, of_states + of_inputs :] = 1.0, 1.0
+        self._lower.first[2:], self._lower.inner[:, _SLACK] = 0.0, 0.0
+        self._h.first[4:], self._h.inner[:, _OF_SLACK] = _SLACK_CURVATURE, _SLACK_CURVATURE
+        self._g.first[2:], self._g.inner[:, _SLACK] = _SLACK_PRICE, _SLACK_PRICE
+        self._high.first[_LIMITS], self._high.inner[:, _LIMITS] = np.inf, np.inf
+
+    def set_weights(self, q: np.ndarray, r: np.ndarray, p: np.ndarray, slope: np.ndarray, target: np.ndarray) -> None:
+        """Sets the Hessian and the cost beyond the horizon.
+
+        Args:
+            q: (N, 8, 8) Hessians of the intervals' costs with respect to states.
+            r: (N, 2, 2) the same with respect to inputs.
+            p: (8, 8) of V(x) = slopeᵀ(x − target) + (x − target)ᵀ p (x − target).
+            slope: (8,) of V at the target.
+            target: (8,) state.
+        """
+        self._r = r + _LEAST_CURVATURE * np.eye(2)
+        self._h.inner[:, _Q] = q[1:].reshape(-1, 64)
+        self._h.last[:] = 2 * p.ravel()
+        self._beyond = p, slope, target
+
+    def iterate(self, margin: float) -> bool:
+        """Linearizes about (x, a), solves, and puts the solution into x[1:] and a; whether there is one.
+
+        Args:
+            margin: least value of the task's margins, in their own units.
+        """
+        x, a = self.x, self.a
+        self._stage()
+        if self.disturbance is not None:
+            rates, slopes = self.disturbance.rates(self.x, self.a)
+            self._next += self.h[:, None] * rates
+            self._jacobian += self.h[:, None, None] * slopes
+        if not np.isfinite(self._next).all():
+            return False
+        self._set_constraints(margin)
+        r = self._r if not self.curvature.any() else self._r + self.curvature[:, None, None] * np.eye(2)
+        self._h.first[:4], self._h.inner[:, _R] = r[0].ravel(), r[1:].reshape(-1, 4)
+        p, slope, target = self._beyond
+        self._g.first[:2], self._g.inner[:, :_SLACK] = self._gradient[0, _A], self._gradient[1:-1]
+        self._g.last[:] = slope + 2 * p @ (x[-1] - target)
+        self._lower.first[:2], self._upper.first[:2] = -1 - a[0], 1 - a[0]
+        self._lower.inner[:, _A], self._upper.inner[:, _A] = -1 - a[1:-1], 1 - a[1:-1]
+        if not (self._program() and self._program.solved and np.isfinite(self._cost[0])):
+            return False
+        a[0] += self._z.first[:2]
+        a[1:-1] += self._z.inner[:, _A]
+        x[1:-1] += self._z.inner[:, _X]
+        x[-1] += self._z.last
+        if self._grip.shape[1]:
+            first, inner = self._grip_multipliers
+            cones = np.concatenate([first[None], inner])[:, 1::2]
+            self.curvature = self._cone_curvature * np.maximum(-cones, 0.0).sum(1)
+        return True
+
+    def _set_constraints(self, margin: float) -> None:
+        jacobian, low, high = self._jacobian, self._low, self._high
+        gaps = self.x[1:] - self._next[:-1]
+        self._a0[:, _GAP] = jacobian[0, _A]
+        self._a_x[:, :, _NEXT], self._a_u[:, :, _GAP] = jacobian[1:-1, _X], jacobian[1:-1, _A]
+        low.first[_GAP] = high.first[_GAP] = gaps[0]
+        low.inner[:, _GAP] = high.inner[:, _GAP] = gaps[1:]
+        margins, slopes = self._nearest_margins()
+        limits, of_states = low.inner[:, _LIMITS], self._a_x[:, :, _SLOPES]
+        limits[:, : self._margins], of_states[:, :, : self._margins] = margin - margins, slopes
+        if self._grip.shape[1]:
+            grip = self._grip_jacobian
+            self._a0[:, _LIMITS], self._a_u[:, :, _LIMITS] = grip[0, _A], grip[1:-1, _A]
+            low.first[_LIMITS] = -self._grip[0]
+            limits[:, self._margins :], of_states[:, :, self._margins :] = -self._grip[1:-1], grip[1:-1, _X]
+
+    def _nearest_margins(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N−1, m) the least of the inner nodes' distinct margins, and their slopes (N−1, 8, m)."""
+        margins, slopes = self._margin[1:-1, self.distinct], self._margin_jacobian[1:-1][:, :, self.distinct]
+        if margins.shape[1] == self._margins:
+            return margins, slopes
+        least = np.argpartition(margins, self._margins - 1, axis=1)[:, : self._margins]
+        return np.take_along_axis(margins, least, 1), np.take_along_axis(slopes, least[:, None, :], 2)
+
+
+@lru_cache(maxsize=16)
+def horizon_qp(task: Task, params: BallbotParams, nodes: int) -> HorizonQp:
+    """The program of a task, robot and number of intervals, made once and shared by all controllers."""
+    return HorizonQp(task, params, nodes)
+
+
+@lru_cache(maxsize=16)
+def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
+    """(x, a, h, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
+
+    It computes `LANES` intervals at once, and matrices are columns.
+
+    Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
+    """
+    x, a, h = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("h")
+    c = casadi.SX.sym("c", len(task.constant_names))
+    z, u = casadi.vertcat(x, a), params.force_limit * a
+    after = dynamics.step(params, x, u, h, 2)  # two RK4 steps, as the env takes per control step
+    margins = casadi.vertcat(*task.margins(x, c))
+    outputs = [
+        after,
+        casadi.vec(casadi.densify(casadi.jacobian(after, z))),
+        casadi.densify(casadi.gradient(task.cost(x, u, c) * h, z)),
+        margins,
+        casadi.vec(casadi.densify(casadi.jacobian(margins, x))),
+    ]
+    inputs = [x, a, h, c]
+    if params.grips:
+        reserve = casadi.SX.sym("reserve")
+        inputs.append(reserve)
+        begins, ends = (
+            casadi.vertcat(*dynamics.grip_limits(params, force, reserve))
+            for force in dynamics.held_contact(params, x, u, task.control_dt)
+        )
+        # only the end of a control step that is nearer to slipping: each row costs time
+        grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT
+        outputs += [grip, casadi.vec(casadi.densify(casadi.jacobian(grip, z)))]
+    function = casadi.Function("stage", inputs, outputs, {"cse": True})
+    return in_lanes(f"{task.id}-nmpc", (function,))[0]
+
+
+def _solver(n: int, m: int, grips: int) -> casadi.Function:
+    """HPIPM for n intervals with m margins and limits of grip at each node."""
+    state, inputs, slack = casadi.Sparsity.dense(8, 8), casadi.Sparsity.dense(2, 2), casadi.Sparsity.dense(1, 1)
+    first_slack = [slack] if grips else []
+    options = {
+        "print_time": False,
+        "error_on_fail": False,
+        "N": n,
+        "nx": [0] + [8] * n,
+        "nu": [2 + len(first_slack)] + [3] * (n - 1) + [0],
+        "ng": [grips] + [m + grips] * (n - 1) + [0],
+        "hpipm": {
+            "mode": "speed_abs",  # a fourth faster, as it computes no residuals; costs agree to 0.03 %
+            "mu0": 1.0,
+            "iter_max": _QP_ITERATIONS,
+            **dict.fromkeys(("res_g_max", "res_b_max", "res_d_max", "res_m_max"), _RESIDUAL),
+        },
+    }
+    hessian = casadi.diagcat(inputs, *first_slack, *[state, inputs, slack] * (n - 1), state)
+    return casadi.conic("qp", "hpipm", {"h": hessian, "a": _constraint_pattern(n, m, grips)}, options)
+
+
+def _constraint_pattern(n: int, m: int, grips: int) -> casadi.Sparsity:
+    """Where the constraints' matrix has entries; the constants at the top of this file say their order."""
+    first_rows, first_columns, height = 8 + grips, 2 + (grips > 0), 8 + m + grips
+    present = np.zeros((first_rows + (n - 1) * height, first_columns + (n - 1) * _VARIABLES + 8), bool)
+    present[:first_rows, :2] = present[8:first_rows, 2:first_columns] = True
+    for k in range(n):
+        row, column = first_rows + k * height, first_columns + k * _VARIABLES
+        before = row - height if k else 0
+        present[range(before, before + 8), range(column, column + 8)] = True
+        own = present[row : row + height, column : column + _VARIABLES]  # without rows in the last stage
+        own[:, _X] = own[_GAP, _A] = own[8 + m :, _A] = own[8:, _SLACK:] = True
+    rows, columns = np.nonzero(present)
+    return casadi.Sparsity.triplet(*present.shape, rows.tolist(), columns.tolist())

@@ -1,0 +1,246 @@
+"""Which guesses the optimum of an episode is searched from, and in which order.
+
+Each guess is one of the task's ground paths. The choices of sides in a slalom are predicted first (`sides.py`). If no path
+leads to a solution, the search starts from simulated recoveries (`righting.py`).
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ballbot_baselines import guess, righting, sides
+from ballbot_baselines.ocp import OcpSolution
+from ballbot_baselines.shooting import BARRIER, NEAR_BARRIER, Shooting, shooting_solver
+from ballbot_gym import dynamics
+from ballbot_gym.paths import cubic, then_stay
+
+FROM_RIGHTING = -1
+"""The `guess` of an optimum that was found from a simulated recovery."""
+
+ALL_GUESSES = 2**10
+"""`guesses` that make `find_optimum` solve every guess."""
+
+_QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
+_HIGH_BARRIER = 1.0  # from one start in thousands fatrop goes in circles with the usual one, and not with this
+_COARSE = 2  # control steps per interval when several guesses are compared
+_COARSEST = 4  # the same when choices of sides are compared first
+_ROUGH = 1e-4  # tolerance there: costs are then right to 1e-5 of their value, in four iterations less
+_BASIN_DOUBT = (
+    0.01  # paths whose coarse costs differ by less than this share may be ordered differently on the env's grid
+)
+_SIDE_DOUBT = 0.01  # choices of sides whose predicted cost exceeds the best by more than this share are not solved
+_COARSEST_DOUBT = 0.005  # relative: how differently the coarsest grid may order choices of sides; 0.0035 was measured
+_GRID_DOUBT = 0.002  # the same of the coarse grid; 0.0007 was measured
+_GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip: 130 to 270 are common
+_GRIPPING_DOUBT = (
+    0.02  # for such robots in place of `_SIDE_DOUBT` and `_GRID_DOUBT`, because predictions ignore friction
+)
+_STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
+
+Found = tuple[int, OcpSolution]
+"""The index of a guess, and the solution that it led to."""
+
+
+def search(episode: Shooting, guesses: int, paths: list[np.ndarray] | None) -> list[Found]:
+    """Every solution found, up to the first kind of guess that leads to an optimum.
+
+    Args:
+        episode: the problem.
+        guesses: how many of the task's guessed paths to solve at most.
+        paths: ground paths to start from instead of the task's.
+    """
+    found: list[Found] = []
+    for more in _attempts(episode, guesses, paths):
+        found += more
+        if _any_optimal(found):
+            break
+    return found
+
+
+def _attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[Found]]:
+    task, x0, c, params = episode.task, episode.x0, episode.c, episode.params
+    paths = task.guess_paths(x0, c, params) if given is None else given
+    likely = given is None and guesses > 1 and task.steps % _COARSE == 0
+    obstacles = task.passed_obstacles(c) if likely else None
+    if obstacles is not None:
+        found = _from_likely_sides(episode, paths, guesses, obstacles)
+        yield found + (_from_paths(episode, paths[:guesses]) if guesses >= ALL_GUESSES or not found else [])
+        yield _from_righting(episode)
+        return
+    if given is None:
+        paths = paths[:guesses]
+    alone = given is None and len(paths) == 1 and not task.first_exit
+    yield _quickly(episode, paths[0], BARRIER) if alone else _from_paths(episode, paths)
+    yield _from_righting(episode)
+    if alone:
+        yield _quickly(episode, paths[0], _HIGH_BARRIER)
+        yield _from_paths(episode, paths)
+
+
+def _any_optimal(found: list[Found]) -> bool:
+    return any(solution.is_optimal for _, solution in found)
+
+
+def _quickly(episode: Shooting, path: np.ndarray, barrier: float) -> list[Found]:
+    """With fatrop and few iterations: a second guess is worth more than many iterations from a bad one."""
+    solver = shooting_solver(episode.task, episode.params, episode.task.steps, "fatrop", _QUICK_ITERATIONS, barrier)
+    return [(0, episode.solve(solver, *episode.along(path)))]
+
+
+def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
+    """Every solution found, with the index of the path it came from.
+
+    Paths of first-exit tasks are first solved with a free interval length, which gives their costs and their times of
+    arrival. The best are then solved again for whole numbers of control steps near those times. Several paths of another task
+    are first solved with forces held for two control steps. That takes half the time and suffices to compare them. Only the
+    paths that may be the best are then solved in full.
+    """
+    task = episode.task
+    if task.first_exit:
+        tried = [(i, episode.relaxed_along(path)) for i, path in enumerate(paths)]
+        found = [t for t in tried if not t[1].is_optimal]
+        for i, relaxed in _distinct([t for t in tried if t[1].is_optimal], _BASIN_DOUBT):
+            found += [(i, solution) for solution in episode.in_whole_steps(relaxed)]
+        return found
+    if len(paths) == 1 or task.steps % _COARSE:
+        return _refined(episode, [], _BASIN_DOUBT, paths)
+    solver = shooting_solver(task, episode.params, task.steps // _COARSE)
+    starts = [episode.along(path) for path in paths]
+    coarse = [(i, episode.solve(solver, x[::_COARSE], a[::_COARSE], _COARSE)) for i, (x, a) in enumerate(starts)]
+    return _refined(episode, [t for t in coarse if t[1].is_optimal], _BASIN_DOUBT, paths)
+
+
+def _refined(episode: Shooting, coarse: list[Found], doubt: float, paths: list[np.ndarray]) -> list[Found]:
+    """Solves from the coarse solutions within a relative `doubt` of the best; along the paths, if there are none."""
+    near = [(i, _on_grid(solution, episode.task.steps)) for i, solution in _distinct(coarse, doubt)]
+    starts = near or [(i, episode.along(path)) for i, path in enumerate(paths)]
+    return [(i, s) for i, (x, a) in starts for s in episode.solve_to_the_end(x, a, near=bool(near))]
+
+
+def _on_grid(solution: OcpSolution, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """States and actions of a solution on a finer grid."""
+    return guess.resampled(solution.states, steps), np.repeat(solution.inputs, steps // len(solution.inputs), axis=0)
+
+
+def _distinct(solved: list[Found], doubt: float) -> list[Found]:
+    """The solutions within a relative `doubt` of the best, sorted by cost, without repetitions."""
+    kept: list[Found] = []
+    for index, solution in sorted(solved, key=lambda pair: pair[1].cost):
+        contends = not kept or solution.cost < kept[0][1].cost * (1 + doubt)
+        if contends and not any(math.isclose(solution.cost, k.cost, rel_tol=1e-5) for _, k in kept):
+            kept.append((index, solution))
+    return kept
+
+
+# --- simulated recoveries ---
+
+
+def _from_righting(episode: Shooting) -> list[Found]:
+    """Solutions from simulated recoveries, to either side of the fall; and those recoveries that are episodes themselves.
+
+    The recovery within the plane of the fall is tried last, because it may lead to a saddle point.
+    """
+    task, params, c, limit = episode.task, episode.params, episode.c, episode.params.force_limit
+    found: list[Found] = []
+    for member in righting.righted(task, params, episode.x0, c, (1 - episode.backoff.force) * limit):
+        if not task.first_exit and len(member.u) == task.steps:
+            found.append((FROM_RIGHTING, _simulated(episode, member)))
+        if member.side == 0 and _any_optimal(found):
+            break
+        for x, u in righting.guesses(task, params, member, c):
+            if task.first_exit:
+                relaxed = episode.relaxed(x, u / limit)
+                solved = episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
+            else:
+                solved = [episode.solve(shooting_solver(task, params, len(u), "fatrop", barrier=BARRIER), x, u / limit)]
+            found += [(FROM_RIGHTING, solution) for solution in solved]
+    return found
+
+
+def _simulated(episode: Shooting, member: righting.Member) -> OcpSolution:
+    """A simulated recovery that lasts the whole episode as a solution."""
+    task, params, c, backoff = episode.task, episode.params, episode.c, episode.backoff
+    room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(member.x[-1], c)]
+    room += [np.asarray(margin) - backoff.margin for margin in task.margins(member.x, c)]
+    room += dynamics.limits(params, member.x[:-1], member.u, backoff.grip, task.control_dt)
+    return OcpSolution(
+        success=False,
+        status="simulated feedback",
+        cost=member.cost,
+        states=member.x,
+        inputs=member.u / params.force_limit,
+        violation=max(0.0, -min(float(np.min(part)) for part in room)),
+        iterations=0,
+        seconds=0.0,
+        solver="simulation",
+        costates=np.zeros((len(member.u), 8)),
+    )
+
+
+# --- the sides of a slalom ---
+
+
+def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, obstacles: np.ndarray) -> list[Found]:
+    """As `_from_paths`, but of all choices of sides only those are solved that are predicted to be the best, or nearly.
+
+    The motion without obstacles comes first: it takes few iterations, and it predicts what every choice costs, and how the
+    robot then moves. Each search starts from that predicted motion, and from the choice's guessed path if that fails. Where
+    there is no motion without obstacles, nothing is solved.
+    """
+    task, params, x0, c = episode.task, episode.params, episode.x0, episode.c
+    iterations, side_doubt, grid_doubt = _QUICK_ITERATIONS, _SIDE_DOUBT, _GRID_DOUBT
+    coarsest, tolerance = (_COARSEST if task.steps % _COARSEST == 0 else _COARSE), _ROUGH
+    if params.grips:
+        iterations, side_doubt, grid_doubt = _GRIPPING_ITERATIONS, _GRIPPING_DOUBT, _GRIPPING_DOUBT
+        coarsest, tolerance = _COARSE, None
+
+    def solved_from(path: np.ndarray, barrier: float, episode: Shooting = episode) -> OcpSolution:
+        solver = shooting_solver(task, params, task.steps // coarsest, "fatrop", iterations, barrier, tolerance)
+        x, a = episode.along(path)
+        return episode.solve(solver, x[::coarsest], a[::coarsest], coarsest)
+
+    free = solved_from(_straight(episode), NEAR_BARRIER, replace(episode, c=task.without_obstacles(c)))
+    if not free.success:
+        return []
+    along = guess.resampled(free.states[:, :2], task.steps)
+    prediction = sides.predict(task, params, x0, c, along, obstacles)
+    rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
+    row_of = [rows[_side_choice(path, obstacles)] for path in paths]
+    predicted = free.cost + prediction.costs[row_of]
+    solved: list[Found] = []
+    for i in np.argsort(predicted, kind="stable")[:most].tolist():
+        if solved and predicted[i] > predicted[solved[0][0]] * (1 + side_doubt):
+            break
+        motion = np.column_stack([along[:, 0], prediction.y[row_of[i]]])
+        for start, barrier in ((motion, NEAR_BARRIER), (motion, BARRIER), (paths[i], BARRIER)):
+            solution = solved_from(start, barrier)
+            if solution.success:
+                solved.append((i, solution))
+                break
+    if coarsest > _COARSE and len(_distinct(solved, _COARSEST_DOUBT)) > 1:
+        solved = _on_coarse_grid(episode, _distinct(solved, _COARSEST_DOUBT)) or solved
+    return _refined(episode, solved, grid_doubt, paths[:most])
+
+
+def _on_coarse_grid(episode: Shooting, solved: list[Found]) -> list[Found]:
+    """Solutions with forces held for `_COARSE` control steps, from those on the coarsest grid."""
+    n = episode.task.steps // _COARSE
+    solver = shooting_solver(episode.task, episode.params, n, "fatrop", _QUICK_ITERATIONS, NEAR_BARRIER, _ROUGH)
+    found = [(i, episode.solve(solver, *_on_grid(solution, n), _COARSE)) for i, solution in solved]
+    return [(i, solution) for i, solution in found if solution.success]
+
+
+def _straight(episode: Shooting) -> np.ndarray:
+    """(steps+1, 2) m, from the position and velocity of x0 to rest where the task's reference ends."""
+    task, x0 = episode.task, episode.x0
+    goal = task.reference(x0, episode.c, episode.params).x[-1, :2]
+    steps = min(task.steps, round(_STRAIGHT_SECONDS / task.control_dt))
+    return then_stay(cubic(x0[:2], x0[4:6], goal, np.zeros(2), steps, task.control_dt), task.steps)
+
+
+def _side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
+    """The sides on which a guessed path passes obstacles (n, 3), where it crosses their x."""
+    nearest = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
+    return tuple(1 if path[k, 1] > y else -1 for k, y in zip(nearest, obstacles[:, 1], strict=True))

@@ -1,0 +1,246 @@
+"""An episode of any task as a problem for solvers: multiple shooting on the env's own discretization.
+
+minimize   Σ_k cost(x_k, u_k, c)·control_dt        over forces u_k, |u_k| ≤ limit, held for control_dt
+subject to x_{k+1} = step(x_k, u_k)  (RK4),   margins(x_k, c) ≥ 0,   first-exit tasks: goal(x_n, c) ≤ 0 at a free n,
+           limits(x_k, u_k) ≥ 0 at both ends of each step, where the robot's friction is limited (`dynamics.limits`)
+
+Solvers see actions, which are forces divided by their limit.
+"""
+
+import math
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+
+import casadi
+import numpy as np
+
+from ballbot_baselines import guess
+from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
+from ballbot_gym import dynamics
+from ballbot_gym.ops import is_number
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+BARRIER = 0.1
+"""Of the first iterate of the solvers."""
+NEAR_BARRIER = 1e-3
+"""The same near a solution of nearly the same problem: it takes about half the iterations."""
+
+_FREE_TIME_INTERVALS = 60
+_MOST_ITERATIONS = 200
+
+
+@dataclass(frozen=True)
+class Backoff:
+    """How far a plan stays from its limits, so that a controller that tracks it stays within them.
+
+    `margin` is in the unit of the task's margins (obstacles: m). `goal` is the fraction of the goal's tolerance that the plan
+    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback. `grip` is the fraction
+    of the robot's weight that it leaves of the normal force, and so of the friction, where friction is limited.
+
+    Raises:
+        ValueError: a field is negative or not finite, or a fraction is not below 1.
+    """
+
+    # The defaults make up for the solvers' tolerance, so that optimal forces and states obey the limits exactly.
+    margin: float = 1e-7
+    goal: float = 1e-6
+    force: float = 1e-7
+    grip: float = 1e-5
+
+    def __post_init__(self) -> None:
+        for name, below in (("margin", math.inf), ("goal", 1.0), ("force", 1.0), ("grip", 1.0)):
+            value = getattr(self, name)
+            if not is_number(value):
+                raise ValueError(f"Backoff: {name} must be a number, not {value!r}")
+            if not 0 <= value < below:
+                raise ValueError(f"Backoff: {name} must be at least 0 and below {below:g}, not {value}")
+
+    def times(self, share: float) -> "Backoff":
+        """A share of every field, but not less than the field's default or, if that is less, than the field itself."""
+        least = asdict(Backoff())
+        return Backoff(**{name: min(value, max(share * value, least[name])) for name, value in asdict(self).items()})
+
+
+@lru_cache(maxsize=64)
+def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
+    """A task on its env's discretization, or with forces held longer than its control steps.
+
+    Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, so that
+    problems on fine and coarse grids share all compiled functions, and all tasks of a robot share those of the dynamics.
+    """
+    nc, limit = len(task.constant_names), params.force_limit
+
+    def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
+        return casadi.vertcat(*task.margins(x, p[1 : 1 + nc])) - p[1 + nc]
+
+    def path(x: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+        return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[3 + nc], p[0]))
+
+    def final(x: casadi.SX, p: casadi.SX) -> casadi.SX:
+        if not task.first_exit:
+            return margins(x, p)
+        # Goal functions are normalized, q/tolerance² − 1: keeping a fraction b of the tolerance asks (1−b)² − 1 − g ≥ 0.
+        room = (1 - p[2 + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, p[1 : 1 + nc]))
+        return casadi.vertcat(margins(x, p), room)
+
+    return Ocp(
+        name=task.id,
+        states=8,
+        inputs=2,
+        params=nc + 3 + params.grips,
+        next=lambda x, a, p: dynamics.step(params, x, limit * a, p[0], dynamics.substeps_for(task.control_dt)),
+        cost=lambda x, a, p: task.cost(x, limit * a, p[1 : 1 + nc]) * p[0],
+        inequalities=path if params.grips else lambda x, a, p: margins(x, p),
+        final_inequalities=final,
+    )
+
+
+def shooting_parameters(
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, coarseness: int = 1
+) -> list[float]:
+    """p of `shooting_ocp`: s that forces are held, c, back-offs from margins and goal, and of grip if friction is limited."""
+    reserve = [backoff.grip] if params.grips else []
+    return [task.control_dt * coarseness, *c, backoff.margin, backoff.goal, *reserve]
+
+
+@lru_cache(maxsize=256)
+def shooting_solver(
+    task: Task,
+    params: BallbotParams,
+    steps: int,
+    solver: str = "fatrop",
+    iterations: int = _MOST_ITERATIONS,
+    barrier: float = BARRIER,
+    tolerance: float | None = None,
+) -> OcpSolver:
+    """A solver of `shooting_ocp`, made once.
+
+    Args:
+        steps: intervals.
+        solver: "fatrop" or "ipopt".
+        iterations: after which it gives up.
+        barrier: of the first iterate.
+        tolerance: of the solver; default, the finest that it reaches.
+    """
+    ocp = shooting_ocp(task, params)
+    return OcpSolver(ocp, steps, solver, tolerance or _tolerance(params), iterations, barrier)
+
+
+@lru_cache(maxsize=8)
+def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolver:
+    """A solver of a first-exit task over intervals of one free length h, the ninth state. It tells roughly when to arrive."""
+    nc = len(task.constant_names)
+    fixed, limit = shooting_ocp(task, params), params.force_limit
+    ocp = replace(
+        fixed,
+        name=f"{task.id}-free-time",
+        states=9,
+        next=lambda s, a, p: casadi.vertcat(dynamics.step(params, s[:8], limit * a, s[8], 2), s[8]),
+        cost=lambda s, a, p: task.cost(s[:8], limit * a, p[1 : 1 + nc]) * s[8],
+        inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
+        final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], p),
+    )
+    return OcpSolver(ocp, _FREE_TIME_INTERVALS, solver, _tolerance(params))
+
+
+def _tolerance(params: BallbotParams) -> float:
+    """Of the solvers. On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits."""
+    return 1e-6 if params.grips else 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class Shooting:
+    """One episode as a problem. Guesses are states x (n+1, 8) and actions a (n, 2), forces divided by their limit."""
+
+    task: Task
+    params: BallbotParams
+    x0: np.ndarray
+    c: np.ndarray
+    backoff: Backoff
+
+    def along(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A guess that roughly follows a ground path (n+1, 2), m, one point for each control step."""
+        x, u = guess.along_path(self.params, path, self.task.control_dt, start=self.x0)
+        return x, u / self.params.force_limit
+
+    def solve(self, solver: OcpSolver, x: np.ndarray, a: np.ndarray, coarseness: int = 1) -> OcpSolution:
+        """From a guess by one solver; forces are held for `coarseness` control steps."""
+        bounds = self._bounds(solver, x[0], len(a))
+        return solver.solve(x, a, bounds, self._parameters(coarseness))
+
+    def solve_to_the_end(self, x: np.ndarray, a: np.ndarray, near: bool = False) -> list[OcpSolution]:
+        """From a guess by fatrop, and if that fails by ipopt: all solutions, the best last.
+
+        Args:
+            x: states.
+            a: actions.
+            near: whether the guess solves nearly the same problem.
+        """
+        tries = [("fatrop", NEAR_BARRIER)] if near else []
+        solutions = []
+        for name, barrier in (*tries, ("fatrop", BARRIER), ("ipopt", BARRIER)):
+            solver = shooting_solver(self.task, self.params, len(a), name, barrier=barrier)
+            solutions.append(self.solve(solver, x, a))
+            if solutions[-1].is_optimal:
+                break
+        return solutions
+
+    def relaxed_along(self, path: np.ndarray) -> OcpSolution:
+        """The solution with a free interval length from a ground path (n+1, 2), m, one point for each control step."""
+        h = (len(path) - 1) * self.task.control_dt / _FREE_TIME_INTERVALS
+        x, u = guess.along_path(self.params, guess.resampled(path, _FREE_TIME_INTERVALS), h, start=self.x0)
+        return self._in_free_time(x, u / self.params.force_limit, h)
+
+    def relaxed(self, x: np.ndarray, a: np.ndarray) -> OcpSolution:
+        """The solution with a free interval length from a guess."""
+        h = len(a) * self.task.control_dt / _FREE_TIME_INTERVALS
+        return self._in_free_time(*_resampled(x, a, _FREE_TIME_INTERVALS), h)
+
+    def in_whole_steps(self, relaxed: OcpSolution) -> list[OcpSolution]:
+        """Solutions that arrive after whole numbers of control steps.
+
+        The search begins at the arrival of a solution with a free interval length, and goes both ways while the cost falls.
+        """
+        most = self.task.steps
+        arrival = relaxed.states[0, 8] * _FREE_TIME_INTERVALS / self.task.control_dt
+        steps = min(max(1, math.ceil(arrival)), most)
+
+        def arriving(steps: int) -> list[OcpSolution]:
+            return self.solve_to_the_end(*_resampled(relaxed.states[:, :8], relaxed.inputs, steps), near=True)
+
+        groups = {steps: arriving(steps)}
+        for direction in (-1, 1):
+            nearby = steps + direction
+            while 1 <= nearby <= most:
+                groups[nearby] = arriving(nearby)
+                found, before = groups[nearby][-1], groups[nearby - direction][-1]
+                if not (found.is_optimal and (not before.is_optimal or found.cost < before.cost)):
+                    break
+                nearby += direction
+        return [solution for group in groups.values() for solution in group]
+
+    def _in_free_time(self, x: np.ndarray, a: np.ndarray, h: float) -> OcpSolution:
+        n = len(a)
+        for name in ("fatrop", "ipopt"):
+            solver = free_time_solver(self.task, self.params, name)
+            bounds = self._bounds(solver, x[0], n)
+            bounds.state_lower[:, 8], bounds.state_upper[:, 8] = self.task.control_dt / 4, self.task.duration / n
+            solution = solver.solve(np.column_stack([x, np.full(n + 1, h)]), a, bounds, self._parameters())
+            if solution.is_optimal:
+                break
+        return solution
+
+    def _bounds(self, solver: OcpSolver, x0: np.ndarray, n: int) -> Bounds:
+        bounds, force = Bounds.free(solver.ocp, n), self.backoff.force
+        bounds.state_lower[0, :8] = bounds.state_upper[0, :8] = x0
+        bounds.input_lower[:], bounds.input_upper[:] = force - 1, 1 - force
+        return bounds
+
+    def _parameters(self, coarseness: int = 1) -> list[float]:
+        return shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness)
+
+
+def _resampled(x: np.ndarray, a: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """States and actions of a guess at another number of equal steps."""
+    return guess.resampled(x, steps), guess.resampled(np.vstack([a, a[-1:]]), steps)[:-1]
