@@ -9,15 +9,19 @@ import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 
 READ_LIMIT = 256 * 2**20
 """Bytes that a file may hold, unpacked, unless a reader says otherwise."""
 
+JSON_LIMIT = 2**26
+"""Bytes of JSON that are read, unless a reader says otherwise: as Python's objects they take up to 24 times as much."""
+
 _PIECE = 2**20  # bytes
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")
+_MOST_MEMBERS = 10_000  # of an archive; zipfile makes an object of each before it says how many there are
 
 
 class FileError(ValueError):
@@ -36,17 +40,18 @@ def read(path: str | Path, limit: int = READ_LIMIT) -> bytes:
         if not os.path.isfile(path):  # a pipe or a device could be read for ever
             raise FileError(f"{path} is no regular file")
         with open(path, "rb") as file:
-            content = _read_at_most(file, limit + 1)
+            size = os.fstat(file.fileno()).st_size
+            content = b"" if size > limit else _read_at_most(file, limit + 1)
     except (OSError, ValueError) as error:
         if isinstance(error, FileError):
             raise
         raise FileError(f"{path} cannot be read: {error}") from error
-    if len(content) > limit:
+    if max(size, len(content)) > limit:
         raise FileError(f"{path} is larger than {limit / 2**20:.0f} MiB, the most that is read")
     return content
 
 
-def _read_at_most(file: BinaryIO, size: int) -> bytes:
+def _read_at_most(file: IO[bytes], size: int) -> bytes:
     """The first bytes of a file, in pieces: read(size) takes memory for `size` bytes, however few there are."""
     pieces = []
     while size > 0 and (piece := file.read(min(size, _PIECE))):
@@ -55,13 +60,19 @@ def _read_at_most(file: BinaryIO, size: int) -> bytes:
     return b"".join(pieces)
 
 
-def read_json(path: str | Path, limit: int = READ_LIMIT) -> Any:
+def read_json(path: str | Path, limit: int = JSON_LIMIT) -> Any:
     """What a file of JSON holds.
 
     Raises:
         FileError: as `read`, or it holds no JSON.
     """
-    content = read(path, limit)
+    return json_of(read(path, limit), path, limit)
+
+
+def json_of(content: bytes, path: str | Path, limit: int = JSON_LIMIT) -> Any:
+    """As `read_json`, of content that was read already; errors name the path."""
+    if len(content) > limit:
+        raise FileError(f"{path} holds more than {limit / 2**20:.0f} MiB of JSON, the most that is read")
     try:
         return json.loads(content)
     except RecursionError:
@@ -85,6 +96,32 @@ def read_npz(path: str | Path, limit: int = READ_LIMIT) -> dict[str, np.ndarray]
 
 def arrays_of(content: bytes, path: str | Path, limit: int = READ_LIMIT) -> dict[str, np.ndarray]:
     """As `read_npz`, of content that was read already; errors name the path."""
+    members = unzipped(content, path, limit, ".npz file")
+    names = [name.removesuffix(".npy") for name in members]
+    if len(set(names)) < len(names):
+        raise FileError(f"{path} holds two arrays of one name")
+    try:
+        arrays = dict(zip(names, map(_array, members.values()), strict=True))
+    except Exception as error:  # NumPy's headers have dozens of ways to fail, and all mean the same
+        raise FileError(f"{path} is no .npz file, or a damaged one: {error}") from error
+    if 8 * sum(array.size for array in arrays.values()) > limit:
+        raise FileError(f"{path} holds more than {limit // 8} numbers, the most that are read")
+    return arrays
+
+
+def unzipped(content: bytes, path: str | Path, limit: int = READ_LIMIT, kind: str = "zip archive") -> dict[str, bytes]:
+    """The members of a zip archive by name. What they declare is checked before any is unpacked, and holds.
+
+    Args:
+        content: of the archive.
+        path: and kind: what errors call it.
+        limit: bytes of all members together.
+
+    Raises:
+        FileError: it is none, is damaged or encrypted, or has too many members or too large ones.
+    """
+    if content.count(b"PK\1\2") > _MOST_MEMBERS:
+        raise FileError(f"{path} holds more than {_MOST_MEMBERS} files, the most that are read")
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = archive.infolist()
@@ -98,14 +135,17 @@ def arrays_of(content: bytes, path: str | Path, limit: int = READ_LIMIT) -> dict
                     raise FileError(
                         f"{path}: {member.filename} is compressed by method {member.compress_type}; use numpy.savez"
                     )
-            names = [member.filename.removesuffix(".npy") for member in members]
-            if len(set(names)) < len(names):
-                raise FileError(f"{path} holds two arrays of one name")
-            return {name: _array(archive.read(member)) for name, member in zip(names, members, strict=True)}
+            if len({member.filename for member in members}) < len(members):
+                raise FileError(f"{path} holds two files of one name")
+            unpacked = {}
+            for member in members:
+                with archive.open(member) as file:  # archive.read() would unpack all that follows, whatever is declared
+                    unpacked[member.filename] = _read_at_most(file, member.file_size)
+            return unpacked
     except FileError:
         raise
-    except Exception as error:  # zipfile and NumPy's headers have dozens of ways to fail, and all mean the same
-        raise FileError(f"{path} is no .npz file, or a damaged one: {error}") from error
+    except Exception as error:  # zipfile has dozens of ways to fail, and all mean the same
+        raise FileError(f"{path} is no {kind}, or a damaged one: {error}") from error
 
 
 def _array(content: bytes) -> np.ndarray:
@@ -122,6 +162,28 @@ def _array(content: bytes) -> np.ndarray:
         raise ValueError(f"the declared shape {shape} of {dtype} does not fit {len(content) - file.tell()} bytes")
     array = np.frombuffer(content, dtype, offset=file.tell())
     return array.reshape(shape, order="F" if fortran else "C").copy()
+
+
+def numbers(value: Any, what: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """value as a float64 array, if it holds real numbers, and all are finite. `what` is its name in messages.
+
+    Whole numbers are real. Complex numbers, truth values, text and whole numbers of more than 64 bits are not.
+
+    Raises:
+        ValueError: it holds something else, or is of another shape than `shape`.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # lists of different lengths
+        array = np.array(None)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{what} must be an array of numbers, not of {array.dtype}")
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"{what} has the shape {array.shape}, and not {shape}")
+    array = array.astype(np.float64, copy=False)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} must be finite numbers, and it holds NaN or infinity")
+    return array
 
 
 def write(path: str | Path, content: bytes | str) -> Path:

@@ -5,7 +5,6 @@ A tuple's components may be floats, arrays of one shape, tensors or symbols. Thi
 Python and for a batch on an accelerator.
 """
 
-import functools
 import math
 import numbers
 import sys
@@ -75,8 +74,13 @@ def where(condition: Any, a: Any, b: Any) -> Any:
     if library.__name__ == "casadi":
         return library.if_else(condition, a, b)
     if library.__name__ == "torch":
-        as_tensor = functools.partial(library.as_tensor, device=condition.device)
-        return library.where(condition, as_tensor(a), as_tensor(b))
+        kinds = [part.dtype for part in (a, b) if isinstance(part, library.Tensor)]
+        kind = kinds[0] if kinds else library.float32  # whatever torch's default is
+        a, b = (
+            library.as_tensor(part, dtype=kind, device=condition.device) if isinstance(part, float) else part
+            for part in (a, b)
+        )
+        return library.where(condition, a, b)
     return library.where(condition, a, b)
 
 

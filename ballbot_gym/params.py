@@ -207,13 +207,21 @@ def default_params() -> BallbotParams:
     return BallbotParams.from_urdf()
 
 
+class _Tree(ElementTree.TreeBuilder):
+    """Builds elements of XML without a DOCTYPE, whose entities could unfold to a hundred times the file."""
+
+    def doctype(self, *declared: str | None) -> None:
+        raise ValueError("it declares a DOCTYPE, which no URDF needs; delete that")
+
+
 class _Urdf:
     """A parsed URDF. Its methods raise a `UrdfError` that names what is missing."""
 
     def __init__(self, path: Path):
         self.path = path
         try:
-            self.root = ElementTree.fromstring(files.read(path, _FILE_LIMIT))
+            parser = ElementTree.XMLParser(target=_Tree())
+            self.root = ElementTree.fromstring(files.read(path, _FILE_LIMIT), parser)
         except files.FileError as error:
             raise UrdfError(f"{error}; give the path of a URDF") from None
         # an unknown encoding is a LookupError, or a ValueError if it is one of several bytes

@@ -38,9 +38,9 @@ class Trajectory:
             value = getattr(self, name)
             if value is not None:
                 try:
-                    object.__setattr__(self, name, np.asarray(value, np.float64))
-                except (TypeError, ValueError) as error:
-                    raise TrajectoryError(f"{name} must be an array of numbers: {error}") from None
+                    object.__setattr__(self, name, files.numbers(value, name))
+                except ValueError as error:
+                    raise TrajectoryError(str(error)) from None
         n = self.t.size - 1
         if n < 0 or self.t.shape != (n + 1,) or self.x.shape != (n + 1, 8):
             raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, 8)")
@@ -48,9 +48,6 @@ class Trajectory:
             raise TrajectoryError(f"u {self.u.shape} must be ({n}, 2), held, or ({n + 1}, 2), linear")
         if self.xdot is not None and self.xdot.shape != self.x.shape:
             raise TrajectoryError(f"xdot {self.xdot.shape} must have the shape of x, {self.x.shape}")
-        arrays = (self.t, self.x, self.u) if self.xdot is None else (self.t, self.x, self.u, self.xdot)
-        if not all(np.isfinite(array).all() for array in arrays):
-            raise TrajectoryError("a trajectory must be finite, and it holds NaN or infinity")
         if not (np.diff(self.t) > 0).all():
             raise TrajectoryError("times must increase")
 

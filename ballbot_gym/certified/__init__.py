@@ -123,7 +123,7 @@ def load(task: str | Task, robot: str | BallbotParams, path: str | Path | None =
         for made, wanted in zip(made_for, (task.problem(), repr(params)), strict=True):
             if made != wanted:
                 raise CertificateError(f"{path} was computed for {made}, not for {wanted}; {again}")
-        _check(task, arrays)
+        arrays |= _checked(task, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])
         states = np.split(x, np.cumsum(lengths + 1)[:-1])
@@ -167,18 +167,17 @@ def _holds(evaluation_set: EvaluationSet, task: Task, params: BallbotParams) -> 
         return bool(moved.all() and (np.abs(costs - known) <= _SAME * known).all() and kept)
 
 
-def _check(task: Task, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises a ValueError that names the array whose shape or values make no sense."""
+def _checked(task: Task, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of numbers; raises a ValueError that names the one whose shape or values make no sense."""
     n = arrays["costs"].size
     shapes = dict.fromkeys(_PER_EPISODE, (n,)) | {"states": (n, 8), "constants": (n, len(task.constant_names))}
     for name, shape in shapes.items():
         if n == 0 or arrays[name].shape != shape:
             raise ValueError(f"{name} has the shape {arrays[name].shape}, and not {shape} of at least one episode")
-        if name == "statuses":
-            continue
-        if arrays[name].dtype.kind != "f" or not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{name} must be finite numbers")
-    if not (arrays["costs"] > 0).all():
+    if arrays["statuses"].dtype.kind != "U":
+        raise ValueError(f"statuses must be text, not of {arrays['statuses'].dtype}")
+    found = {name: files.numbers(arrays[name], name) for name in shapes if name != "statuses"}
+    if not (found["costs"] > 0).all():
         raise ValueError("costs must be positive")
     lengths = arrays["lengths"]
     if lengths.ndim != 1 or lengths.dtype.kind not in "iu" or not 0 < lengths.size <= n:
@@ -187,5 +186,5 @@ def _check(task: Task, arrays: Mapping[str, np.ndarray]) -> None:
         raise ValueError(f"lengths must be 0 to {task.steps} control steps")
     steps = int(lengths.sum())
     for name, shape in (("x", (steps + lengths.size, 8)), ("u", (steps, 2))):
-        if arrays[name].shape != shape:
-            raise ValueError(f"{name} has the shape {arrays[name].shape}, and not {shape}, as lengths say")
+        found[name] = files.numbers(arrays[name], name, shape)
+    return found

@@ -31,6 +31,7 @@ from ballbot_train.policy_files import (
     shipped_policies,
 )
 from ballbot_train.routes import Routes
+from ballbot_train.weights import checked, own_precision
 
 try:
     import safetensors
@@ -66,20 +67,21 @@ class PolicyNetwork(torch.nn.Module):
     decides on which sides obstacles are passed.
     """
 
-    def __init__(self, spec: PolicySpec):
+    def __init__(self, spec: PolicySpec, device: str = "cpu"):
         super().__init__()
         self.spec = spec
+        own: dict[str, Any] = {"device": device, "dtype": torch.float32}  # whatever torch's defaults are
         self._frame = None if spec.frame is None else FRAMES[spec.frame]
-        self._mirrors = [tuple(torch.tensor(signs, dtype=torch.float32) for signs in mirror) for mirror in spec.mirrors]
-        self.routes = Routes(spec.frame, spec.routes) if spec.frame is not None and spec.routes else None
+        self._mirrors = [tuple(torch.tensor(signs, **own) for signs in mirror) for mirror in spec.mirrors]
+        self.routes = Routes(spec.frame, spec.routes, device) if spec.frame is not None and spec.routes else None
         inputs = spec.observations if self._frame is None else self._frame.size
         self._steady = self._frame.steady if self._frame is not None and spec.centred else None
-        self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd) if spec.linear else None
+        self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd, **own) if spec.linear else None
         widths = (inputs, *spec.hidden)
         layers: list[torch.nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(widths):
-            layers += [torch.nn.Linear(fan_in, fan_out, bias=not spec.odd), _ACTIVATIONS[spec.activation]()]
-        last = torch.nn.Linear(widths[-1], 2, bias=not spec.odd)
+            layers += [torch.nn.Linear(fan_in, fan_out, bias=not spec.odd, **own), _ACTIVATIONS[spec.activation]()]
+        last = torch.nn.Linear(widths[-1], 2, bias=not spec.odd, **own)
         if spec.linear:  # so that the policy starts as its linear part
             for part in last.parameters():
                 torch.nn.init.zeros_(part)
@@ -95,9 +97,9 @@ class PolicyNetwork(torch.nn.Module):
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             seen = tuple(observation.tolist())
             features, back = self._frame.features(seen if self.routes is None else seen + self.routes.alone(seen))
-            output = self._in_frame(features, lambda values: torch.tensor(values, dtype=observation.dtype))
+            output = self._in_frame(features, observation.new_tensor)
             forwards, sideways = output.tolist()
-            return torch.tensor(back((forwards, sideways)), dtype=observation.dtype)
+            return observation.new_tensor(back((forwards, sideways)))
         if self.routes is not None:
             observation = self.routes.behind(observation)
         if self._frame is not None:
@@ -166,8 +168,9 @@ class PolicyController(ActionController):
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
         """Actions (..., 2) for observations (..., no); the other arguments are SB3's and have no effect."""
-        with torch.inference_mode():
-            return self._network(torch.as_tensor(observation, dtype=torch.float32)).numpy(), state
+        with own_precision(), torch.inference_mode():
+            given = torch.as_tensor(np.array(observation), dtype=torch.float32, device="cpu")
+            return self._network(given).numpy(), state
 
 
 def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[str, Any]) -> Path:
@@ -221,8 +224,8 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
             f"{description_path} takes {spec.observations} observations, {task.id} has {len(task.observation_scale)}"
         )
     weights = _read_weights(weights_path)
-    with torch.device("meta"):  # shapes without memory, which a wrong description would ask for
-        shapes = {name: tuple(part.shape) for name, part in PolicyNetwork(spec).state_dict().items()}
+    # shapes without memory, which a wrong description would ask for
+    shapes = {name: tuple(part.shape) for name, part in PolicyNetwork(spec, "meta").state_dict().items()}
     found = {name: tuple(part.shape) for name, part in weights.items()}
     differing = [name for name in {**shapes, **found} if shapes.get(name) != found.get(name)]
     if differing:
@@ -239,18 +242,12 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
 def _read_weights(path: Path) -> dict[str, torch.Tensor]:
     """The weights of a file; raises a PolicyError that names what is no number."""
     try:
-        weights = safetensors.torch.load(files.read(path))
+        return checked(safetensors.torch.load(files.read(path)), path)
+    except PolicyError:
+        raise
     # safetensors answers some files with a KeyError, or with an error that torch raises
     except (ValueError, KeyError, TypeError, RuntimeError, safetensors.SafetensorError) as error:
         raise PolicyError(f"{path} is not a policy: {error}") from error
-    for name, tensor in weights.items():
-        if not tensor.is_floating_point():
-            raise PolicyError(f"{path}: {name} holds {tensor.dtype}, and not floating-point numbers")
-        if not tensor.isfinite().all():
-            raise PolicyError(
-                f"{path}: {name} holds NaN or infinity; take an earlier policy of the training, or train anew"
-            )
-    return weights
 
 
 def load_policy(

@@ -7,6 +7,7 @@ episode, so it does not waver.
 
 import functools
 import itertools
+from typing import Any
 
 from ballbot_gym.lazy import missing
 from ballbot_gym.tasks.symmetry import FRAMES
@@ -23,19 +24,20 @@ class Routes(torch.nn.Module):
     Its outputs, before the greatest is taken, belong to the 2^n choices of obstacles that are passed on the farther side.
     """
 
-    def __init__(self, frame: str, hidden: tuple[int, ...]):
-        """Args: frame: name in `FRAMES` of one with sides; hidden: units of the hidden layers."""
+    def __init__(self, frame: str, hidden: tuple[int, ...], device: str = "cpu"):
+        """Args: frame: name in `FRAMES` of one with sides; hidden: units of the hidden layers; device: of the weights."""
         super().__init__()
+        own: dict[str, Any] = {"device": device, "dtype": torch.float32}
         route = FRAMES[frame].route
         assert route is not None
         self._route = route
         layers: list[torch.nn.Module] = []
         for fan_in, fan_out in itertools.pairwise((3 * route.obstacles, *hidden)):
-            layers += [torch.nn.Linear(fan_in, fan_out), torch.nn.Tanh()]
+            layers += [torch.nn.Linear(fan_in, fan_out, **own), torch.nn.Tanh()]
         last = (3 * route.obstacles, *hidden)[-1]
-        self.mlp = torch.nn.Sequential(*layers, torch.nn.Linear(last, 2**route.obstacles))
+        self.mlp = torch.nn.Sequential(*layers, torch.nn.Linear(last, 2**route.obstacles, **own))
         self._choices: torch.Tensor
-        self.register_buffer("_choices", torch.tensor(farther_choices(route.obstacles)), persistent=False)
+        self.register_buffer("_choices", torch.tensor(farther_choices(route.obstacles), **own), persistent=False)
 
     def layout(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 3 n) x, y and radius of every obstacle as seen from the goal, of observations (..., no)."""

@@ -13,11 +13,7 @@ Pickles, such as `VecNormalize.save` writes, can execute code, and are not read.
 """
 
 import hashlib
-import io
 import itertools
-import json
-import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +27,7 @@ from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.policy_files import PolicyError
+from ballbot_train.weights import checked, saved_by_torch
 
 try:
     import torch
@@ -47,6 +44,7 @@ _ACTIVATIONS = {
     "tanh": "Tanh",
 }
 _MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # whose policies act as it is written here
+_DATA_LIMIT = 2**24  # bytes of JSON
 _SUPPORTED = "give a model with MlpPolicy, or load the model yourself and give it to ballbot_train.evaluate"
 
 
@@ -202,7 +200,7 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         raise PolicyError(f"{path} takes {size} observations, its statistics are of {len(normalization['mean'])}")
     parts: list[torch.nn.Module] = []
     for weight, bias in layers:
-        linear = torch.nn.Linear(weight.shape[1], weight.shape[0])
+        linear = torch.nn.Linear(weight.shape[1], weight.shape[0], device="cpu", dtype=torch.float32)
         linear.load_state_dict({"weight": weight, "bias": bias})
         parts += [linear, getattr(torch.nn, _ACTIVATIONS[activation])()]
     return SavedActor(torch.nn.Sequential(*parts[:-1]), output, normalization).eval()
@@ -217,47 +215,48 @@ def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str,
         return _read_sb3(Path(path)) if Path(path).suffix == ".zip" else (*_read_rsl(Path(path)), None)
     except PolicyError:
         raise
-    except files.FileError as error:
-        raise PolicyError(str(error)) from error
-    except Exception as error:  # zipfile, JSON and torch have dozens of ways to refuse a damaged file
-        raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {error!r:.300}") from error
+    except Exception as error:  # torch has dozens of ways to refuse a damaged file
+        reason = str(error) if isinstance(error, files.FileError) else f"{error!r:.300}"
+        raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {reason}") from error
 
 
 def _read_sb3(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces]:
-    with zipfile.ZipFile(io.BytesIO(files.read(path))) as archive:
-        for name in ("data", "policy.pth"):
-            if name not in archive.namelist():
-                raise PolicyError(f"{path} is no saved Stable-Baselines3 model: it holds no {name}")
-            if archive.getinfo(name).file_size > files.READ_LIMIT:
-                raise PolicyError(f"{path}: {name} is larger than {files.READ_LIMIT / 2**20:.0f} MiB")
-        data, weights = json.loads(archive.read("data")), _tensors(archive.read("policy.pth"))
+    members = files.unzipped(files.read(path), path)
+    for name in ("data", "policy.pth"):
+        if name not in members:
+            raise PolicyError(f"{path} is no saved Stable-Baselines3 model: it holds no {name}")
+    data = files.json_of(members["data"], f"data in {path}", _DATA_LIMIT)
+    weights = saved_by_torch(members["policy.pth"], f"policy.pth in {path}")
     made_by = str(data["policy_class"].get("__module__", ""))
     if not made_by.startswith(_MODULES):
-        raise PolicyError(f"{path} has a policy of {made_by or 'an unknown module'}, which is not read; {_SUPPORTED}")
+        raise PolicyError(
+            f"{path} has a policy of {made_by or 'an unknown module':.100}, which is not read; {_SUPPORTED}"
+        )
     options = data.get("policy_kwargs") or {}
     unknown = [name for name in weights if "features_extractor" in name or "lstm" in name]
     if unknown or "features_extractor_class" in options:
-        raise PolicyError(f"{path} extracts features ({(unknown or ['features_extractor_class'])[0]}); {_SUPPORTED}")
+        raise PolicyError(
+            f"{path} extracts features ({(unknown or ['features_extractor_class'])[0]:.100}); {_SUPPORTED}"
+        )
     output: dict[str, float] = {}
     if "action_net.weight" in weights:
-        layers, usual = _layers(weights, "mlp_extractor.policy_net.", "action_net."), "tanh"
+        layers, usual = _layers(path, weights, "mlp_extractor.policy_net.", "action_net."), "tanh"
         if options.get("squash_output"):
             output["tanh"] = 1.0
     elif any(name.startswith("actor.latent_pi.") for name in weights):
         deep = "actor.mu.0.weight" in weights  # with state-dependent exploration the mean is clipped
-        layers, usual = _layers(weights, "actor.latent_pi.", "actor.mu.0." if deep else "actor.mu."), "relu"
+        layers, usual = _layers(path, weights, "actor.latent_pi.", "actor.mu.0." if deep else "actor.mu."), "relu"
         output["tanh"] = 1.0
         if deep:
-            output["limit"] = float(options.get("clip_mean", 2.0))
+            output["limit"] = float(files.numbers(options.get("clip_mean", 2.0), "clip_mean", ()))
     elif "actor.mu.0.weight" in weights:
-        layers, usual, output["tanh"] = _layers(weights, "actor.mu."), "relu", 1.0
+        layers, usual, output["tanh"] = _layers(path, weights, "actor.mu."), "relu", 1.0
     else:
-        raise PolicyError(f"{path} has no actor that is read, but {', '.join(list(weights)[:4])}, …; {_SUPPORTED}")
-    _check_layers(path, layers)
-    named = re.search(r"(\w+)'?>?$", str(options.get("activation_fn", usual)))
-    activation = named.group(1).lower() if named else ""
+        raise PolicyError(f"{path} has no actor that is read, but {', '.join(list(weights)[:4]):.200}, …; {_SUPPORTED}")
+    named = str(options.get("activation_fn", usual))
+    activation = named.rstrip("'>").rpartition(".")[2].rpartition("'")[2].lower()
     if activation not in _ACTIVATIONS:
-        raise PolicyError(f"{path} has the activation {options.get('activation_fn')}; known: {', '.join(_ACTIVATIONS)}")
+        raise PolicyError(f"{path} has the activation {named:.100}; known: {', '.join(_ACTIVATIONS)}")
     found = Spaces(_space(data["observation_space"]), _space(data["action_space"]))
     return layers, activation, output, _statistics(path, data), found
 
@@ -286,36 +285,45 @@ def _statistics(path: Path, data: Mapping[str, Any]) -> dict[str, Any] | None:
             )
         return None
     arrays = files.read_npz(beside)
-    if not int(arrays["normalized"]):
-        return None
-    mean, variance = torch.from_numpy(arrays["mean"]), torch.from_numpy(arrays["variance"])
-    scale, limit = torch.sqrt(variance + float(arrays["epsilon"])), float(arrays["limit"])
-    if mean.shape != scale.shape or mean.ndim != 1 or not (mean.isfinite().all() and scale.isfinite().all()):
-        raise PolicyError(f"{beside} is damaged; write it again with ballbot_train.save_vecnormalize")
-    return {"mean": mean.double(), "scale": scale.double(), "limit": limit}
+    try:
+        if not files.numbers(arrays["normalized"], "normalized", ()):
+            return None
+        mean = files.numbers(arrays["mean"], "mean")
+        variance = files.numbers(arrays["variance"], "variance", (mean.size,))
+        epsilon, limit = (float(files.numbers(arrays[name], name, ())) for name in ("epsilon", "limit"))
+        if mean.ndim != 1 or limit <= 0 or (variance + epsilon <= 0).any():
+            raise ValueError("mean must be a row of numbers, variance + epsilon and limit positive")
+    except (KeyError, ValueError) as error:
+        raise PolicyError(
+            f"{beside} is damaged ({error}); write it again with ballbot_train.save_vecnormalize"
+        ) from error
+    scale = torch.sqrt(torch.from_numpy(variance + epsilon))
+    return {"mean": torch.from_numpy(mean), "scale": scale, "limit": limit}
 
 
 def _read_rsl(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None]:
-    saved, described = _tensors(files.read(path)), _description_of(path)
+    saved, described = saved_by_torch(files.read(path), path), _description_of(path)
     if isinstance(saved.get("actor_state_dict"), dict):
         weights, first, normalizer = saved["actor_state_dict"], "mlp.", "obs_normalizer."
     elif isinstance(saved.get("model_state_dict"), dict):  # of versions before 4
         weights, first, normalizer = saved["model_state_dict"], "actor.", "actor_obs_normalizer."
     else:
-        raise PolicyError(f"{path} is no checkpoint of rsl_rl: it has {', '.join(map(str, list(saved)[:4]))}")
+        raise PolicyError(f"{path} is no checkpoint of rsl_rl: it has {', '.join(list(saved)[:4]):.200}")
     if not described.exists():
         raise PolicyError(
             f'{path}: a checkpoint of rsl_rl does not name its activation; write {described} with {{"activation": "elu"}}, '
             f"or another of {', '.join(_ACTIVATIONS)}"
         )
-    activation = files.read_json(described)["activation"]
+    activation = files.read_json(described, _DATA_LIMIT)["activation"]
     if activation not in _ACTIVATIONS:
-        raise PolicyError(f"{described} has the activation {activation!r}; known: {', '.join(_ACTIVATIONS)}")
-    layers = _layers(weights, first)
-    _check_layers(path, layers)
+        raise PolicyError(f"{described} has the activation {activation!r:.100}; known: {', '.join(_ACTIVATIONS)}")
+    layers = _layers(path, weights, first)
     statistics = None
     if f"{normalizer}_mean" in weights:
-        mean, std = (weights[f"{normalizer}{name}"].flatten().double() for name in ("_mean", "_std"))
+        parts = checked({name: weights[f"{normalizer}{name}"] for name in ("_mean", "_std")}, path).values()
+        mean, std = (part.flatten().double() for part in parts)
+        if mean.shape != std.shape or (std < 0).any():
+            raise PolicyError(f"{path} has a mean of {len(mean)} observations, and a deviation that does not fit it")
         statistics = {"mean": mean, "scale": std + 1e-2, "limit": float("inf")}
     return layers, activation, {}, statistics
 
@@ -325,32 +333,26 @@ def _description_of(path: str | Path) -> Path:
     return Path(path).with_suffix(".json")
 
 
-def _tensors(content: bytes) -> dict[str, Any]:
-    """What torch saved, as tensors and plain values: nothing is executed."""
-    saved = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
-    if not isinstance(saved, dict):
-        raise ValueError(f"it holds {type(saved).__name__} and no weights")
-    return saved
+def _layers(path: Path, weights: Mapping[str, Any], *prefixes: str) -> list[Any]:
+    """Weight and bias of the linear layers under names that begin so, in order.
 
-
-def _layers(weights: Mapping[str, Any], *prefixes: str) -> list[Any]:
-    """Weight and bias of the linear layers under names that begin so, in order."""
-    layers = []
+    Raises:
+        PolicyError: they are not what `checked` takes, do not follow one another, or do not end in two actions.
+    """
+    names = []
     for prefix in prefixes:
         numbers = {name.removeprefix(prefix).rpartition(".")[0] for name in weights if name.startswith(prefix)}
         for number in sorted(numbers, key=lambda text: int(text or 0)):
             start = f"{prefix}{number}." if number else prefix
-            layers.append((weights[f"{start}weight"].float(), weights[f"{start}bias"].float()))
-    return layers
-
-
-def _check_layers(path: Path, layers: list[Any]) -> None:
-    """Raises a PolicyError where layers do not follow one another, or do not end in two finite actions."""
-    shapes = [tuple(weight.shape) for weight, _ in layers]
-    fitting = all(len(shape) == 2 for shape in shapes) and all(
-        after[1] == before[0] for before, after in itertools.pairwise(shapes)
+            names.append((f"{start}weight", f"{start}bias"))
+    found = checked({name: weights[name] for pair in names for name in pair}, path)
+    layers = [(found[weight], found[bias]) for weight, bias in names]
+    shapes = [tuple(part.shape) for layer in layers for part in layer]
+    fitting = all(weight.ndim == 2 and bias.shape == weight.shape[:1] for weight, bias in layers) and all(
+        after.shape[1] == before.shape[0] for (before, _), (after, _) in itertools.pairwise(layers)
     )
-    if not shapes or not fitting or shapes[-1][0] != 2:
-        raise PolicyError(f"{path} is no network of linear layers that ends in 2 actions: its weights are {shapes}")
-    if not all(part.isfinite().all() for layer in layers for part in layer):
-        raise PolicyError(f"{path} holds NaN or infinity; take an earlier model of the training, or train anew")
+    if not fitting or shapes[-1:] != [(2,)]:
+        raise PolicyError(
+            f"{path} is no network of linear layers that ends in 2 actions: its weights and biases are {shapes!s:.200}"
+        )
+    return layers

@@ -33,6 +33,7 @@ from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
 from ballbot_train.policy import load_network, shipped_policies
 from ballbot_train.saved_models import load_actor
+from ballbot_train.weights import own_precision
 
 try:
     import torch
@@ -283,11 +284,18 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
             if is_saved_model(name)
             else load_network(shipped.get(name, name), task, robot)
         ).eval()
-        return lambda observation: network(observation.float())
+
+        def act(observation: torch.Tensor) -> torch.Tensor:
+            with own_precision():
+                return network(observation.float())
+
+        return act
     if callable(getattr(policy, "predict", None)):
         predictor = Predictor(policy, task, named_robot(robot))
         begins = itertools.chain([True], itertools.repeat(False))
-        return lambda observation: torch.as_tensor(predictor(observation.float().numpy(), next(begins)))
+        return lambda observation: torch.as_tensor(
+            predictor(observation.float().numpy(), next(begins)), device=observation.device
+        )
     if callable(policy):
         function: Any = policy
         return lambda observation: function(observation.float())

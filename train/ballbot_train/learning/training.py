@@ -55,6 +55,7 @@ from ballbot_train.evaluation import evaluate, fresh
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
 from ballbot_train.provenance import provenance
+from ballbot_train.weights import own_defaults, saved_by_torch
 
 _CONFIG = "config.json"
 _VALIDATION_SEED = 0
@@ -223,6 +224,7 @@ def _validation(run: BatchEpisodes, task: Task) -> Validation:
     )
 
 
+@own_defaults()
 def train(
     learner: Learner,
     task: Task,
@@ -319,7 +321,7 @@ class _Run:
         path = self.out / "checkpoint.pt"
         try:
             # tensors and plain values: nothing in it is executed
-            state = torch.load(io.BytesIO(files.read(path, _CHECKPOINT_LIMIT)), weights_only=True)
+            state = saved_by_torch(files.read(path, _CHECKPOINT_LIMIT), path, _CHECKPOINT_LIMIT)
             self.learner.load_state_dict(state["learner"])
             best = self._restored(state["policy"])
             self.seconds = float(state["seconds"])

@@ -62,7 +62,8 @@ class Algorithm:
         """
         if demos is not None and not self.demonstrations:
             raise ValueError(f"{self.module.rpartition('.')[2]} uses no demonstrations")
-        return load(f"{self.module}:make")(task, params, settings, seed, demos)
+        with load("ballbot_train.weights:own_defaults")():
+            return load(f"{self.module}:make")(task, params, settings, seed, demos)
 
 
 _MAY_BE_ZERO = {
