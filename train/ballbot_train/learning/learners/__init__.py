@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from ballbot_gym.lazy import load
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
@@ -52,8 +51,7 @@ class Algorithm:
             task: to learn.
             params: the robot.
             settings: as of `settings`.
-            seed: of everything that the learner draws, which gets the one that `seeding.spawned` makes of it. So learners may
-                seed env i with the i-th number after it.
+            seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
 
         Returns:
@@ -64,7 +62,7 @@ class Algorithm:
         """
         if demos is not None and not self.demonstrations:
             raise ValueError(f"{self.module.rpartition('.')[2]} uses no demonstrations")
-        return load(f"{self.module}:make")(task, params, settings, spawned(seed), demos)
+        return load(f"{self.module}:make")(task, params, settings, seed, demos)
 
 
 _MAY_BE_ZERO = {
