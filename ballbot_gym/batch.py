@@ -17,10 +17,12 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
+from ballbot_gym.lazy import install
+
 try:
     import torch
 except ImportError as error:
-    raise ImportError('batches of environments need torch: pip install "ballbot-gym[train]"') from error
+    raise ImportError(f"batches of environments need torch: {install('train')}") from error
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.env import LARGEST, fixed_error, limit_names, make_task
@@ -209,6 +211,9 @@ class BallbotBatch:
     through `step` into earlier actions until an episode ends; `detach` cuts them. The physics is the closed form of
     `BallbotEnv(physics="rk4")`. `state` is never written into: keep it and assign it again to go on from there. Copies and
     pickles are independent batches in the same state.
+
+    As in Gymnasium, the seed s gives env i the seed s + i. So batches with the seeds 0 and 1 draw the same episodes, moved by
+    one env. Give each run the seed that `seeding.spawned` makes of its own.
     """
 
     def __init__(

@@ -11,11 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ballbot_gym.lazy import install
+
 try:
     import casadi
 except ImportError as error:
     raise ImportError(
-        'environments in machine code need CasADi: pip install "ballbot-gym[baselines]", or give engine="torch"'
+        f'environments in machine code need CasADi: {install("baselines")}. Or give engine="torch"'
     ) from error
 
 from ballbot_gym import dynamics, ops

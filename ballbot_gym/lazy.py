@@ -35,12 +35,15 @@ def need(package: str, *libraries: str) -> None:
             raise missing(package, name)
 
 
-def missing(package: str, library: str | None) -> ModuleNotFoundError:
-    """The error that says which extra brings a library that a package of ours needs."""
-    extra = _EXTRAS[package.partition(".")[0]]
-    return ModuleNotFoundError(
-        f'{package} needs {library}, which is not installed: pip install "ballbot-gym[{extra}]"', name=library
-    )
+def missing(package: str, library: str | None, extra: str | None = None) -> ModuleNotFoundError:
+    """The error that says which extra brings a library; by default the extra of the package of ours that needs it."""
+    extra = extra or _EXTRAS[package.partition(".")[0]]
+    return ModuleNotFoundError(f"{package} needs {library}, which is not installed: {install(extra)}", name=library)
+
+
+def install(extra: str) -> str:
+    """The command that installs an extra, for whoever has the package from an index, and for whoever has a checkout."""
+    return f'pip install "ballbot-gym[{extra}]", or in a checkout pip install -e ".[{extra}]"'
 
 
 def called(entry: str) -> Callable[..., Any]:

@@ -24,6 +24,7 @@ from ballbot_gym.env import (
     observation_space,
     spec_of,
 )
+from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
@@ -36,8 +37,8 @@ try:
     import torch
 except ImportError as error:
     raise ImportError(
-        'vector environments need torch: pip install "ballbot-gym[train]", or use '
-        'gymnasium.make_vec(..., vectorization_mode="sync", physics="rk4"), which needs none'
+        f"vector environments need torch: {install('train')}. Or use gymnasium.make_vec(..., "
+        'vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
 from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, tilt_of

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym.drawing import BALL, FORCE, FORCE_SCALE, PUSH, Drawing, GroundPath, Robot, arrow, pose
+from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.simulator import State
 from ballbot_gym.tasks.marker import Marker
@@ -70,8 +71,8 @@ def import_viser() -> Any:
     """viser, or an ImportError that says what to do."""
     try:
         import viser
-    except ImportError as error:
-        raise ImportError(f'{error}; pip install "ballbot-gym[play]" installs what the page needs') from error
+    except ModuleNotFoundError as error:
+        raise missing("the page", error.name, "play") from error
     return viser
 
 

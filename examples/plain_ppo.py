@@ -6,12 +6,14 @@ Episodes in training last 4 s in place of 8, so that more of the samples are of 
 
 import gymnasium
 import numpy as np
+import torch
 import tyro
 from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 import ballbot_gym  # noqa: F401
+from ballbot_gym.seeding import spawned
 from ballbot_train import evaluate_fresh
 
 
@@ -45,8 +47,9 @@ def main(steps: int = 3_000_000, seed: int = 0, episodes: int = 1000) -> None:
         seed: of everything that is drawn.
         episodes: fresh episodes in the end.
     """
+    torch.set_num_threads(1)  # such a small network is slower on more, and many times so beside other work
     settings = {"learning_rate": lambda left: 2e-3 * left, "batch_size": 2048, "ent_coef": 0.03}
-    model = PPO("MlpPolicy", make_vec_env(make, n_envs=8), seed=seed, device="cpu", **settings).learn(steps)
+    model = PPO("MlpPolicy", make_vec_env(make, n_envs=8), seed=spawned(seed), device="cpu", **settings).learn(steps)
     row = evaluate_fresh(Seen(model), "stabilize", episodes=episodes).summary()
     print(f"success {row.success:.1%}, {row.failures} failures in {episodes}, cost {row.cost_median:.2f} in the median")
 

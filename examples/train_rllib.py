@@ -45,12 +45,15 @@ def main(
         save: folder of a checkpoint in the end.
     """
     import ray as cluster
+    import torch
     from ray.rllib.algorithms.ppo import PPOConfig
 
+    from ballbot_gym.seeding import spawned
     from ballbot_gym.tasks import TASKS
     from ballbot_train import evaluate, evaluate_fresh
     from ballbot_train.rllib import RllibPolicy, register
 
+    torch.set_num_threads(1)  # such a small network is slower on more, and many times so beside other work
     register()
     if not cluster.is_initialized():
         small = (
@@ -68,7 +71,7 @@ def main(
             lr=learning_rate,
             gamma=gamma,
         )
-        .debugging(seed=seed)
+        .debugging(seed=spawned(seed))
     )
     algorithm, began = settings.build_algo(), time.monotonic()
     for i in range(1, iterations + 1):

@@ -1,8 +1,10 @@
 """The commands, as a user runs them."""
 
 import importlib
+import inspect
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -21,7 +23,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.robots import ROBOTS, Robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.commands import COMMANDS, help_of
+from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
 from ballbot_train.commands.certify import certify
 from ballbot_train.commands.compare import compare
 from ballbot_train.evaluation.controllers import make_controller
@@ -164,6 +166,48 @@ def test_every_command_has_one_line_of_help_that_is_its_own(name):
     function = load(COMMANDS[name])
     assert help_of(name) == function.__doc__.strip().partition("\n")[0]
     assert help_of(name).endswith(".")
+
+
+def test_the_commands_that_continue_are_those_that_do_much_work():
+    long = {name for name in COMMANDS if "workers" in inspect.signature(load(COMMANDS[name])).parameters}
+    assert set(RESUMABLE) == long
+
+
+@pytest.mark.parametrize(
+    ("arguments", "how"),
+    [
+        (("evaluate", "lqr", "--task", "turn", "--episodes", 2, "--workers", 1, "--out", "a folder"), "continues"),
+        (("paper", "--only", "stabilize-1"), "starts again"),
+    ],
+)
+def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, how, typed, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ballbot_train.console.Bars.advance", interrupt)
+        patch.setattr("ballbot_train.report.figures.save", interrupt)
+        ended, printed = typed(*arguments)
+    assert (ended, how in printed) == (130, True), printed
+    program, *words = shlex.split(printed.rpartition(": ")[2])
+    assert (program, words) == ("ballbot", [str(word) for word in arguments])
+    assert typed(*words)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option", "help"),
+    [
+        (("train", "shac", "--taks", "turn"), "--task", "ballbot train shac --help"),
+        (("train", "--taks", "turn"), "", "ballbot train --help"),
+        (("train", "shac", "--task"), "--task", "ballbot train shac --help"),
+        (("tune", "ppo", "--tiral", "3"), "--trials", "ballbot tune --help"),
+        (("benchmark", "--taks", "turn"), "--tasks", "ballbot benchmark --help"),
+    ],
+)
+def test_a_mistyped_option_is_answered_with_the_nearest_and_with_a_help_that_exists(arguments, option, help, typed):
+    ended, printed = typed(*arguments)
+    assert (ended, option in printed, help in printed) == (2, True, True), printed
+    assert typed(*help.split()[1:])[0] == 0
 
 
 LOADED = """

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.metadata import metadata
 
 import pytest
 
@@ -12,6 +13,9 @@ def run(code, *blocked):
     start = f"import sys\nfor name in {blocked!r}:\n    sys.modules[name] = None\n"
     done = subprocess.run([sys.executable, "-c", start + code], capture_output=True, text=True)
     return done.stdout + done.stderr
+
+
+TYPED = "import sys\nsys.argv = ['ballbot', '{}']\nfrom ballbot_train.cli import main\nmain()"
 
 
 @pytest.mark.parametrize(
@@ -35,11 +39,18 @@ def run(code, *blocked):
             "ray",
         ),
         ("import ballbot_train.rllib", "ray", "rllib"),
+        ("import ballbot_train.learning.tuning", "optuna", "tune"),
+        (TYPED.format("paper"), "matplotlib", "train"),
+        (TYPED.format("demos"), "minari", "train"),
+        (TYPED.format("compare"), "tyro", "train"),
         ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
     ],
 )
 def test_missing_library_names_its_extra(code, library, extra):
-    assert f'pip install "ballbot-gym[{extra}]"' in run(code, library)
+    wrote = run(code, library)
+    assert library in wrote
+    assert f'pip install "ballbot-gym[{extra}]", or in a checkout pip install -e ".[{extra}]"' in wrote
+    assert extra in metadata("ballbot-gym").get_all("Provides-Extra")
 
 
 EXTRAS = (

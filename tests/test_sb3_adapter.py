@@ -9,6 +9,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 from ballbot_gym import dynamics
+from ballbot_gym.seeding import spawned
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning.sb3 import BallbotVecEnv
 
@@ -33,7 +34,7 @@ def test_terminal_observation_is_the_last_of_the_old_episode_and_the_returned_on
     env, same = make(duration=0.1, engine="torch"), BallbotVectorEnv(4, duration=0.1, engine="torch")
     env.seed(3)
     first = env.reset()
-    np.testing.assert_array_equal(first, same.reset(seed=3)[0])
+    np.testing.assert_array_equal(first, same.reset(seed=spawned(3))[0])
     for _ in range(5):
         observation, _, done, infos = env.step(np.zeros((4, 2)))
         x = same.batch.state.x

@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -168,6 +169,33 @@ def test_a_killed_run_resumes_to_the_same_result(tmp_path, typed):
     assert (measured[0]["physics"], measured[0]["episodes"]) == ("bullet", 8)
     ended, printed = typed("train", *common, "--seed", 1, "--out", killed, "--resume")
     assert (ended, "holds a run of seed" in printed) == (1, True), printed
+
+
+def test_after_ctrl_c_the_printed_command_continues_as_does_a_copy_of_the_folder(tmp_path, typed, monkeypatch):
+    iterate = shac.Shac.iterate
+
+    def interrupted(self):
+        if self.iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+        return iterate(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shac.Shac, "iterate", interrupted)
+        ended, printed = typed("train", "shac", *SETTINGS, "--out", "a run")
+    assert (ended, "this continues where it stopped" in printed) == (130, True), printed
+    shutil.copytree(tmp_path / "a run", tmp_path / "copy")
+    words = shlex.split(printed.rpartition(": ")[2])
+    assert (words[:2], words[-1]) == (["ballbot", "train"], "--resume")
+    for command in (words[1:], [word.replace("a run", "copy") for word in words[1:]]):
+        ended, printed = typed(*command)
+        assert ended == 0, printed
+    records = [json.loads((tmp_path / name / "config.json").read_text()) for name in ("a run", "copy")]
+    assert "--out copy" in records[1].pop("command")
+    assert "--out 'a run'" in records[0].pop("command")
+    assert [record.pop("about")["commit"] for record in records]
+    assert records[0] == records[1]
+    weights = [(tmp_path / name / "policy.safetensors").read_bytes() for name in ("a run", "copy")]
+    assert weights[0] == weights[1]
 
 
 @pytest.mark.parametrize(

@@ -4,17 +4,23 @@
 """
 
 import difflib
+import os
+import shlex
+import shutil
 import sys
+from pathlib import Path
 from typing import Any
 
 try:
     from rich.table import Table
 
     from ballbot_train.escaping import PlainConsole
-except ImportError as error:
-    sys.exit(f'ballbot: {error}; pip install "ballbot-gym[train]" installs what the commands need')
+except ModuleNotFoundError as error:
+    from ballbot_gym.lazy import missing
 
-from ballbot_train.commands import COMMANDS, help_of
+    sys.exit(str(missing("ballbot", error.name, "train")))
+
+from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
@@ -48,12 +54,12 @@ def _run(arguments: list[str]) -> int:
     try:
         _call(command, options)
     except KeyboardInterrupt:
-        errors.print("interrupted; the same command continues where it stopped")
+        errors.print(f"interrupted; {_again(command, options)}")
         return 130
     except ModuleNotFoundError as error:
-        hint = (
-            "" if "pip install" in str(error) else '; pip install "ballbot-gym[train]" installs what the commands need'
-        )
+        from ballbot_gym.lazy import install
+
+        hint = "" if "pip install" in str(error) else f"; the commands need {install('train')}"
         errors.print(f"ballbot: {error}{hint}", style="red")
         return 1
     except (ValueError, TypeError, ImportError, OSError, RuntimeError) as error:
@@ -69,11 +75,25 @@ def _call(command: str, options: list[str]) -> Any:
 
     from ballbot_gym.lazy import load
 
+    # Before torch, NumPy or CasADi are imported, here and in the processes of this one: these nets and batches are too small
+    # for a second thread, and beside other work threads wait for each other at every operation.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     function = load(COMMANDS[command])
     # the options of some commands depend on what is typed, so these commands parse it themselves
     if parse := getattr(sys.modules[function.__module__], "command_line", None):
         return parse(options)
     return tyro.cli(function, args=options, prog=f"ballbot {command}")
+
+
+def _again(command: str, options: list[str]) -> str:
+    """What to type after an interruption."""
+    if command == "train" and "--resume" not in options:
+        options = [*options, "--resume"]
+    program = [sys.argv[0]] if Path(sys.argv[0]).name == "ballbot" else [sys.executable, "-m", "ballbot_train.cli"]
+    if program == [shutil.which("ballbot")]:
+        program = ["ballbot"]
+    does = "this continues where it stopped" if command in RESUMABLE else "this starts again"
+    return f"{does}:\n{shlex.join([*program, command, *options])}"
 
 
 def _is_expected(error: RuntimeError) -> bool:

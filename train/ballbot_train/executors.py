@@ -23,11 +23,11 @@ from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import Any, Literal, Protocol
 
+from ballbot_gym.lazy import missing
 from ballbot_train.console import console
 
 _NODE_SECONDS = 5.0  # how often the nodes of a cluster are counted
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
-_INSTALL = 'pip install "ballbot-gym[ray]"'
 
 
 class WorkerError(RuntimeError):
@@ -254,7 +254,7 @@ def _cluster(workers: Workers, per_core: int) -> Iterator[Pool]:
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"--ray needs ray, which is not installed: {_INSTALL}", name="ray") from error
+        raise missing("--ray", error.name, "ray") from error
     connected = ray.is_initialized()
     with TemporaryDirectory() as folder:
         if not connected:

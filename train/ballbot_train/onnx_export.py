@@ -131,6 +131,4 @@ def _require(library: str) -> None:
     try:
         __import__(library)
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f'ONNX files need {library}, which is not installed: pip install "ballbot-gym[onnx]"', name=library
-        ) from error
+        raise missing("an ONNX file", library, "onnx") from error

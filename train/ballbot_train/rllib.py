@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import ballbot_gym
+from ballbot_gym.lazy import missing
 from ballbot_gym.tasks import TASKS
 
 try:
@@ -17,8 +18,8 @@ try:
     import torch
     from ray.rllib.core.columns import Columns  # pyright: ignore[reportMissingImports]
     from ray.tune.registry import register_env  # pyright: ignore[reportMissingImports]
-except ImportError as error:
-    raise ImportError(f'{error}; pip install "ballbot-gym[rllib]" installs what ballbot_train.rllib needs') from error
+except ImportError as error:  # Ray without RLlib raises one without a name
+    raise missing(__name__, error.name or str(error), "rllib") from error
 
 
 def register() -> list[str]:

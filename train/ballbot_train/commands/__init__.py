@@ -28,6 +28,9 @@ COMMANDS: dict[str, str] = {
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 
+RESUMABLE = ("benchmark", "evaluate", "robustness", "transfer", "basins", "certify", "demos", "train", "tune")
+"""Those that continue where they were interrupted; `train` does it with --resume."""
+
 
 def help_of(name: str) -> str:
     """The first line of a command's docstring, read from its file without importing it."""

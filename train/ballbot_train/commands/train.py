@@ -41,8 +41,8 @@ class Run:
     command continues a queue that was stopped."""
     workers: WorkersOption = Workers()
     """Who does the runs of --seeds, each on one core; by default one after another here, and all cores of a cluster."""
-    threads: int | None = None
-    """Threads of torch; default, torch's own choice. Another number changes the last digits."""
+    threads: int = 1
+    """Threads of torch. Another number changes the last digits; more than one is slower beside other work."""
     out: Path | None = None
     """Folder of the run, or of all runs of --seeds; default runs/train/TASK-LEARNER."""
     test_episodes: int = certified.EPISODES
@@ -61,7 +61,7 @@ def train(
     start: Path | None = None,
     seed: int = 0,
     settings: Any = None,
-    threads: int | None = None,
+    threads: int = 1,
     out: Path | None = None,
     test_episodes: int = certified.EPISODES,
     validation_episodes: int = VALIDATION_EPISODES,
@@ -80,7 +80,7 @@ def train(
         start: policy file whose weights training starts from, of any robot; only for apg, rsl_ppo and shac.
         seed: seed of everything that is drawn.
         settings: the learner's settings; default, those tuned for the task.
-        threads: threads of torch; default, torch's own choice. Another number changes the last digits.
+        threads: threads of torch. Another number changes the last digits; more than one is slower beside other work.
         out: folder of the run; default runs/train/TASK-LEARNER.
         test_episodes: on how many of the certified episodes the policy is measured in the end, from the first.
         validation_episodes: on how many fresh episodes the policy is chosen that the run keeps.
@@ -93,7 +93,7 @@ def train(
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
     algorithm = LEARNERS[learner]
-    if threads is not None and not 1 <= threads <= _MOST_THREADS:
+    if not 1 <= threads <= _MOST_THREADS:
         raise ValueError(f"threads must be 1 to {_MOST_THREADS}, not {threads}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
@@ -130,21 +130,19 @@ def train(
     from ballbot_train.learning.demonstrations import command_of
     from ballbot_train.policy import load_network, read_description
 
-    if threads is not None:
-        torch.set_num_threads(threads)
+    torch.set_num_threads(threads)
     problem = make_task(task, robot)
     settings = algorithm.settings(task) if settings is None else settings
     check_settings(settings)
     if command is None:
         command = command_with(learner, run, settings)
     # the record also says how the demonstrations, or the policy to start from, were made
-    if demos is not None:
-        command = f"{command_of(demos)} && {command}"
+    inputs = [] if demos is None else [command_of(demos)]
     if start is not None:
         trained = read_description(start).get("training")
         if not isinstance(trained, dict) or not isinstance(trained.get("command"), str):
             raise ValueError(f"{start} does not say by which command it was trained; give a policy of ballbot train")
-        command = f"{trained['command']} && {command}"
+        inputs.append(trained["command"])
     config = {
         "learner": learner,
         "task": task,
@@ -152,7 +150,8 @@ def train(
         "demos": None if demos is None else str(demos),
         "settings": asdict(settings),
         "start": None if start is None else str(start),
-        "command": command,
+        "command": " && ".join([*reversed(inputs), command]),
+        **({"inputs": inputs} if inputs else {}),
         **robot_setting(robot),
         **({} if validation_episodes == VALIDATION_EPISODES else {"validation_episodes": validation_episodes}),
     }
@@ -236,15 +235,16 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     import tyro
 
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--task", default=Run.task)
+    early.add_argument("--task", nargs="?", default=Run.task, const=Run.task)  # tyro says what is wrong with no value
     task = early.parse_known_args(arguments)[0].task
     named = arguments[0] if arguments and not arguments[0].startswith("-") else None
     if named is not None:
         check_names("learner", [named], LEARNERS)
         check_names("task", [task], TASKS)
-    commands = {name: _command(name, task, call, complete=name == named) for name in LEARNERS}
+        tyro.cli(_command(named, task, call), prog=f"ballbot train {named}", args=list(arguments[1:]))
+        return
     tyro.extras.subcommand_cli_from_dict(
-        commands,
+        {name: _command(name) for name in LEARNERS},
         prog="ballbot train",
         description="Trains a policy on the batched model, and measures it in PyBullet on the certified episodes. "
         "`ballbot train LEARNER --help` lists the settings of a learner, with the defaults tuned for --task.",
@@ -257,6 +257,7 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
     words = ["ballbot", "train", learner]
     defaults = {  # settings of which older records know nothing
         "robot": PAPER,
+        "threads": 1,
         "test_episodes": certified.EPISODES,
         "validation_episodes": VALIDATION_EPISODES,
     }
@@ -277,8 +278,8 @@ def _option(name: str, value: Any) -> list[str]:
     return [f"--{name}", *map(str, value if isinstance(value, tuple | list) else [value])]
 
 
-def _command(name: str, task: str, call: Callable[[str, Run, Any], None], complete: bool) -> Callable[..., None]:
-    """A learner's command as a function whose signature tyro reads; one that is not complete has no options yet."""
+def _command(name: str, task: str = "", call: Callable[[str, Run, Any], None] | None = None) -> Callable[..., None]:
+    """A learner's command as a function whose signature tyro reads; one that is not to be called has no options."""
 
     def without_options() -> None:
         raise AssertionError("only a learner that is named is called")
@@ -286,7 +287,7 @@ def _command(name: str, task: str, call: Callable[[str, Run, Any], None], comple
     import tyro
 
     function: Callable[..., None] = without_options
-    if complete:
+    if call is not None:
         settings = LEARNERS[name].settings(task)
 
         def with_options(run: Any = Run(), settings: Any = settings) -> None:

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ballbot_gym import certified
+from ballbot_gym import certified, seeding
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -175,7 +175,7 @@ def run_episodes(
         name: of the controller, in the results.
         task: the task's name, in the results.
         episodes: their indices.
-        seed: of what the env's randomization draws, episode i with seed + i.
+        seed: of what the env's randomization draws; no two seeds share what an episode draws.
 
     Raises:
         CertificateError: there is no certified set of the env's task and robot.
@@ -204,7 +204,7 @@ def iterate_episodes(
             "optimum": optimum,
         }
         try:
-            run = rollout(env, controller, seed=seed + i, options=episode_set.options(i))
+            run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=episode_set.options(i))
         except PlanError as error:
             outcome: dict[str, Any] = {
                 "cost": env.task.survival_pay,

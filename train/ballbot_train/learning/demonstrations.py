@@ -42,7 +42,7 @@ from minari.dataset.minari_dataset import parse_dataset_id
 from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
-from ballbot_gym import files
+from ballbot_gym import files, seeding
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
@@ -56,7 +56,7 @@ from ballbot_train.policy import OBSERVATION_VERSION
 
 _CHUNK = 5  # episodes of a job
 _ARRAYS = "npz"  # where an entry holds the arrays of its episode
-_SEEDS = 1_000_000  # episode seeds per dataset seed, so that datasets of different seeds share none
+_MOST_EPISODES = 1_000_000
 _NOT_SEARCHED = {"optimum": math.nan, "solver_status": "not searched", "violation": math.nan}
 
 
@@ -88,8 +88,8 @@ class DemoConfig:
     def __post_init__(self) -> None:
         task = make_task(self.task, self.robot)
         check_names("expert", [self.expert], controllers.names(task, self.robot))
-        if not 1 <= self.episodes <= _SEEDS:
-            raise ValueError(f"episodes must be 1 to {_SEEDS}, not {self.episodes}")
+        if not 1 <= self.episodes <= _MOST_EPISODES:
+            raise ValueError(f"episodes must be 1 to {_MOST_EPISODES}, not {self.episodes}")
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
         for name in ("noise", "pushes"):
@@ -101,7 +101,7 @@ class DemoConfig:
 
     def episode_seed(self, i: int) -> int:
         """Seed with which the env is reset in episode i."""
-        return _SEEDS * (self.seed + 1) + i
+        return seeding.of_episode(self.seed + 1, i)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.seeding import spawned
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -26,18 +27,18 @@ class RslVecEnv:
         seed: int = 0,
         critic_inputs: Callable[[torch.Tensor], torch.Tensor] | None = None,
     ):
-        """Starts an episode in every env; env i has the seed seed + i.
+        """Starts an episode in every env.
 
         Args:
             batch: the envs.
-            seed: of the first env.
+            seed: of the run; those with other seeds meet other episodes.
             critic_inputs: maps observations (B, n) to what the critic sees, such as `critics.CriticInputs`.
         """
         self._critic_inputs = critic_inputs
         self.batch, self.num_envs, self.device = batch, batch.num_envs, batch.device
         self.max_episode_length = batch.task.steps
         self.cfg: dict[str, Any] = {"task": batch.task.id, "num_envs": batch.num_envs}
-        batch.reset(seed)
+        batch.reset(spawned(seed))
 
     @property
     def episode_length_buf(self) -> torch.Tensor:

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
+from ballbot_gym.seeding import spawned
 from ballbot_gym.vector import BallbotVectorEnv
 
 
@@ -48,6 +49,10 @@ class BallbotVecEnv(VecEnv):
         self._made = time.time()
         self._actions: np.ndarray | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seeds the envs for the next reset, with numbers that runs with other seeds do not use; returns these numbers."""
+        return super().seed(None if seed is None else spawned(seed))
 
     def reset(self) -> np.ndarray:
         """Starts an episode in every env, with the seeds and options set since the last reset."""

@@ -238,8 +238,8 @@ def train(
     Args:
         learner: before its first iteration.
         task: the task; it needs certified episodes.
-        config: contents of config.json; a run resumes only with the same. Its "robot" names the robot, if it is not the
-            paper's.
+        config: contents of config.json; a run resumes only with the same, but for the "command". Its "robot" names the
+            robot, if it is not the paper's.
         out: folder of the run.
         resume: continue the run in `out`, if there is one.
         test_episodes: of the certified ones, on how many the policy is measured, from the first.
@@ -308,7 +308,9 @@ class _Run:
         self.validation_episodes = self.config.get("validation_episodes", VALIDATION_EPISODES)
         if (out / _CONFIG).exists() and not resume:
             raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
-        jobs.claim(out, self.config, _CONFIG, {"about": provenance()})
+        compared = {name: value for name, value in self.config.items() if name != "command"}
+        # a command names the folder, which may have been moved or copied, and every setting is compared without it
+        jobs.claim(out, compared, _CONFIG, {"command": self.config.get("command"), "about": provenance()})
         try:
             if (out / "checkpoint.pt").exists():
                 self._restore()

@@ -37,6 +37,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
+from ballbot_gym.lazy import missing
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
@@ -47,8 +48,8 @@ from ballbot_train.learning.learners import LEARNERS
 try:
     import optuna
     import sqlalchemy.exc  # Optuna's
-except ImportError as error:
-    raise ImportError(f'{error}; pip install "ballbot-gym[tune]" installs what ballbot tune needs') from error
+except ModuleNotFoundError as error:
+    raise missing("ballbot tune", error.name, "tune") from error
 
 _STARTUP_TRIALS = 8  # drawn at random before the estimator proposes, and before any trial is pruned
 _ITERATIONS = ("rl_iterations", "total_iterations")  # names of the setting that bounds a training

@@ -51,7 +51,7 @@ class Algorithm:
             task: to learn.
             params: the robot.
             settings: as of `settings`.
-            seed: of everything that the learner draws.
+            seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
 
         Returns:

@@ -20,6 +20,7 @@ import torch
 
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import Symmetry, average_of, spec_for
@@ -107,7 +108,7 @@ class Apg:
         self.iterations, self.evaluations = config.total_iterations, config.evaluations
         self.task = replace(task, duration=config.episode_seconds)
         self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
-        self._batch.reset(seed=seed)
+        self._batch.reset(seed=spawned(seed))
         network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
         start_as_lqr(network, task, params)
         self._make(network)

@@ -22,6 +22,7 @@ from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, spec_for
@@ -185,11 +186,11 @@ class Shac:
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), config.learning_rate, betas=(0.7, 0.95))
         self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
-        self._start = self._batch.reset(seed=seed)  # (B, no) first observations of the running episodes
+        self._start = self._batch.reset(seed=spawned(seed))  # (B, no) first observations of the running episodes
         dear = round(config.dear_share * config.reset_fraction * config.num_envs)  # new episodes of an iteration
         self._drawn = BallbotBatch(self.task, _DEAR_AMONG * dear, compile=False, params=params) if dear else None
         if self._drawn is not None:
-            self._drawn.reset(seed=seed + config.num_envs)
+            self._drawn.reset(seed=spawned(seed) + config.num_envs)
         self._step = self._one_step
         if config.compile:
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
