@@ -125,20 +125,13 @@ def test_plan_that_cannot_be_found_is_an_error_at_reset(make_env, params):
         rollout(env, TrajoptController(env.task, params), options={"state": [0, 0, 1.3, 0, 0, 0, 5.0, 0]})
 
 
-def test_tracker_applies_the_plan_on_the_plan(params):
-    t, rng = 0.02 * np.arange(6), np.random.default_rng(0)
+def test_tracker_applies_the_plan_on_the_plan_from_its_reset_on(params, rng):
+    t = 0.02 * np.arange(6)
     plan = Trajectory(t, rng.normal(size=(6, 8)), rng.normal(size=(5, 2)))
     tracker = TvlqrController.for_task(Stabilize(), params, plan)
-    tracker.reset(0.0, plan.x[0], np.zeros(0))
-    for k in range(5):
-        np.testing.assert_allclose(tracker.act(t[k], plan.x[k]), plan.u[k], atol=1e-9)
-
-
-def test_tracker_starts_when_it_is_reset(params):
-    plan = Trajectory([0.0, 0.02, 0.04], np.ones((3, 8)), np.array([[1.0, 2.0], [3.0, 4.0]]))
-    tracker = TvlqrController.for_task(Stabilize(), params, plan)
     tracker.reset(7.0, plan.x[0], np.zeros(0))
-    np.testing.assert_allclose(tracker.act(7.02, plan.x[1]), [3.0, 4.0])
+    for k in range(5):
+        np.testing.assert_allclose(tracker.act(7.0 + t[k], plan.x[k]), plan.u[k], atol=1e-9)
 
 
 def test_past_a_plan_that_ends_at_rest_the_tracker_is_lqr(params):

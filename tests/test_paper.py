@@ -7,7 +7,7 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import guess as guesses
 from ballbot_baselines.collocation import Guess, collocation_error, solve
-from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, circular_orbit, state, straight_guess
+from ballbot_baselines.paper_problems import PAPER_PROBLEMS, between_states, state, straight_guess
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.orbit import orbit_tilt
@@ -229,13 +229,6 @@ def test_resampling_keeps_the_ends_and_straight_lines():
     np.testing.assert_allclose(
         guesses.resampled(values, 10), np.column_stack([np.linspace(0, 1, 11), np.linspace(3, -1, 11)])
     )
-
-
-def test_orbits_start_on_the_y_axis_and_close(params):
-    problem = circular_orbit("any", 3.0)
-    assert problem.initial[0][0] == problem.initial[1][0] == 0
-    assert problem.periodic
-    assert len(problem.free) == 1
 
 
 def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):

@@ -8,17 +8,9 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines import (
-    LqrController,
-    NmpcController,
-    TrajoptController,
-    certification,
-    find_optimum,
-    righting,
-    search,
-    shooting,
-)
-from ballbot_baselines.ocp import FEASIBLE
+from ballbot_baselines import LqrController, NmpcController, TrajoptController, certification, find_optimum, righting
+from ballbot_baselines.ocp import FEASIBLE, OcpSolver
+from ballbot_baselines.optimum import FROM_RIGHTING
 from ballbot_gym import dynamics
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -42,7 +34,7 @@ def steep(params):
 
 def test_leaning_by_60_degrees_is_recovered_at_less_than_the_cost_of_staying_in_the_plane(steep):
     assert steep.is_optimal
-    assert steep.guess == search.FROM_RIGHTING
+    assert steep.guess == FROM_RIGHTING
     assert steep.cost == pytest.approx(78.088156, rel=1e-6)
     # 99.31 is the stationary episode in the plane of the fall: a saddle point
     assert steep.cost < 99.31
@@ -83,24 +75,13 @@ def test_no_member_rights_what_the_whole_force_cannot(params):
     assert righting.righted(task, params, leaning(75, lean_rate=3.0), NO_CONSTANTS, params.force_limit) == []
 
 
-class Altered:
-    """A solver whose solutions are changed."""
-
-    def __init__(self, solver, change):
-        self.ocp, self.solver, self.change = solver.ocp, solver, change
-
-    def solve(self, *args):
-        return replace(self.solver.solve(*args), success=False, **self.change)
-
-
 @pytest.fixture
 def altered(monkeypatch):
     """Has every solver fail, with given fields of its solutions."""
+    solve = OcpSolver.solve
 
     def alter(**change):
-        make = shooting.shooting_solver
-        for module in (search, shooting):
-            monkeypatch.setattr(module, "shooting_solver", lambda *args, **kw: Altered(make(*args, **kw), change))
+        monkeypatch.setattr(OcpSolver, "solve", lambda *args: replace(solve(*args), success=False, **change))
 
     return alter
 
