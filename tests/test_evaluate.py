@@ -109,7 +109,7 @@ def test_a_file_without_episodes_is_refused(tmp_path):
     "name", ["=cmd|' /C calc'!A0.json", "+1+1", "@SUM(A1)", "-x", "'=x", "\tx", "plain", 'a,"b"', "'x"]
 )
 def test_a_name_is_no_formula_in_csv_and_is_read_back_as_it_was(name, tmp_path):
-    results = [result(controller=name, note=name)]
+    results = [result(controller=name, note=name, effort=1.0)]
     write_leaderboard(leaderboard(results), results, {}, tmp_path)
     with (tmp_path / "episodes.csv").open() as file:
         (row,) = csv.DictReader(file)

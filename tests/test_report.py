@@ -149,14 +149,13 @@ def test_the_report_of_a_robot_shows_nothing_of_another(tmp_path):
     replays = {robot: replay_of("stabilize", ["lqr"], results, "rk4", robot) for robot in ("paper", "rolling")}
     assert {robot: replay.params for robot, replay in replays.items()} == {r: named_robot(r) for r in replays}
     (tmp_path / "basins").mkdir()
-    picture = figures.save(figures.trajectory_figure("t", []), tmp_path / "basins" / "basins.png")
+    (tmp_path / "basins" / "basins.png").write_bytes(b"a picture")
     (tmp_path / "basins" / "basins.json").write_text('{"about": {"robot": "rolling"}}')
     arguments = (HEADER, ROWS, results, {"stabilize": ["lqr"]}, [], "rk4", tmp_path, "")
     shown = {
         robot: [section.title for section in leaderboard_sections(*arguments, robot) if section is not None]
         for robot in ("paper", "rolling")
     }
-    assert picture.exists()
     assert "Basins of attraction" in shown["rolling"]
     assert "Basins of attraction" not in shown["paper"]
 
