@@ -164,7 +164,9 @@ def _read_sb3(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, A
     options = data.get("policy_kwargs") or {}
     unknown = [name for name in weights if "features_extractor" in name or "lstm" in name]
     if unknown or "features_extractor_class" in options:
-        raise PolicyError(f"{path} extracts features ({(unknown or ['features_extractor_class'])[0]:.100}); {_SUPPORTED}")
+        raise PolicyError(
+            f"{path} extracts features ({(unknown or ['features_extractor_class'])[0]:.100}); {_SUPPORTED}"
+        )
     output: dict[str, float] = {}
     if "action_net.weight" in weights:
         layers, usual = _layers(path, weights, "mlp_extractor.policy_net.", "action_net."), "tanh"
