@@ -164,8 +164,8 @@ def _array(content: bytes) -> np.ndarray:
     return array.reshape(shape, order="F" if fortran else "C").copy()
 
 
-def numbers(value: Any, what: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """value as a float64 array, if it holds real numbers, and all are finite. `what` is its name in messages.
+def numbers(value: Any, what: str, shape: tuple[int, ...] | None = None, most: float = math.inf) -> np.ndarray:
+    """value as a float64 array, if it holds real numbers, all finite and within ±most. `what` is its name in messages.
 
     Whole numbers are real. Complex numbers, truth values, text and whole numbers of more than 64 bits are not.
 
@@ -183,6 +183,8 @@ def numbers(value: Any, what: str, shape: tuple[int, ...] | None = None) -> np.n
     array = array.astype(np.float64, copy=False)
     if not np.isfinite(array).all():
         raise ValueError(f"{what} must be finite numbers, and it holds NaN or infinity")
+    if (np.abs(array) > most).any():
+        raise ValueError(f"{what} must be numbers within ±{most:g}")
     return array
 
 

@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium
+import h5py
 import minari
 import numpy as np
 from minari.data_collector import EpisodeBuffer
@@ -43,7 +44,7 @@ from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import files, seeding
-from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.env import LARGEST, BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import Controller, PlanError
@@ -57,6 +58,16 @@ from ballbot_train.policy import OBSERVATION_VERSION
 _CHUNK = 5  # episodes of a job
 _ARRAYS = "npz"  # where an entry holds the arrays of its episode
 _MOST_EPISODES = 1_000_000
+_IN_DATASET = {  # where Minari keeps the arrays of an episode, by their names in a shard
+    "observations": "observations",
+    "states": "infos/state",
+    "labels": "infos/expert_action",
+    "actions": "actions",
+    "rewards": "rewards",
+    "terminations": "terminations",
+    "truncations": "truncations",
+}
+_UNFIT = (KeyError, ValueError, IndexError, TypeError)  # arrays that do not fit together
 _NOT_SEARCHED = {"optimum": math.nan, "solver_status": "not searched", "violation": math.nan}
 
 
@@ -394,24 +405,9 @@ def _opened(url: str | Path, task: Task) -> shards.Shards:
 def _of_shard(opened: shards.Shards, number: int, task: Task) -> Demos:
     arrays = opened.read(number)
     try:
-        first = np.cumsum(arrays["lengths"] + 1) - arrays["lengths"] - 1  # where the observations of each episode begin
-        inner = np.ones(len(arrays["observations"]), bool)
-        inner[first] = False
-        last = np.ones(len(arrays["observations"]), bool)
-        last[first + arrays["lengths"]] = False
-        demos = Demos(
-            observations=arrays["observations"][last],
-            actions=arrays["labels"],
-            rewards=arrays["rewards"].astype(np.float32),
-            next_observations=arrays["observations"][inner],
-            terminations=arrays["terminations"],
-            truncations=arrays["truncations"],
-            executed=arrays["actions"],
-        )
-        _check(demos, len(task.observation_scale))
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise ValueError(f"shard {number} of {opened.url} is damaged; make the set anew ({error!r})") from error
-    return demos
+        return _demos(arrays, len(task.observation_scale))
+    except _UNFIT as error:
+        raise _damaged_shard(opened, number, error) from error
 
 
 def dataset_folder(out: Path) -> Path:
@@ -445,11 +441,9 @@ def load_demos(path: str | Path, task: Task) -> Demos:
     path = Path(path)
     _check_made_for(str(path), _metadata(path), task)
     try:
-        demos = _read(path / "data")
-        _check(demos, len(task.observation_scale))
-    except Exception as error:  # Minari and h5py have dozens of ways to refuse a damaged file
-        raise ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r})') from error
-    return demos
+        return _demos(_dataset(path), len(task.observation_scale))
+    except Exception as error:  # h5py has dozens of ways to refuse a damaged file
+        raise _damaged_dataset(path, error) from error
 
 
 def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task) -> None:
@@ -471,60 +465,97 @@ def demonstrated_states(path: str | Path, task: Task) -> list[tuple[np.ndarray, 
     """
     if shards.is_set(path):
         return _states_of_shards(_opened(path, task), task)
-    load_demos(path, task)  # it checks the whole dataset
-    data = minari.MinariDataset(Path(path) / "data")
-    env = BallbotEnv(task, physics="rk4")
-    episodes = []
-    for episode, about in zip(data, data.storage.get_episode_metadata(data.episode_indices), strict=True):
-        if about["success"]:
-            _, info = env.reset(seed=int(about["seed"]))  # constants follow from the seed
-            episodes.append((np.asarray(episode.infos["state"], np.float64), info["constants"]))
-    env.close()
-    return episodes
+    _check_made_for(str(path), _metadata(Path(path)), task)
+    try:
+        arrays = _dataset(Path(path))
+        _demos(arrays, len(task.observation_scale))  # it checks the arrays
+        return _successes(arrays, task)
+    except Exception as error:  # h5py has dozens of ways to refuse a damaged file
+        raise _damaged_dataset(path, error) from error
 
 
 def _states_of_shards(opened: shards.Shards, task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
+    found = []
+    for number in opened.numbers:
+        arrays = opened.read(number)
+        try:
+            found += _successes(arrays, task)
+        except _UNFIT as error:
+            raise _damaged_shard(opened, number, error) from error
+    return found
+
+
+def _successes(arrays: Mapping[str, np.ndarray], task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
+    """States (T+1, 8) and constants (nc,) of the successful episodes among some."""
+    states = files.numbers(arrays["states"], "states", (int((arrays["lengths"] + 1).sum()), 8))
+    parts = np.split(states, np.cumsum(arrays["lengths"] + 1)[:-1])
     env = BallbotEnv(task, physics="rk4")
-    episodes = []
-    for arrays in opened:
-        states = np.split(arrays["states"], np.cumsum(arrays["lengths"] + 1)[:-1])
-        for each, text in zip(states, arrays["about"], strict=True):
-            about = json.loads(str(text))
-            if about["success"]:
-                _, info = env.reset(seed=int(about["seed"]))  # constants follow from the seed
-                episodes.append((each, info["constants"]))
+    found = []
+    for each, text in zip(parts, arrays["about"], strict=True):
+        about = json.loads(str(text))
+        if about["success"]:
+            _, info = env.reset(seed=int(about["seed"]))  # constants follow from the seed
+            found.append((each, info["constants"]))
     env.close()
-    return episodes
+    return found
 
 
-def _read(data: Path) -> Demos:
-    """The episodes of Minari's folder."""
-    episodes = list(minari.MinariDataset(data))
+def _dataset(path: Path) -> dict[str, np.ndarray]:
+    """A dataset's HDF5 as arrays of a shard; see `_arrays_of`.
 
-    def joined(kind: type, part: Callable[[Any], np.ndarray]) -> np.ndarray:
-        return np.concatenate([np.asarray(part(episode), kind) for episode in episodes])
+    Minari itself would make the env that a dataset describes, with whatever code that names, and read arrays of any size.
+    """
+    main = path / "data" / "main_data.hdf5"
+    if not main.is_file():
+        raise ValueError(f"{main} is no regular file")
+    size, declared, about = main.stat().st_size, 0, []
+    arrays: dict[str, list[np.ndarray]] = {name: [] for name in _IN_DATASET}
+    with h5py.File(main, "r") as file:
+        for i in range(len(file)):
+            group: Any = file[f"episode_{i}"]
+            declared += sum(group[place].nbytes for place in _IN_DATASET.values())
+            if declared > size:
+                raise ValueError(f"its arrays declare more than the {size} bytes of {main.name}")
+            for name, place in _IN_DATASET.items():
+                arrays[name].append(group[place][()])
+            about.append(json.dumps({name: int(group.attrs[name]) for name in ("seed", "success")}))
+    lengths = np.array([len(each) for each in arrays["actions"]], np.int64)
+    joined = {name: np.concatenate(parts) for name, parts in arrays.items()}
+    return joined | {"lengths": lengths, "about": np.array(about)}
 
+
+def _demos(arrays: Mapping[str, np.ndarray], observations: int) -> Demos:
+    """The demonstrations of a shard's arrays, with so many observations.
+
+    Raises:
+        KeyError, ValueError, IndexError, TypeError: they do not fit together, or one holds something else than numbers.
+    """
+    lengths = arrays["lengths"]
+    n, ends = int(lengths.sum()), np.cumsum(lengths + 1) - 1  # where the observations of each episode end
+    shapes = {"observations": (n + len(lengths), observations), "labels": (n, 2), "actions": (n, 2), "rewards": (n,)}
+    found = {
+        name: files.numbers(arrays[name], name, shape, LARGEST).astype(np.float32) for name, shape in shapes.items()
+    }
+    for name in ("terminations", "truncations"):
+        if arrays[name].dtype != np.bool_ or arrays[name].shape != (n,):
+            raise ValueError(f"{name} must be {n} truth values, not {arrays[name].shape} of {arrays[name].dtype}")
     return Demos(
-        observations=joined(np.float32, lambda e: e.observations[:-1]),
-        actions=joined(np.float32, lambda e: e.infos["expert_action"]),
-        rewards=joined(np.float32, lambda e: e.rewards),
-        next_observations=joined(np.float32, lambda e: e.observations[1:]),
-        terminations=joined(np.bool_, lambda e: e.terminations),
-        truncations=joined(np.bool_, lambda e: e.truncations),
-        executed=joined(np.float32, lambda e: e.actions),
+        observations=np.delete(found["observations"], ends, 0),
+        actions=found["labels"],
+        rewards=found["rewards"],
+        next_observations=np.delete(found["observations"], ends - lengths, 0),
+        terminations=arrays["terminations"],
+        truncations=arrays["truncations"],
+        executed=found["actions"],
     )
 
 
-def _check(demos: Demos, observations: int) -> None:
-    """Raises a ValueError that names the array whose shape or values make no sense."""
-    n = len(demos.actions)
-    wide, pair = (n, observations), (n, 2)
-    shapes = {"observations": wide, "actions": pair, "next_observations": wide, "executed": pair}
-    for name, array in vars(demos).items():
-        if array.shape != shapes.get(name, (n,)):
-            raise ValueError(f"{name} has the shape {array.shape}, and not {shapes.get(name, (n,))}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name} holds NaN or infinity")
+def _damaged_dataset(path: str | Path, error: Exception) -> ValueError:
+    return ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r:.300})')
+
+
+def _damaged_shard(opened: shards.Shards, number: int, error: Exception) -> ValueError:
+    return ValueError(f"shard {number} of {opened.url} is damaged; make the set anew ({error!r:.300})")
 
 
 def command_of(path: str | Path) -> str:
