@@ -48,6 +48,9 @@ class BallbotVecEnv(VecEnv):
         self._made = time.time()
         self._actions: np.ndarray | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.metadata = (
+            env.metadata | self.metadata
+        )  # of the latter the render modes: the base class draws "human" itself
 
     def reset(self) -> np.ndarray:
         """Starts an episode in every env, with the seeds and options set since the last reset."""
