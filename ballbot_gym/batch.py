@@ -7,11 +7,11 @@ Eager batches give bit-identical results for the same seed and actions, and so d
 and compiled batches agree to rounding. So does a compiled batch of one env, which computes sines with another library.
 """
 
+import itertools
 import logging
-import reprlib
 import shutil
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -25,7 +25,8 @@ except ImportError as error:
     raise ImportError(f"batches of environments need torch: {install('train')}") from error
 
 from ballbot_gym import counter_rng, dynamics
-from ballbot_gym.env import LARGEST, fixed_error, limit_names, make_task
+from ballbot_gym.checks import LARGEST, check_num_envs, shown
+from ballbot_gym.env import fixed_error, limit_names, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
@@ -221,7 +222,7 @@ class BallbotBatch:
         task: str | Task = "stabilize",
         num_envs: int = 1,
         device: str | torch.device = "cpu",
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | str = torch.float32,
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
         randomization: Randomization | None = None,
@@ -233,7 +234,7 @@ class BallbotBatch:
         Args:
             task: a name in `TASKS`, or a Task.
             num_envs: B.
-            device, dtype: of all tensors; torch.float32 or torch.float64.
+            device, dtype: of all tensors; torch.float32 or torch.float64, or its name.
             compile: True compiles `transition` at the first step, for half a minute or so, and raises if that fails.
                 "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
                 warning and runs eagerly. False never compiles.
@@ -247,6 +248,7 @@ class BallbotBatch:
             TypeError: a keyword that is no field of the task.
         """
         check_num_envs(num_envs)
+        dtype = dtype_named(dtype)
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, not {dtype}")
         if compile not in (True, False, "auto"):
@@ -353,11 +355,16 @@ class BallbotBatch:
         if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.num_envs,):
             raise ValueError(f"mask must be a tensor of {self.num_envs} bools, not {_described(mask)}")
 
+    def _check_tensor(self, given: Any, shape: tuple[int, ...], what: str) -> None:
+        if not isinstance(given, torch.Tensor) or given.shape != shape:
+            raise ValueError(f"{what} must be a tensor of shape {shape}, not {_described(given)}")
+        if given.is_complex() or given.dtype == torch.bool:
+            raise ValueError(f"{what} must be real numbers, not {_described(given)}")
+
     def _check_given(self, given: Any, rows: int, what: str) -> None:
         if given is None:
             return
-        if not isinstance(given, torch.Tensor) or given.shape != (rows, self.num_envs):
-            raise ValueError(f"{what} must be a tensor of shape ({rows}, {self.num_envs}), not {_described(given)}")
+        self._check_tensor(given, (rows, self.num_envs), what)
         if not (given.detach().abs() <= LARGEST).all():  # NaN neither
             raise ValueError(f"{what} must be finite numbers within ±{LARGEST:g}")
 
@@ -366,10 +373,15 @@ class BallbotBatch:
         return self._observe(_rows(state))
 
     def step(self, actions: torch.Tensor) -> BatchStep:
-        """Holds forces for one control step; see `transition`. Call `reset` first."""
+        """Holds forces for one control step; see `transition`. Call `reset` first.
+
+        Raises:
+            ValueError: actions that are no tensor of real numbers of shape (B, 2).
+        """
         state = self.state
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
+        self._check_tensor(actions, (self.num_envs, 2), "actions")
         try:
             self.state, result = self._run(state, actions)
         except Exception as error:
@@ -634,9 +646,12 @@ def tilt_of(x: tuple) -> torch.Tensor:
 
 def _described(value: Any) -> str:
     """What a value is, for a message."""
-    return (
-        f"one of shape {tuple(value.shape)}, {value.dtype}" if isinstance(value, torch.Tensor) else reprlib.repr(value)
-    )
+    return f"one of shape {tuple(value.shape)}, {value.dtype}" if isinstance(value, torch.Tensor) else shown(value)
+
+
+def dtype_named(dtype: Any) -> Any:
+    """A dtype that may be given by its name, as in a spec that was JSON."""
+    return {"float32": torch.float32, "float64": torch.float64}.get(dtype, dtype) if isinstance(dtype, str) else dtype
 
 
 def check_finite(actions: np.ndarray) -> None:
@@ -647,28 +662,22 @@ def check_finite(actions: np.ndarray) -> None:
         raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
 
 
-def check_num_envs(num_envs: Any) -> int:
-    """num_envs, or a ValueError."""
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-        raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
-    return int(num_envs)
-
-
 def seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
     """One seed per env."""
-    if isinstance(seed, int | np.integer):
+    if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
         seeds: list[Any] = [int(seed) + i for i in range(num_envs)]
-    elif isinstance(seed, str | bytes) or not hasattr(seed, "__iter__"):
-        raise TypeError(f"seed must be a whole number, or one or None for each env, not {seed!r}")
+    elif isinstance(seed, str | bytes | Mapping | Set) or not hasattr(seed, "__iter__"):
+        raise TypeError(f"seed must be a whole number, or one or None for each env, not {shown(seed)}")
     else:
-        seeds = list(seed)
+        seeds = list(itertools.islice(seed, num_envs + 1))  # it may have no end
     if len(seeds) != num_envs:
-        raise ValueError(f"seed has {len(seeds)} entries for {num_envs} envs")
+        found = f"more than {num_envs}" if len(seeds) > num_envs else len(seeds)
+        raise ValueError(f"seed has {found} entries for {num_envs} envs")
     for value in seeds:
         if value is None:
             continue
         if isinstance(value, bool) or not isinstance(value, int | np.integer):
-            raise TypeError(f"seeds must be whole numbers, not {value!r}")
+            raise TypeError(f"seeds must be whole numbers, not {shown(value)}")
         if not 0 <= value < 2**63:
-            raise ValueError(f"seeds must be in [0, 2^63), not {value}")
+            raise ValueError(f"seeds must be in [0, 2^63), not {shown(value)}")
     return [None if value is None else int(value) for value in seeds]

@@ -1,6 +1,7 @@
 """BallbotEnv: Gymnasium's interface to a task and a simulator."""
 
 import dataclasses
+import enum
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -13,9 +14,10 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
+from ballbot_gym.checks import finite_array, real_array, reset_options
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, checked_robot, own_fields
+from ballbot_gym.robots import PAPER, checked_robot, named_robot, own_fields
 from ballbot_gym.scene import CAMERA_YAW, Scene, check_render_mode, window_trouble
 from ballbot_gym.simulator import (
     PHYSICS,
@@ -29,8 +31,6 @@ from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.viewer import PageScene
 
-LARGEST = 1e6
-"""Of any number that `reset` takes."""
 _VIEW = math.radians(-CAMERA_YAW)
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 
@@ -112,14 +112,16 @@ class BallbotEnv(gymnasium.Env):
     | key | meaning |
     |---|---|
     | state | (8,) float64 state x; order and units in `dynamics.STATE` |
-    | cost | what this step cost, a failure's price included (0 after `reset`) |
+    | cost | what this step cost, a failure's price included (0 after `reset`): the objective, and no constraint's cost |
     | reward_survive | part of the reward: survival_reward · control_dt |
     | reward_cost | part of the reward: −cost rate · control_dt |
     | reward_goal | part of the reward: survival_reward for every second that remained at the first exit, else 0 |
     | tilt | rad, between the body's axis and the vertical |
     | success | the task's goal holds at the end of the episode |
+    | is_success | the same, under the name that Stable-Baselines3 looks for |
     | failure | a limit is violated: the robot fell, touched something or left the arena |
-    | violated | the name of that limit, one of `task.limit_names`, as "tilt", "arena" or "obstacle 2"; else "" |
+    | violated | the index of that limit in `limit_names`, as of "tilt", "arena" or "obstacle 2"; else −1 |
+    | constraint_cost | 1.0 where a limit is violated, else 0.0: the cost of safe reinforcement learning |
     | force | (2,) N, applied in this step (0 after `reset`) |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
@@ -127,8 +129,8 @@ class BallbotEnv(gymnasium.Env):
 
     Only robots whose friction is limited have `grip`. Such a robot has lost its grip if it needs more friction, or a floor
     that pulls, when a step begins or at its end. The closed form cannot say how it slips, so with physics="rk4" that is a
-    failure, and `violated` is "grip". PyBullet simulates the contact of a rolling ball: it slips or leaves the floor, and
-    that by itself is no failure. `grip` is then the force at the end of the step.
+    failure, and `violated` is the index of "grip". PyBullet simulates the contact of a rolling ball: it slips or leaves the
+    floor, and that by itself is no failure. `grip` is then the force at the end of the step.
 
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
@@ -191,6 +193,7 @@ class BallbotEnv(gymnasium.Env):
         )
         self._noisy = self.randomization.is_noisy
         self.observation_space = observation_space(self.task, self.params)
+        self._limit_index = {name: i for i, name in enumerate(("", *self.limit_names), start=-1)}
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: Judge | None = None  # in machine code
@@ -215,7 +218,7 @@ class BallbotEnv(gymnasium.Env):
         """
         self._check_open()
         super().reset(seed=seed)
-        x, c = self._draw({} if options is None else options)
+        x, c = self._draw(options)
         self._resets += 1
         self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
         outcome = self._start(x, c)
@@ -238,7 +241,7 @@ class BallbotEnv(gymnasium.Env):
             action: (2,) force in units of the robot's force limit; clipped to [−1, 1].
 
         Raises:
-            ValueError: an action that is not finite or not of shape (2,).
+            ValueError: an action that is not of real, finite numbers or not of shape (2,).
             gymnasium.error.ResetNeeded: before `reset`, or after the end of an episode.
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
@@ -261,7 +264,12 @@ class BallbotEnv(gymnasium.Env):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec_of(spec, self.task)
+        self._spec = spec_of(spec, self.task, self.params, self.randomization)
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """What can end an episode; `info["violated"]` is an index of it."""
+        return limit_names(self.task, self.params)
 
     @property
     def episode_params(self) -> BallbotParams:
@@ -454,25 +462,20 @@ class BallbotEnv(gymnasium.Env):
             )
         return _START
 
-    def _draw(self, options: dict[str, Any]) -> tuple[State, State]:
+    def _draw(self, options: dict[str, Any] | None) -> tuple[State, State]:
         """Initial state and constants. Those that the options do not give are drawn."""
-        if not isinstance(options, dict):
-            raise ValueError(f"options must be a dict with 'state' and 'constants', not {options!r}")
-        options = dict(options)
-        state, constants = options.pop("state", None), options.pop("constants", None)
-        if options:
-            raise ValueError(f"unknown reset options {sorted(options)}; known: 'state', 'constants'")
+        state, constants = reset_options(options, "state", "constants")
         task = self.task
         draws = self.np_random.random(task.constant_draws + task.state_draws).tolist()
         c = _floats(task.draw_constants(tuple(draws[: task.constant_draws]), self.params))
         if constants is not None:
             if isinstance(constants, dict):
                 constants = self._replaced(c, constants)
-            given = _finite_vector(constants, len(task.constant_names), "constants")
+            given = finite_array(constants, (len(task.constant_names),), "constants")
             task.check_constants(given, self.params)
             c = _floats(given)
         x = _floats(task.draw_state(tuple(draws[task.constant_draws :]), c, self.params))
-        return x if state is None else _floats(_finite_vector(state, 8, "state")), c
+        return x if state is None else _floats(finite_array(state, (8,), "state")), c
 
     def _replaced(self, c: State, named: dict[str, float]) -> list[Any]:
         """The drawn constants c, of which some are replaced by name."""
@@ -481,11 +484,10 @@ class BallbotEnv(gymnasium.Env):
         return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
-        is_array = isinstance(action, np.ndarray)
-        shape = action.shape if is_array else np.shape(action)
-        if shape != (2,):
-            raise ValueError(f"action must have shape (2,), not {shape}")
-        ax, ay = map(float, action.tolist() if is_array else action)
+        return self._clipped(*real_array(action, "action", (2,)).tolist())
+
+    def _clipped(self, ax: float, ay: float) -> tuple[tuple[float, float], bool]:
+        """The force, N, of an action, and whether it was clipped."""
         limit = self.params.force_limit
         if -1.0 <= ax <= 1.0 and -1.0 <= ay <= 1.0:
             return (limit * ax, limit * ay), False
@@ -518,8 +520,10 @@ class BallbotEnv(gymnasium.Env):
             "reward_goal": goal,
             "tilt": dynamics.tilt(self._state) if outcome.tilt is None else outcome.tilt,
             "success": outcome.success,
+            "is_success": outcome.success,
             "failure": outcome.violated != "",
-            "violated": outcome.violated,
+            "violated": self._limit_index[outcome.violated],
+            "constraint_cost": float(outcome.violated != ""),
             "force": force,
             "clipped": outcome.clipped,
             "constants": self._constants_array.copy(),
@@ -550,9 +554,14 @@ def observation_space(task: Task, params: BallbotParams) -> spaces.Box:
     return spaces.Box(-bounds, bounds, dtype=np.float32)
 
 
-def spec_of(spec: EnvSpec | None, task: Task) -> EnvSpec | None:
+def spec_of(
+    spec: EnvSpec | None, task: Task, params: BallbotParams, randomization: Randomization, steps: int | None = None
+) -> EnvSpec | None:
     """A registered spec as tools shall read it of an env: with the env's own number of control steps, whatever duration
-    was asked for, and without a reward threshold where another problem or another pay makes it meaningless.
+    was asked for, and without a reward threshold where another problem, robot or pay makes it meaningless.
+
+    Its keywords are such that `to_json` can write them and the env can be made of them again, unless the task is an object
+    of a class that is not in `TASKS`.
 
     Episodes are truncated by the envs themselves, so no `TimeLimit` is registered: it would cut longer durations.
     """
@@ -560,8 +569,27 @@ def spec_of(spec: EnvSpec | None, task: Task) -> EnvSpec | None:
         return None
     kind = type(task)()
     usual = task.problem() == kind.problem() and task.survival_reward == kind.survival_reward
-    threshold = spec.reward_threshold if usual else None
-    return dataclasses.replace(spec, max_episode_steps=task.steps, reward_threshold=threshold)
+    usual = usual and params == named_robot(PAPER) and not randomization.active
+    keywords = {name: _plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
+    if isinstance(keywords.get("task"), Task):
+        name = next((name for name, known in TASKS.items() if known is type(task)), None)
+        keywords |= {} if name is None else {"task": name, **dataclasses.asdict(task)}
+    return dataclasses.replace(
+        spec,
+        max_episode_steps=task.steps if steps is None else steps,
+        reward_threshold=spec.reward_threshold if usual else None,
+        kwargs=keywords,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """A keyword as JSON knows it, of those that envs take as words or numbers too."""
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, np.generic):
+        return value.item()
+    is_torchs = type(value).__module__ == "torch" and type(value).__name__ in ("device", "dtype")
+    return str(value).removeprefix("torch.") if is_torchs else value
 
 
 def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:
@@ -597,7 +625,7 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
 
 def check_constant_names(task: Task, named: dict[str, Any]) -> None:
     """Raises a ValueError that says which constants a task has, where others are given by name."""
-    unknown = sorted(set(named) - set(task.constant_names))
+    unknown = sorted(set(named) - set(task.constant_names), key=repr)
     if not unknown:
         return
     if not task.constant_names:
@@ -610,15 +638,3 @@ def check_constant_names(task: Task, named: dict[str, Any]) -> None:
 
 def _floats(vector: Sequence[Any] | np.ndarray) -> State:
     return tuple(map(float, vector))
-
-
-def _finite_vector(value: Any, size: int, what: str) -> np.ndarray:
-    try:
-        vector = np.array(value, np.float64)
-    except (TypeError, ValueError):
-        vector = np.zeros(())
-    if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise ValueError(f"{what} must be {size} finite numbers, not {value!r}")
-    if (np.abs(vector) > LARGEST).any():
-        raise ValueError(f"{what} must be numbers within ±{LARGEST:g}, not {value!r}")
-    return vector

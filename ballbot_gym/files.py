@@ -13,6 +13,8 @@ from typing import IO, Any
 
 import numpy as np
 
+from ballbot_gym.checks import real_array
+
 READ_LIMIT = 256 * 2**20
 """Bytes that a file may hold, unpacked, unless a reader says otherwise."""
 
@@ -172,15 +174,9 @@ def numbers(value: Any, what: str, shape: tuple[int, ...] | None = None, most: f
     Raises:
         ValueError: it holds something else, or is of another shape than `shape`.
     """
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):  # lists of different lengths
-        array = np.array(None)
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{what} must be an array of numbers, not of {array.dtype}")
+    array = real_array(value, what).astype(np.float64, copy=False)
     if shape is not None and array.shape != shape:
         raise ValueError(f"{what} has the shape {array.shape}, and not {shape}")
-    array = array.astype(np.float64, copy=False)
     if not np.isfinite(array).all():
         raise ValueError(f"{what} must be finite numbers, and it holds NaN or infinity")
     if (np.abs(array) > most).any():

@@ -12,8 +12,9 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import counter_rng, dynamics
-from ballbot_gym.batch import BatchState, BatchStep, check_num_envs, seeds_of
-from ballbot_gym.env import BallbotEnv, Outcome, fixed, limit_names
+from ballbot_gym.batch import BatchState, BatchStep, seeds_of
+from ballbot_gym.checks import check_num_envs
+from ballbot_gym.env import BallbotEnv, Outcome, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import DisturbanceState, Randomization
 from ballbot_gym.simulator import State
@@ -52,7 +53,6 @@ class BallbotLoop:
         self._singles = [_Single(task, params, randomization) for _ in range(self.num_envs)]
         first = self._singles[0]
         self.task, self.params, self.randomization = first.task, first.params, first.randomization
-        self._index = {name: i for i, name in enumerate(("", *limit_names(self.task, self.params)), start=-1)}
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._started = False
         self._shown: tuple[np.ndarray, np.ndarray] | None = None  # x and c, until they change
@@ -148,7 +148,7 @@ class BallbotLoop:
             observation = np.array([single.seen() for single in self._singles], np.float32)
             tilt = np.array([dynamics.tilt(single._state) for single in self._singles], self.dtype)
         terminated, truncated, reward, cost, force, success, violated, clipped, grip, *_ = zip(*outcomes, strict=True)
-        index = np.array([self._index[name] for name in violated])
+        index = np.array([self._singles[0]._limit_index[name] for name in violated])
         fields: Any = {
             "observation": observation,
             "reward": np.array([sum(parts) for parts in reward]),
@@ -236,7 +236,7 @@ class _Single(BallbotEnv):
         """Holds an action for one control step. It is finite."""
         if self._disturbance is not None:
             self._rng.seek(self, 0)
-        outcome = self._advance(*self._force(action))
+        outcome = self._advance(*self._clipped(*action))
         self.taken += 1
         return outcome
 

@@ -17,7 +17,8 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_finite, check_num_envs, seeds_of
+from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_finite, seeds_of
+from ballbot_gym.checks import check_num_envs
 from ballbot_gym.env import fixed
 from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.params import BallbotParams

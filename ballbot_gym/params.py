@@ -1,6 +1,7 @@
 """The robot's parameters, read from its URDF by link and joint name."""
 
 import math
+import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
@@ -97,7 +98,7 @@ class BallbotParams:
                     )
                 continue
             # batches of robots hold tensors, whose values are not looked at
-            if is_number(value) and not 0 < value < math.inf:
+            if is_number(value) and not 0 < value <= sys.float_info.max:
                 raise ValueError(f"BallbotParams: {field.name} must be positive and finite, not {value}")
 
     @cached_property

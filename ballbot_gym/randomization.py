@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ballbot_gym import ops
+from ballbot_gym.checks import from_fields
 from ballbot_gym.ops import between, is_number
 from ballbot_gym.params import BallbotParams
 
@@ -77,6 +78,7 @@ class Randomization:
                     )
                 continue
             low, high = _pair(field.name, value)
+            object.__setattr__(self, field.name, (low, high))  # so that a list, as JSON has it, is the same range
             if not (math.isfinite(high) and low <= high):
                 raise ValueError(f"Randomization: {field.name} must be a finite range (low, high), not {value}")
             largest = _LARGEST_FACTOR if field.default == (1.0, 1.0) else _LARGEST
@@ -184,13 +186,14 @@ class Randomization:
 
 
 def checked_randomization(randomization: Any) -> Randomization:
-    """The randomization that was given, or none for None.
+    """The randomization that was given, also as the dict of all its fields, or none for None.
 
     Raises:
         TypeError: it is something else, such as a dict of fields.
     """
     if randomization is None:
         return Randomization()
+    randomization = from_fields(Randomization, randomization)
     if not isinstance(randomization, Randomization):
         raise TypeError(
             f"randomization must be a Randomization, for instance Randomization(lean_noise=0.01), not {randomization!r}"
@@ -291,5 +294,5 @@ def _pair(name: str, value: Any) -> Range:
         if not (is_number(low) and is_number(high)):
             raise TypeError
         return float(low), float(high)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"Randomization: {name} must be a finite range (low, high), not {value!r}") from None

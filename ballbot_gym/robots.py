@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ballbot_gym.checks import from_fields
 from ballbot_gym.params import ROLLING_URDF_PATH, URDF_FOLDER, URDF_PATH, BallbotParams
 
 
@@ -86,8 +87,8 @@ def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
     """The robot that was given by name or by its parameters.
 
     Args:
-        robot: a name in `ROBOTS`, or a BallbotParams.
-        params: the same as a BallbotParams, or None; not both.
+        robot: a name in `ROBOTS`, a BallbotParams, or the dict of all its fields that `dataclasses.asdict` makes.
+        params: the same without a name, or None; not both.
 
     Raises:
         ValueError: no robot of that name, or a robot and params.
@@ -97,6 +98,7 @@ def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
         if robot != PAPER:
             raise ValueError("give either robot or params, not both: robot takes a name or a BallbotParams")
         robot = params
+    robot = from_fields(BallbotParams, robot)
     if params is None and isinstance(robot, str):
         return named_robot(robot)
     if not isinstance(robot, BallbotParams):

@@ -9,6 +9,7 @@ from typing import Any, Protocol, cast
 import gymnasium
 import numpy as np
 
+from ballbot_gym.checks import real_array
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -83,7 +84,7 @@ class ActionController:
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
-        action = np.asarray(self._action(observation, self._begins), np.float64)
+        action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
         return self._params.force_limit * action
 

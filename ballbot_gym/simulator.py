@@ -430,7 +430,8 @@ def _check_rolling(params: BallbotParams, rolls: bool) -> None:
 def _whole_substeps(control_dt: float, physics_dt: float) -> int:
     if not is_number(physics_dt):
         raise ValueError(f"physics_dt must be a number of seconds, not {physics_dt!r}")
-    substeps = round(control_dt / physics_dt) if physics_dt > control_dt / (_MOST_SUBSTEPS + 0.5) else 0
+    in_range = control_dt / (_MOST_SUBSTEPS + 0.5) < physics_dt <= 2 * control_dt
+    substeps = round(control_dt / physics_dt) if in_range else 0
     if substeps < 1 or not math.isclose(substeps * physics_dt, control_dt, rel_tol=1e-9):
         raise ValueError(
             f"physics_dt = {physics_dt} s must be a whole fraction of control_dt = {control_dt} s, and at least "

@@ -41,20 +41,20 @@ class Spares:
         return kept
 
 
-def sparse_objects(size: int) -> Spares:
-    """Arrays (size,) of objects, None but for those that `fill` has set."""
-    return Spares(partial(_no_objects, size))
+def sparse_rows(size: int, columns: int) -> Spares:
+    """Arrays (size, columns) of float32, NaN but for the rows that `fill` has set."""
+    return Spares(partial(_no_rows, size, columns))
 
 
-def _no_objects(size: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.empty(size, dtype=object), np.empty(0, np.int64)
+def _no_rows(size: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.full((size, columns), np.nan, np.float32), np.empty(0, np.int64)
 
 
 def fill(spares: Spares, indices: np.ndarray, values: Any) -> np.ndarray:
-    """An array of `sparse_objects` with values, one or one for each index, at some indices. All others are None."""
+    """An array of `sparse_rows` with values, one row for each index, at some indices. All others are NaN."""
     kept = spares.take()
     array: np.ndarray = kept[0]
-    array[kept[1]] = None
+    array[kept[1]] = np.nan
     array[indices] = values
     kept[1] = indices
     return array

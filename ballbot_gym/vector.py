@@ -1,9 +1,6 @@
 """BallbotVectorEnv: Gymnasium's vector interface to machine code, to a `BallbotBatch` in torch, or to a `BallbotLoop`."""
 
-import dataclasses
 import logging
-import math
-import reprlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,8 +11,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from ballbot_gym import dynamics
+from ballbot_gym.checks import finite_array, real_array, reset_options
 from ballbot_gym.env import (
-    LARGEST,
     REWARD_PARTS,
     check_constant_names,
     fixed,
@@ -30,7 +28,7 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.scene import Scene, check_render_mode
 from ballbot_gym.simulator import PHYSICS
-from ballbot_gym.spares import fill, sparse_objects
+from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
 
 try:
@@ -41,7 +39,7 @@ except ImportError as error:
         'vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, tilt_of
+from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, dtype_named, tilt_of
 from ballbot_gym.loop import BallbotLoop
 
 if TYPE_CHECKING:
@@ -65,8 +63,10 @@ _INFO_KEYS = tuple(
         *REWARD_PARTS,
         "tilt",
         "success",
+        "is_success",
         "failure",
         "violated",
+        "constraint_cost",
         "force",
         "clipped",
         "constants",
@@ -102,10 +102,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     | "NextStep" | the next step ignores the env's action, starts the next episode and rewards 0 |
     | "Disabled" | `reset(options={"reset_mask": mask})` must come before the next step |
 
-    The episodes are the same in all three. The entries of `final_info` are valid only for the envs that the
-    masks `_…` mark. Returned arrays never change later; `state`, `constants` and `violated` in `infos` may share memory
-    and are read-only. Observations and states are in Fortran order, component by component, like those of Gymnasium's own
-    batched CartPole, and actions in that order are not copied. engine="loop" has C order.
+    The episodes are the same in all three. The entries of `final_info` and the rows of `final_obs`, a float32 array (B, no),
+    are valid only for the envs that the masks `_…` mark. Returned arrays never change later; `state`, `constants` and
+    `violated` in `infos` may share memory and are read-only. Observations and states are in Fortran order, component by
+    component, like those of Gymnasium's own batched CartPole, and actions in that order are not copied. engine="loop" has C
+    order.
 
     `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
     """
@@ -118,7 +119,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         task: str | Task = "stabilize",
         render_mode: str | None = None,
         device: str | torch.device = "cpu",
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | str = torch.float32,
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
         randomization: Randomization | None = None,
@@ -135,7 +136,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             render_mode: None or "rgb_array", which draws every env in turn.
             autoreset_mode: an `AutoresetMode`, or its value or name; default, SAME_STEP.
             physics: "rk4". Gymnasium's own vector envs run "bullet".
-            max_episode_steps: control steps; the same as the task's `duration` of so many.
+            max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
+                Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
                 once per task and machine; it needs CasADi and no gradients, and knows no `Randomization`. "torch" computes
                 them in torch, and `compile` says whether that is compiled. "loop" computes one after the other in float64,
@@ -155,11 +157,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
         self._spec: EnvSpec | None = None
         params = checked_robot(robot, params)
-        task = _task(task, params, max_episode_steps, task_fields)
+        task = make_task(task, params, **task_fields)
         _check_physics(physics, task, num_envs)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         if engine in ("native", "loop") and torch.device(device).type != "cpu":
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
+        dtype = dtype_named(dtype)
         self._dtype = np.float32 if dtype == torch.float32 else np.float64
         self.batch = _batch(task, num_envs, device, dtype, compile, params, randomization, engine)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
@@ -171,11 +174,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space = observation_space(self.task, self.params)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._limit_names = np.array([*limit_names(self.task, self.params), ""], dtype=object)  # the last has index −1
-        self._no_names = np.full(self.num_envs, "", dtype=object)
+        self._most_steps = _most_steps(max_episode_steps, self.task)
+        self._none, self._nothing = np.full(self.num_envs, -1), np.zeros(self.num_envs)
         self._everywhere = np.ones(self.num_envs, np.bool_)
-        self._objects = sparse_objects(self.num_envs)
-        self._no_names.flags.writeable = self._everywhere.flags.writeable = False
+        self._ends = sparse_rows(self.num_envs, len(self.task.observation_scale))
+        for array in (self._none, self._nothing, self._everywhere):
+            array.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
         self._scene: Scene | None = None
 
@@ -186,7 +190,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec_of(spec, self.task)
+        self._spec = spec_of(spec, self.task, self.params, self.randomization, self._most_steps)
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """What can end an episode; `infos["violated"]` has indices of it."""
+        return limit_names(self.task, self.params)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -205,11 +214,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             TypeError, ValueError: an unknown option, or a value of the wrong type, shape or range.
         """
         self._check_open()
-        options = dict(options or {})
-        mask = _reset_mask(options.pop("reset_mask", None), self.num_envs)
-        x, constants = options.pop("state", None), options.pop("constants", None)
-        if options:
-            raise ValueError(f"unknown reset options {sorted(options)}; known: 'reset_mask', 'state', 'constants'")
+        given_mask, x, constants = reset_options(options, "reset_mask", "state", "constants")
+        mask = _reset_mask(given_mask, self.num_envs)
         if self.batch.state is None:
             mask = np.ones_like(mask)
         batch_mask: Any = self._to_batch(mask)
@@ -228,10 +234,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         tilt = self._array(tilt).astype(self._dtype, copy=False)
         force, grip = np.zeros((2, size), self._dtype), np.zeros((4 * self.params.grips, size), self._dtype)
         success, failure, clipped = np.zeros((3, size), bool)
-        none = np.full(size, -1)
-        now = StepInfo(
-            x_now, np.zeros(size), np.zeros((3, size)), tilt, force, success, failure, none, clipped, c_now, grip
-        )
+        parts = np.zeros((4, size))
+        now = StepInfo(x_now, parts[0], parts[1:], tilt, force, success, failure, self._none, clipped, c_now, grip)
         infos = self._info(now, mask)
         return self._array(observation, np.float32), infos
 
@@ -242,14 +246,17 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1].
 
         Raises:
-            ValueError: actions that are not finite or not of shape (B, 2).
+            ValueError: actions that are not of real, finite numbers or not of shape (B, 2).
             gymnasium.error.ResetNeeded: before `reset`, or in mode "Disabled" while an episode has ended.
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
-        actions = np.asarray(actions, self._dtype)
-        if actions.shape != (self.num_envs, 2):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 2), not {actions.shape}")
+        actions = real_array(actions, "actions", (self.num_envs, 2))
+        if actions.dtype != self._dtype:
+            check_finite(actions)
+            actions = actions.clip(-2.0, 2.0).astype(
+                self._dtype
+            )  # what is too large for float32 is clipped all the same
         waiting = self._ended if np.count_nonzero(self._ended) else None
         if waiting is not None and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
@@ -258,15 +265,15 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             )
         restart = self.autoreset_mode is AutoresetMode.SAME_STEP
         result, now, end, ended = self._advance(actions, waiting, restart)
+        if self._most_steps < self.task.steps:
+            result, now, end, ended = self._cut(result, now, end, ended, restart)
         done = result.terminated | result.truncated
         infos: dict[str, Any] = {}
         if not restart:
             self._ended = done
         elif ended.size:
-            infos["final_info"] = self._info(end, done, ended)
-            infos["final_obs"] = fill(
-                self._objects, ended, np.fromiter(result.final_observation, dtype=object, count=ended.size)
-            )
+            infos["final_info"] = self._info(end, done)
+            infos["final_obs"] = fill(self._ends, ended, result.final_observation)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
         infos |= self._info(now, self._everywhere)
@@ -384,6 +391,28 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             result = result._replace(final_observation=result.final_observation[ended])
         return result, *self._step_infos(result, constants, ended, waiting, restart), ended
 
+    def _cut(
+        self, result: Any, now: StepInfo, end: StepInfo, ended: np.ndarray, restart: bool
+    ) -> tuple[Any, StepInfo, StepInfo, np.ndarray]:
+        """What `_advance` returns, and episodes that have had `max_episode_steps` are truncated too."""
+        state: Any = self.batch.state
+        cut = (self._array(state.steps) >= self._most_steps) & ~(result.terminated | result.truncated)
+        if not cut.any():
+            return result, now, end, ended
+        result = result._replace(truncated=result.truncated | cut)
+        if not restart:
+            return result, now, end, ended
+        final, observation, tilt = (part.copy("K") for part in (result.observation, result.observation, now.tilt))
+        final[ended] = result.final_observation
+        with torch.no_grad():
+            self.batch.state = self.batch.initial_state(None, self._to_batch(cut))
+            observation[cut] = self._array(self.batch.observe(self.batch.state), np.float32)[cut]
+        x, c = self._x_and_c()
+        tilt[cut] = dynamics.tilt(tuple(x[:, cut]))
+        now, ended = _begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
+        result = result._replace(observation=observation, final_observation=final[ended])
+        return result, now._replace(x=x, c=c, tilt=tilt), end, ended
+
     def _step_infos(
         self, result: Any, constants: np.ndarray, ended: np.ndarray, waiting: np.ndarray | None, restart: bool
     ) -> tuple[StepInfo, StepInfo]:
@@ -405,9 +434,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if not (restart and ended.size):
             return now, now
         end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants)
-        # Where an episode ended, the info of now is that of the next episode's start, as after `reset`.
-        cleared = ("cost", "reward_parts", "force", "success", "failure", "clipped", "grip")
-        return now._replace(**{name: _without(getattr(now, name), ended) for name in cleared}), end
+        return _begun(now, ended), end
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
         """(8, B) states and (nc, B) constants."""
@@ -423,21 +450,19 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         array = part if isinstance(part, np.ndarray) else part.cpu().numpy()
         return array if dtype is None else array.astype(dtype, copy=False)
 
-    def _info(self, told: StepInfo, mask: np.ndarray, which: np.ndarray | None = None) -> dict[str, Any]:
+    def _info(self, told: StepInfo, mask: np.ndarray) -> dict[str, Any]:
         """An info with the keys of `BallbotEnv`'s, in the same order, each with Gymnasium's mask (B,) of valid entries.
 
-        Arrays that share the batch's memory are read-only. Where the mask holds for few envs, `which` are their indices.
+        Arrays that share the batch's memory are read-only.
         """
-        x, c, names = told.x.T, told.c.T, self._no_names
-        x.flags.writeable = c.flags.writeable = False
-        if np.count_nonzero(told.failure):
-            if which is None:
-                names, failed = names.copy(), told.failure.nonzero()[0]
-                names[failed] = self._limit_names[told.violated[failed]]
-            else:
-                names = fill(self._objects, which, self._limit_names[told.violated[which]])
+        x, c, success, failure, violated = told.x.T, told.c.T, told.success, told.failure, self._none
+        constraint_cost = self._nothing
+        if np.count_nonzero(failure):
+            violated, constraint_cost = told.violated.view(), failure.astype(np.float64)
+        x.flags.writeable = c.flags.writeable = violated.flags.writeable = False
         values = (
-            x, told.cost, *told.reward_parts, told.tilt, told.success, told.failure, names, told.force.T, told.clipped, c
+            x, told.cost, *told.reward_parts, told.tilt, success, success, failure, violated, constraint_cost,
+            told.force.T, told.clipped, c,
         )  # fmt: skip
         infos = {}
         for (name, mask_name), value in zip(_INFO_KEYS, values, strict=True):
@@ -453,9 +478,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if isinstance(constants, dict):
             check_constant_names(task, constants)
             for name, value in constants.items():
-                c[names.index(name)] = _finite(value, (self.num_envs,), f"constant {name!r}")
+                c[names.index(name)] = finite_array(value, (self.num_envs,), f"constant {name!r}", broadcast=True)
         else:
-            c[:] = _finite(constants, (self.num_envs, len(names)), "constants").T
+            c[:] = finite_array(constants, (self.num_envs, len(names)), "constants", broadcast=True).T
         for distinct in np.unique(c[:, mask], axis=1).T:
             task.check_constants(distinct, self.params)
         return self._to_batch(c.astype(self._array(drawn.c).dtype))
@@ -463,7 +488,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
         """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
         drawn, c = self._array(state.x), self._array(state.c)
-        x = np.where(mask, _finite(given, (self.num_envs, 8), "state").T, drawn).astype(drawn.dtype, order="C")
+        wanted = finite_array(given, (self.num_envs, 8), "state", broadcast=True).T
+        x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
         safe = np.all([limit >= 0 for limit in self.task.limits(tuple(x), tuple(c))], axis=0)
         if not safe[mask].all():
             bad = np.flatnonzero(mask & ~safe)
@@ -566,16 +592,13 @@ def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | N
     return result._replace(observation=observation, tilt=tilt_of(batch.state.x.unbind(0)))
 
 
-def _task(task: str | Task, params: BallbotParams, max_episode_steps: int | None, fields: dict[str, Any]) -> Task:
-    """The task, with episodes of at most so many control steps."""
-    made = make_task(task, params, **fields)
-    if max_episode_steps is None:
-        return made
+def _most_steps(max_episode_steps: int | None, task: Task) -> int:
+    """Control steps in the longest episode; −1 stands for None, as for `gymnasium.make`."""
+    if max_episode_steps is None or max_episode_steps == -1:
+        return task.steps
     if isinstance(max_episode_steps, bool) or not isinstance(max_episode_steps, int) or max_episode_steps < 1:
         raise ValueError(f"max_episode_steps must be a positive whole number, not {max_episode_steps!r}")
-    if "duration" in fields:
-        raise ValueError("give duration or max_episode_steps, not both")
-    return dataclasses.replace(made, duration=max_episode_steps * made.control_dt)
+    return min(max_episode_steps, task.steps)
 
 
 def _check_physics(physics: str, task: Task, num_envs: int) -> None:
@@ -603,7 +626,7 @@ def _reset_mask(mask: Any, num_envs: int) -> np.ndarray:
     """The option "reset_mask", checked as Gymnasium's vector envs do."""
     if mask is None:
         return np.ones(num_envs, np.bool_)
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or np.ma.is_masked(mask):
         raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, not {mask!r}")
     if mask.shape != (num_envs,):
         raise ValueError(f"options['reset_mask'] must have shape ({num_envs},), not {mask.shape}")
@@ -612,17 +635,10 @@ def _reset_mask(mask: Any, num_envs: int) -> np.ndarray:
     return mask.copy()
 
 
-def _finite(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """value as a float64 array, broadcast to shape."""
-    try:
-        array = np.broadcast_to(np.asarray(value, np.float64), shape)
-    except (TypeError, ValueError):
-        array = np.full(shape, math.nan)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{what} must be finite numbers that broadcast to {shape}, not {reprlib.repr(value)}")
-    if (np.abs(array) > LARGEST).any():
-        raise ValueError(f"{what} must be numbers within ±{LARGEST:g}, not {reprlib.repr(value)}")
-    return array
+def _begun(now: StepInfo, begun: np.ndarray) -> StepInfo:
+    """What infos say where episodes have begun in place of ended ones, as after `reset`."""
+    cleared = ("cost", "reward_parts", "force", "success", "failure", "clipped", "grip")
+    return now._replace(**{name: _without(getattr(now, name), begun) for name in cleared})
 
 
 def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:

@@ -13,13 +13,23 @@ from ballbot_gym.vector import LOOP_BELOW, BallbotBatch, BallbotLoop, BallbotVec
 ROBOTS = Randomization(body_mass=(0.8, 1.2), actuator_delay=(0.0, 0.06), position_noise=0.01, push_impulse=(0.0, 3.0))
 
 
+@pytest.mark.parametrize("limit", [None, 7])
 @pytest.mark.parametrize("engine", ["native", "loop", "torch"])
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine):
-    """The sync envs draw other episodes, so that both are started alike at each restart of ours."""
+def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine, limit):
+    """The sync envs draw other episodes, so that both are started alike at each restart of ours.
+
+    An episode may have 10 control steps; max_episode_steps=7 cuts it short.
+    """
     size, duration = 4, 0.2
     ours = BallbotVectorEnv(
-        size, type(task)(duration=duration), dtype=torch.float64, compile=False, engine=engine, autoreset_mode=mode
+        size,
+        type(task)(duration=duration),
+        dtype=torch.float64,
+        compile=False,
+        engine=engine,
+        autoreset_mode=mode,
+        max_episode_steps=limit,
     )
     sync = gymnasium.make_vec(
         task.id,
@@ -28,6 +38,7 @@ def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine)
         vector_kwargs={"autoreset_mode": mode},
         physics="rk4",
         duration=duration,
+        max_episode_steps=limit,
     )
     assert ours.metadata["autoreset_mode"] is ours.autoreset_mode is mode
     _, infos = ours.reset(seed=5)
@@ -60,7 +71,10 @@ def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine)
             "cost",
             "tilt",
             "success",
+            "is_success",
             "failure",
+            "violated",
+            "constraint_cost",
             "force",
             "clipped",
             "reward_survive",
@@ -68,10 +82,13 @@ def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine)
             "reward_goal",
         ):
             np.testing.assert_allclose(infos[key][same], its_infos[key][same], rtol=1e-6, atol=1e-6, err_msg=key)
-        assert (infos["violated"][same] == its_infos["violated"][same]).all()
         if mode is AutoresetMode.SAME_STEP:
             for i in np.flatnonzero(done):
                 np.testing.assert_allclose(infos["final_obs"][i], its_infos["final_obs"][i], rtol=1e-5, atol=1e-5)
+                for key, told in its_infos["final_info"].items():
+                    np.testing.assert_allclose(
+                        infos["final_info"][key][i], told[i], rtol=1e-5, atol=1e-5, err_msg=f"final {key}"
+                    )
         if mode is AutoresetMode.DISABLED and done.any():
             _, infos = ours.reset(options={"reset_mask": done})
             sync.reset(options={"reset_mask": done.copy()})

@@ -220,9 +220,11 @@ def test_falling_terminates_and_costs_the_time_not_lived(task, physics, make_env
     _, terminated, truncated, info = steps[-1]
     assert (terminated, truncated, info["failure"], info["success"]) == (True, False, True, False)
     assert info["tilt"] > task.max_tilt
-    assert info["violated"] == "tilt"
+    assert env.limit_names[info["violated"]] == "tilt"
     assert info["cost"] > task.survival_reward * (task.duration - len(steps) * task.control_dt)
-    assert all(not step[-1]["failure"] and step[-1]["violated"] == "" for step in steps[:-1])
+    assert info["constraint_cost"] == 1.0
+    for *_, info in steps[:-1]:
+        assert (info["failure"], info["violated"], info["constraint_cost"]) == (False, -1, 0.0)
 
 
 def test_episode_is_truncated_at_its_duration(task, physics):

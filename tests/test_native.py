@@ -74,7 +74,7 @@ def test_a_step_is_that_of_the_batch_in_torch(task, robot):
 def test_an_env_is_the_same_bit_for_bit_wherever_it_stands(task, dtype):
     """In blocks that are full and in the remainder, alone, and where threads share the work."""
     actions = actions_of(37)
-    make = {"task": task, "engine": "native", "dtype": dtype, "max_episode_steps": 25}
+    make = {"task": task, "engine": "native", "dtype": dtype, "duration": 0.5}
     whole = play(BallbotVectorEnv(37, **make), actions, list(range(37)))
     for first, count in ((0, 1), (3, 16), (19, 18), (36, 1)):
         part = play(
@@ -90,7 +90,7 @@ def test_threads_change_nothing(monkeypatch):
     monkeypatch.setattr(native, "_PARALLEL_FROM", 64)
     actions, results = actions_of(2500, 30), []
     for threads in (1, 3):
-        env = BallbotVectorEnv(2500, "weave", engine="native", max_episode_steps=20)
+        env = BallbotVectorEnv(2500, "weave", engine="native", duration=0.4)
         env.batch.threads = threads
         results.append(play(env, actions, 0))
     for a, b in zip(*results, strict=True):
@@ -99,9 +99,7 @@ def test_threads_change_nothing(monkeypatch):
 
 def arrays_in(value):
     """All arrays of numbers in what a step returns."""
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        yield from (row for row in value if isinstance(row, np.ndarray))
-    elif isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray):
         yield value
     elif isinstance(value, (tuple, dict)):
         for part in value.values() if isinstance(value, dict) else value:
@@ -111,7 +109,7 @@ def arrays_in(value):
 @needs_compiler
 def test_what_a_step_returned_never_changes_later_though_memory_is_used_again():
     """Some arrays are kept, and of others only a row; all others are dropped at once."""
-    env = BallbotVectorEnv(19, "weave", robot="rolling", engine="native", max_episode_steps=9)
+    env = BallbotVectorEnv(19, "weave", robot="rolling", engine="native", duration=0.18)
     rng, kept, addresses = np.random.default_rng(0), [], set()
     env.reset(seed=0)
     for action in actions_of(19, 200):
@@ -163,32 +161,24 @@ def test_an_action_that_is_not_finite_changes_nothing(count):
 
 @needs_compiler
 def test_infos_that_a_user_keeps_stay_as_they_are():
-    """Arrays of objects are used again, but not while somebody has them."""
+    """Arrays of last observations are used again, but not while somebody has them."""
     env = BallbotVectorEnv(50, "stabilize", engine="native")
     env.reset(seed=0)
-    kept = [env.step(action)[4] for action in actions_of(50, 60, scale=3)]
-    told = [
-        (infos["final_obs"].tolist(), infos["final_info"]["violated"].tolist())
-        for infos in kept
-        if "final_obs" in infos
-    ]
+    kept = [infos for action in actions_of(50, 60, scale=3) if "final_obs" in (infos := env.step(action)[4])]
+    told = [(infos["final_obs"].copy(), infos["final_info"]["violated"].copy()) for infos in kept]
     assert len(told) > 10
     for action in actions_of(50, 30, scale=3):
         env.step(action)
-    again = [
-        (infos["final_obs"].tolist(), infos["final_info"]["violated"].tolist())
-        for infos in kept
-        if "final_obs" in infos
-    ]
-    for (seen, names), (seen_again, names_again) in zip(told, again, strict=True):
-        assert names == names_again
-        assert all(map(np.array_equal, seen, seen_again))
-        assert [row is None for row in seen] == [name is None for name in names]
+    for (seen, violated), infos in zip(told, kept, strict=True):
+        np.testing.assert_array_equal(infos["final_obs"], seen)
+        np.testing.assert_array_equal(infos["final_info"]["violated"], violated)
+        np.testing.assert_array_equal(np.isnan(seen).all(1), ~infos["_final_obs"])
+        assert not np.isnan(seen[infos["_final_obs"]]).any()
 
 
 @needs_compiler
 def test_copies_and_pickles_go_on_alike_and_apart():
-    env, actions = BallbotVectorEnv(5, "weave", engine="native", max_episode_steps=8), actions_of(5)
+    env, actions = BallbotVectorEnv(5, "weave", engine="native", duration=0.16), actions_of(5)
     play(env, actions[:10], 0)
     copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
     expected = [env.step(action)[0] for action in actions]
@@ -230,7 +220,7 @@ def test_a_state_that_is_not_finite_fails_and_its_neighbours_go_on():
         *_, terminated, _, infos = env.step(np.zeros((3, 2)))
         assert terminated.tolist() == [False, True, False]
         assert infos["failure"].tolist() == [False, True, False]
-        assert infos["violated"][1]
+        assert infos["violated"][1] >= 0
         env.step(np.zeros((3, 2)))
 
 

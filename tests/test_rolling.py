@@ -295,7 +295,7 @@ def test_losing_grip_is_a_failure_in_the_closed_form(rolling):
     _, _, terminated, _, info = env.step([1.0, 0.0])
     assert terminated
     assert info["failure"]
-    assert info["violated"] == "grip"
+    assert env.limit_names[info["violated"]] == "grip"
     assert info["grip"][3] > 0.8
 
 
@@ -334,6 +334,7 @@ def test_batches_lose_grip_as_single_envs_do(engine):
         assert reward[i] == pytest.approx(alone)
         assert (ended, info["violated"]) == (terminated[i], infos["violated"][i])
         np.testing.assert_allclose(infos["grip"][i], info["grip"], rtol=1e-6)
+    assert vector.limit_names == env.limit_names
 
 
 def test_a_robot_draws_its_own_episodes():

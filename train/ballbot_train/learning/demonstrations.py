@@ -44,7 +44,8 @@ from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import files, seeding
-from ballbot_gym.env import LARGEST, BallbotEnv, make_task
+from ballbot_gym.checks import LARGEST
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import Controller, PlanError

@@ -49,6 +49,9 @@ class BallbotVecEnv(VecEnv):
         self._made = time.time()
         self._actions: np.ndarray | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.metadata = (
+            env.metadata | self.metadata
+        )  # of the latter the render modes: the base class draws "human" itself
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seeds the envs for the next reset, with numbers that runs with other seeds do not use; returns these numbers."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ballbot_gym.checks import MOST_ENVS
 from ballbot_gym.lazy import load
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -94,7 +95,7 @@ _POSITIVE = {
     "std",
 }
 _MOST = 10**9  # of whole numbers
-_MOST_OF = {"critic_hidden": 2**14, "hidden": 2**14, "horizon": 10**5, "num_envs": 2**20, "num_steps": 10**6}
+_MOST_OF = {"critic_hidden": 2**14, "hidden": 2**14, "horizon": 10**5, "num_envs": MOST_ENVS, "num_steps": 10**6}
 _MOST_STEPS = 10**8  # env steps of an iteration, which are all in memory
 
 
