@@ -120,10 +120,10 @@ COMMANDS = {
     ),
     "tune": _command("tune rsl_ppo --task turn --trials 3 --seeds 1 --env-steps 8192 --evaluations 2", _search),
     "demos": _command("demos --task turn --expert lqr --episodes 12 --physics rk4", _dataset),
-    "bc": _train("bc", "--total-iterations 6 --gradient-steps 20 --demos {demos}"),
+    "bc": _train("dagger", "--iterations 6 --gathering-iterations 0 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(
         "dagger",
-        "--total-iterations 4 --gathering-iterations 2 --batch-episodes 0 --episodes-per-iteration 2 --candidate-episodes 0 "
+        "--iterations 4 --gathering-iterations 2 --batch-episodes 0 --episodes-per-iteration 2 --candidate-episodes 0 "
         "--tracked-rollouts-per-plan 1 --gradient-steps 20",
     ),
     "ppo": _train("ppo", _RL),
@@ -134,7 +134,7 @@ COMMANDS = {
         "rsl_ppo", "--total-iterations 6 --num-envs 16 --num-steps 8 --num-mini-batches 2 --critic-hidden 8"
     ),
     "sac": _train("sac", _RL),
-    "shac": _train("shac", "--total-iterations 8 --num-envs 4 --horizon 3 --no-compile"),
+    "shac": _train("shac", "--iterations 8 --num-envs 4 --horizon 3"),
 }
 
 

@@ -235,7 +235,7 @@ def _checkpoint(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type
     from ballbot_train.learning.learners import shac
 
     task, config = make_task("turn"), {"learner": "shac", "task": "turn"}
-    settings = shac.ShacConfig(total_iterations=2, evaluations=1, num_envs=2, horizon=2, hidden=(4,), compile=False)
+    settings = shac.ShacConfig(iterations=2, evaluations=1, num_envs=2, horizon=2, hidden=(4,))
     made = shac.Shac(task, default_params(), settings)
     run = training._Run(made, task, config | {"settings": asdict(settings)}, folder / "run", False)
     run.score()

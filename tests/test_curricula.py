@@ -12,7 +12,6 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_train.learning import curricula
 from ballbot_train.learning.curricula import Curriculum, CurriculumBatch, widened
-from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS
 
 TINY = {
@@ -105,14 +104,6 @@ def test_the_goal_narrows_and_then_the_speed_rises_whenever_enough_episodes_succ
     assert [speed for _, speed, _ in reached] == pytest.approx([9.85, 9.85, 9.85, 9.95, 10.0, 10.0])
     assert all(speed == drawn for _, speed, drawn in reached)
     assert made.task == make_task("turn", duration=0.2)
-
-
-@pytest.mark.parametrize(("order", "expected"), [("goal", (1.2, 4.0)), ("ramp", (1.5, 4.1)), ("together", (1.2, 4.1))])
-def test_the_order_says_what_becomes_harder_first(order, expected):
-    settings = Curriculum(goal_factor=1.5, goal_step=0.8, ramp="max_speed", ramp_start=4.0, episodes=1, order=order)
-    made = batch(curriculum=settings)
-    made._harden()
-    assert (made.difficulty["goal_factor"], made.difficulty["max_speed"]) == pytest.approx(expected)
 
 
 def test_easier_speeds_are_drawn_first():
@@ -238,18 +229,7 @@ def test_a_share_of_the_episodes_repeats_starts_that_went_wrong():
     result = made.step(torch.zeros(400, 2))
     torch.testing.assert_close(result.observation, made.observe(made.state))
     run(made, 40 * made.task.steps)
-    assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0), (10, 0)]
-
-
-def test_no_start_is_repeated_when_the_goal_has_narrowed_enough():
-    settings = Curriculum(retries=1.0, goal_factor=2.0, goal_step=0.7, retries_goal_factor=1.5)
-    made = batch(curriculum=settings, num_envs=50)
-    run(made, 2 * made.task.steps)
-    assert made._again.all()
-    made._harden()
-    assert made.difficulty["goal_factor"] == pytest.approx(1.4)
-    run(made, made.task.steps)
-    assert not made._again.any()
+    assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0)]
 
 
 def test_episodes_on_optima_that_went_wrong_are_repeated_as_such():
@@ -264,59 +244,6 @@ def test_episodes_on_optima_that_went_wrong_are_repeated_as_such():
     counts = made._on_optima.state()
     run(made, made.task.steps)
     assert counts == pytest.approx(made._on_optima.state(), nan_ok=True)
-
-
-def test_no_episode_begins_in_the_gap_and_a_share_begins_just_above_it():
-    made = batch(curriculum=Curriculum(gap_low=4.0, gap_high=6.0, gap_step=0.1, gap_share=0.25), num_envs=400)
-    torch.manual_seed(0)
-    for _ in range(3):
-        run(made, made.task.steps)
-        speed = made.state.c[0]
-        assert not ((speed > 4) & (speed < 6)).any()
-        assert torch.equal(made.state.x[5], speed)
-        above = made._kind == curricula._ABOVE_GAP
-        assert 0.15 < float(above.double().mean()) < 0.35
-        assert (speed[above] <= 6.2).all()
-        assert (speed[above] >= 6).all()
-    assert (speed < 4).any()
-    assert (speed > 7).any()
-    result = made.step(torch.zeros(400, 2))
-    torch.testing.assert_close(result.observation, made.observe(made.state))
-
-
-def test_the_first_episodes_are_outside_of_the_gap_too():
-    made = batch(curriculum=Curriculum(gap_low=2.0, gap_high=9.0), num_envs=100)
-    assert (made.state.c[0] >= 9).all()
-    again = made.reset(mask=torch.arange(100) < 50)
-    assert (made.state.c[0] >= 9).all()
-    assert torch.equal(again, made.observe(made.state))
-
-
-def test_the_gap_closes_from_above_as_the_episodes_above_it_succeed():
-    made = batch(curriculum=Curriculum(gap_low=4.0, gap_high=4.5, gap_step=0.2, episodes=4, success=0.75), num_envs=100)
-    of_four = torch.ones(4, dtype=torch.bool)
-    made._count_above_gap(of_four, torch.tensor([True, True, False, False]))
-    assert made.difficulty["gap_high"] == 4.5
-    for reached in (4.3, 4.1, 4.0):
-        made._count_above_gap(of_four, torch.tensor([True, True, True, False]))
-        assert made.difficulty["gap_high"] == pytest.approx(reached)
-    torch.manual_seed(0)
-    run(made, 20 * made.task.steps)
-    assert (made._kind == curricula._OWN).all()
-
-
-def test_while_the_goal_is_wide_the_gap_stays_and_nothing_crowds_above_it():
-    settings = Curriculum(goal_factor=2.0, gap_low=4.0, gap_high=6.0, starts_on_optima=0.5, gap_share=1.0)
-    made = batch(curriculum=settings, num_envs=100)
-    starts = some_starts(made.task)
-    speeds = torch.where(torch.arange(20) < 10, 3.0, 5.0)
-    given(made, starts._replace(c=speeds.double()[None]))
-    torch.manual_seed(0)
-    run(made, made.task.steps)
-    assert not (made._kind == curricula._ABOVE_GAP).any()
-    on_optima = made._kind == curricula._ON_OPTIMUM
-    assert on_optima.any()
-    assert (made.state.c[0, on_optima] == 3).all()  # those of 5 m/s lie in the gap
 
 
 def test_only_failures_are_repeated_where_an_episode_that_runs_out_of_time_may_be_a_good_one():
@@ -336,17 +263,6 @@ def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     assert starts.x[:2, 0].tolist() == [0.0, -1.0]
     assert float(starts.x[5, 0]) == pytest.approx(float(starts.c[0, 0]))
     assert not task.is_goal(starts.x[:, -1].numpy(), starts.c[:, -1].numpy())
-
-
-def test_episodes_begin_on_successful_demonstrations(tmp_path):
-    data = write_demos(
-        DemoConfig("stabilize", "lqr", episodes=3, physics="rk4", pushes=0.0), tmp_path / "tiny-v0", 1, lambda n: None
-    )
-    starts = curricula.demonstrated_starts(data, make_task("stabilize"), 50)
-    assert starts.steps.max() == 49
-    assert torch.isfinite(starts.x).all()
-    with pytest.raises(ValueError, match="not of Turn"):
-        curricula.demonstrated_starts(data, make_task("turn"), 50)
 
 
 def test_optima_with_a_reserve_end_deeper_in_the_goal():
@@ -428,13 +344,36 @@ def test_the_curriculum_is_over_once_enough_episodes_of_the_task_itself_succeed(
     assert resumed.is_settled
 
 
+def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
+    torch.manual_seed(0)
+    task = replace(make_task("stabilize"), duration=2.0)
+    curriculum = Curriculum(short_episodes=0.5, short_seconds=0.1)
+    batch = CurriculumBatch(task, 400, default_params(), curriculum, gamma=0.99)
+    batch.reset(seed=0)
+    assert batch.state is not None
+    batch.state = batch.state._replace(steps=torch.full((400,), task.steps - 1))
+    actions = torch.zeros(400, 2)
+    assert batch.step(actions).truncated.all()  # the next episodes begin, some of them short
+    for _ in range(4):
+        assert not batch.step(actions).truncated.any()
+    short = batch.step(actions).truncated
+    assert 0.4 < short.double().mean() < 0.6
+    for _ in range(10):  # no other than short ones ends before 2 s
+        assert not (batch.step(actions).truncated & ~short).any()
+
+
+def test_a_task_that_ends_at_its_goal_has_no_short_episodes():
+    with pytest.raises(ValueError, match="pays at its goal"):
+        Curriculum(short_episodes=0.5).check(make_task("turn"))
+
+
 @pytest.mark.parametrize("name", ["rsl_ppo", "ppo", "sac"])
 def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(name, monkeypatch):
     monkeypatch.setattr(curricula, "optimal_starts", lambda task, params, count, steps, reserve: some_starts(task))
     easier = Curriculum(
         goal_factor=3.0, ramp="max_speed", ramp_start=3.0, starts_on_optima=0.5, shaping=1.0, episodes=2, success=0.0
     )
-    easier = replace(easier, starts_seconds=0.04, retries=0.5, gap_low=2.2, gap_high=2.6)
+    easier = replace(easier, starts_seconds=0.04, retries=0.5)
     settings = replace(LEARNERS[name].settings("turn"), hidden=(8,), curriculum=easier, **TINY[name])
 
     def make(seed):
@@ -464,7 +403,6 @@ def test_a_learner_with_a_curriculum_goes_on_from_its_state_as_if_never_stopped(
         ({"goal_factor": 0.5}, "curriculum.goal_factor must be 1 to 1000, not 0.5"),
         ({"success": float("nan")}, "curriculum.success must be 0 to 1, not nan"),
         ({"retries": 2.0}, "curriculum.retries must be 0 to 1, not 2.0"),
-        ({"gap_share": 0.0}, "curriculum.gap_share must be 0.001 to 1, not 0.0"),
         ({"starts_on_optima": 2.0}, "curriculum.starts_on_optima must be 0 to 1, not 2.0"),
     ],
 )
@@ -482,12 +420,6 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
             {"ramp": "max_speed"},
             "BallbotStabilize-v0 has no field 'max_speed' for curriculum.ramp; it has",
         ),
-        (
-            "stabilize",
-            {"gap_high": 1.0},
-            "BallbotStabilize-v0 draws no constants, so curriculum.gap_high must not be above",
-        ),
-        ("turn", {"gap_high": 11.0}, "BallbotTurn-v0 draws no speed just above curriculum.gap_high 11"),
         ("turn", {"ramp": "max_speed", "ramp_start": 1.0}, "curriculum.ramp_start 1 is out of range"),
         ("turn", {"starts_seconds": 0.5}, "curriculum.starts_seconds needs curriculum.starts_on_optima above 0"),
         ("weave", {"starts_seconds": 0.5, "starts_on_optima": 0.5}, "BallbotWeave-v0 does not end at its goal"),
@@ -501,31 +433,3 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
 def test_what_a_task_has_not_is_refused(name, settings, message):
     with pytest.raises(ValueError, match=message):
         batch(name, Curriculum(**settings))
-
-
-def test_demonstrations_without_starts_on_them_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="uses demonstrations only with"):
-        LEARNERS["rsl_ppo"].make(make_task("turn"), default_params(), LEARNERS["rsl_ppo"].settings("turn"), 0, tmp_path)
-
-
-def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
-    torch.manual_seed(0)
-    task = replace(make_task("stabilize"), duration=2.0)
-    curriculum = Curriculum(short_episodes=0.5, short_seconds=0.1)
-    batch = CurriculumBatch(task, 400, default_params(), curriculum, gamma=0.99)
-    batch.reset(seed=0)
-    assert batch.state is not None
-    batch.state = batch.state._replace(steps=torch.full((400,), task.steps - 1))
-    actions = torch.zeros(400, 2)
-    assert batch.step(actions).truncated.all()  # the next episodes begin, some of them short
-    for _ in range(4):
-        assert not batch.step(actions).truncated.any()
-    short = batch.step(actions).truncated
-    assert 0.4 < short.double().mean() < 0.6
-    for _ in range(10):  # no other than short ones ends before 2 s
-        assert not (batch.step(actions).truncated & ~short).any()
-
-
-def test_a_task_that_ends_at_its_goal_has_no_short_episodes():
-    with pytest.raises(ValueError, match="pays at its goal"):
-        Curriculum(short_episodes=0.5).check(make_task("turn"))

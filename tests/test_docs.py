@@ -21,9 +21,9 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where the clients are installed
 SHORTER = {  # a training that a page calls `# minutes` runs with these too
-    "dagger": "--total-iterations 1 --episodes-per-iteration 4 --candidate-episodes 4 --batch-episodes 0 --gradient-steps 5",
+    "dagger": "--iterations 1 --episodes-per-iteration 4 --candidate-episodes 4 --batch-episodes 0 --gradient-steps 5",
     "ppo": "--rl-iterations 1 --num-envs 64 --num-steps 48 --clone-iterations 1 --critic-warmup-iterations 0",
-    "shac": "--total-iterations 1 --num-envs 8 --horizon 4 --no-compile",
+    "shac": "--iterations 1 --num-envs 8 --horizon 4",
 }
 MEASURED = "--evaluations 1 --test-episodes 2 --validation-episodes 2"
 

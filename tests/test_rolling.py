@@ -478,16 +478,19 @@ def test_every_robot_can_be_named_on_the_command_line():
 
 def taught(robot, **settings):
     """shac on Stabilize after some iterations, from LQR."""
-    config = shac.ShacConfig(num_envs=64, hidden=(16,), symmetry="odd", compile=False, **settings)
+    config = shac.ShacConfig(num_envs=64, hidden=(16,), symmetry="odd", **settings)
     learner = shac.Shac(make_task("stabilize", robot), named_robot(robot), config)
-    for _ in range(config.total_iterations):
+    for _ in range(config.iterations):
         learner.iterate()
     return learner.network
 
 
-def test_the_penalty_on_slipping_is_for_robots_that_can_slip():
+def test_the_penalty_on_slipping_is_for_robots_that_can_slip(monkeypatch):
     def same(robot):
-        networks = [taught(robot, total_iterations=1, horizon=5, grip_penalty=penalty) for penalty in (3000.0, 0.0)]
+        networks = []
+        for penalty in (3000.0, 0.0):
+            monkeypatch.setattr(shac, "_GRIP_PENALTY", penalty)
+            networks.append(taught(robot, iterations=1, horizon=5))
         return all(torch.equal(*pair) for pair in zip(*(network.parameters() for network in networks), strict=True))
 
     assert same("paper")
@@ -495,11 +498,12 @@ def test_the_penalty_on_slipping_is_for_robots_that_can_slip():
 
 
 @pytest.mark.slow
-def test_shac_learns_to_keep_its_grip():
+def test_shac_learns_to_keep_its_grip(monkeypatch):
     """The penalty's gradient leads away from slipping, which without it is only counted."""
 
     def failures(grip_penalty):
-        network = taught("rolling", total_iterations=40, horizon=15, grip_penalty=grip_penalty)
+        monkeypatch.setattr(shac, "_GRIP_PENALTY", grip_penalty)
+        network = taught("rolling", iterations=40, horizon=15)
         return training.validate(network, make_task("stabilize", "rolling"), "rolling").failures
 
     assert failures(3000.0) < 0.8 * failures(0.0)

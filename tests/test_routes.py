@@ -137,14 +137,14 @@ def test_a_learner_teaches_its_routes_first_and_keeps_them(name, monkeypatch):
     monkeypatch.setattr(routing, "EPISODES", 60)
     monkeypatch.setattr(routing, "_STEPS", 5)
     tiny = {
-        "shac": {"num_envs": 4, "horizon": 3, "compile": False, "total_iterations": 2, "one_way": True},
+        "shac": {"num_envs": 4, "horizon": 3, "iterations": 2, "one_way": True},
         "dagger": {
             "episodes_per_iteration": 1,
             "candidate_episodes": 0,
             "rollouts_per_plan": 0,
             "tracked_rollouts_per_plan": 1,
             "gradient_steps": 2,
-            "total_iterations": 2,
+            "iterations": 2,
         },
     }[name]
     settings = replace(LEARNERS[name].settings("weave"), symmetry="routes", hidden=(8,), **tiny)

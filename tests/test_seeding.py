@@ -25,12 +25,12 @@ ENVS = 64
 SMALL = {
     "num_envs": ENVS,
     "hidden": (8,),
-    "compile": False,
     "buffer_steps": 1000,
     "gradient_steps": 1,
     "batch_episodes": ENVS,
     "gathering_iterations": 1,
     "total_iterations": 1,
+    "iterations": 1,
 }
 
 
@@ -72,7 +72,7 @@ class Drawn(Exception):
     """All starts of an iteration are drawn."""
 
 
-@pytest.mark.parametrize("name", sorted(set(LEARNERS) - {"bc"}))  # which draws no episode
+@pytest.mark.parametrize("name", LEARNERS)
 def test_trainings_with_neighbouring_seeds_share_no_start(name, starts, monkeypatch):
     def plan(*arguments):
         raise Drawn

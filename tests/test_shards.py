@@ -144,13 +144,15 @@ def test_a_stream_gives_every_shard_once_per_epoch_in_an_order_of_its_own(demos)
 
 
 def test_behaviour_cloning_reads_one_shard_per_iteration_and_resumes_with_the_same_bits(demos, monkeypatch):
-    settings = type(LEARNERS["bc"].settings("turn"))(total_iterations=4, gradient_steps=2, batch_size=8, hidden=(4,))
+    settings = type(LEARNERS["dagger"].settings("turn"))(
+        iterations=4, gathering_iterations=0, gradient_steps=2, batch_size=8, hidden=(4,)
+    )
     read = []
     real = shards.Shards.read
     monkeypatch.setattr(shards.Shards, "read", lambda self, number: (read.append(number), real(self, number))[1])
 
     def learner():
-        return LEARNERS["bc"].make(TASK, default_params(), settings, 0, demos / "set")
+        return LEARNERS["dagger"].make(TASK, default_params(), settings, 0, demos / "set")
 
     first, second = learner(), learner()
     for _ in range(4):

@@ -217,7 +217,7 @@ def test_a_policy_that_is_averaged_over_mirror_images_mirrors_exactly(name, inde
 @pytest.mark.parametrize(("name", "symmetry"), [("weave", "frame"), ("weave", "mirrors"), ("turn", "frame")])
 def test_policies_that_are_fitted_or_follow_gradients_have_the_symmetry_that_is_asked_for(name, symmetry, params):
     task = TASKS[name]()
-    config = ShacConfig(num_envs=2, hidden=(8,), symmetry=symmetry, compile=False)
+    config = ShacConfig(num_envs=2, hidden=(8,), symmetry=symmetry)
     for network in (Fit(task, params, symmetry, (8,), 0).network, Shac(task, params, config).network):
         assert network.spec == spec_for(task, symmetry, (8,), linear=True)
         assert network.spec.squash == "tanh"
@@ -225,7 +225,7 @@ def test_policies_that_are_fitted_or_follow_gradients_have_the_symmetry_that_is_
 
 def test_where_the_policy_sees_the_frame_the_critic_of_shac_does_too(params, rng):
     task = TASKS["weave"]()
-    critic = Shac(task, params, ShacConfig(num_envs=2, hidden=(8,), symmetry="frame", compile=False)).critic
+    critic = Shac(task, params, ShacConfig(num_envs=2, hidden=(8,), symmetry="frame")).critic
     torch.nn.init.normal_(critic.mlp[-1].weight)  # it starts at zero
     seen = torch.tensor(np.array([task.observe(*task.sample(rng, params)) for _ in range(20)]), dtype=torch.float32)
     signs = torch.tensor(task.observation_signs(task.mirrors[0]))

@@ -153,8 +153,8 @@ def test_the_file_for_rl_zoo3_has_the_four_ids(learner):
 
 
 def test_a_learner_without_a_space_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="no search space for bc; there is one for ppo"):
-        tuning.run(replace(SEARCH, learner="bc"), 1, tmp_path)
+    with pytest.raises(ValueError, match="no search space for dagger; there is one for ppo"):
+        tuning.run(replace(SEARCH, learner="dagger"), 1, tmp_path)
 
 
 def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, capsys):

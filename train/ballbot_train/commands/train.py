@@ -33,7 +33,7 @@ class Run:
     demos: str | None = None
     """Folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards."""
     start: Path | None = None
-    """Policy file whose weights training starts from; only for apg, rsl_ppo and shac."""
+    """Policy file whose weights training starts from; only for rsl_ppo and shac."""
     seed: int = 0
     """Seed of everything that is drawn."""
     seeds: str | None = None
@@ -77,7 +77,7 @@ def train(
         learner: name of a learner in `LEARNERS`.
         task: name of a task.
         demos: folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards.
-        start: policy file whose weights training starts from, of any robot; only for apg, rsl_ppo and shac.
+        start: policy file whose weights training starts from, of any robot; only for rsl_ppo and shac.
         seed: seed of everything that is drawn.
         settings: the learner's settings; default, those tuned for the task.
         threads: threads of torch. Another number changes the last digits; more than one is slower beside other work.

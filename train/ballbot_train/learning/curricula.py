@@ -6,7 +6,7 @@ A curriculum changes training alone. What is evaluated is always the task itself
 - A field of the task that bounds what is drawn, as Turn's `max_speed`, begins at an easier value, and goes to the task's own
   by a step whenever enough training episodes succeed.
 - A share of the episodes begins in states along optima, with the time that is left there. These optima are those of training
-  episodes drawn for this purpose, or the states of a dataset of demonstrations. No certified episode is among them. These
+  episodes drawn for this purpose. No certified episode is among them. These
   episodes can begin shortly before the end of their optimum at first, and ever earlier as enough of them succeed (Florensa et
   al., "Reverse curriculum generation for reinforcement learning", 2017).
 - A share of the episodes, also of those on optima, repeats starts from which recent ones failed or missed their goal. So what
@@ -14,9 +14,6 @@ A curriculum changes training alone. What is evaluated is always the task itself
   level replay", 2021).
 - A curriculum is over when the goal and that field are the task's own and enough episodes succeed. From then on a failure can
   cost less, fewer starts are repeated, and schedules of the learner that waited go on.
-- Values of the first constant, as Turn's speed, can be left out at first. This gap closes from above, by a step whenever
-  enough of the episodes just above it succeed. So the way of the episodes above it, as Turn's loop, is carried on into the
-  gap, where a policy that begins with all of them averages two ways.
 - A share of the episodes is cut soon after its start, so that more of the samples are of starts.
 - Rewards are shaped by a potential, minus the distance to the goal. Shaping by a potential moves no optimum (Ng et al.,
   "Policy invariance under reward transformations", 1999).
@@ -27,8 +24,7 @@ A curriculum changes training alone. What is evaluated is always the task itself
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -43,9 +39,8 @@ from ballbot_train.evaluation import fresh
 
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
-_OWN, _ON_OPTIMUM, _ABOVE_GAP = 0, 1, 2  # how an episode began
+_OWN, _ON_OPTIMUM = 0, 1  # how an episode began
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
-_CANDIDATES = 100_000  # constants, of which those outside of the gap are taken
 
 
 @dataclass(frozen=True)
@@ -66,8 +61,6 @@ class Curriculum:
     """Value of that field at the start of training, in its unit."""
     ramp_step: float = 0.1
     """How much nearer the field comes to the task's own value whenever enough episodes succeed, in its unit."""
-    order: Literal["goal", "ramp", "together"] = "goal"
-    """What comes first, narrowing the goal or the steps of `ramp`; or both together."""
     success: float = 0.7
     """Share of the training episodes that is enough. Episodes that begin on optima do not count."""
     settled_success: float = 0.0
@@ -77,7 +70,7 @@ class Curriculum:
     """Number of ended training episodes after which that share is looked at; then they are counted anew."""
     starts_on_optima: float = 0.0
     """Share of the training episodes that begin in a state along an optimum, drawn from all values of the task; 0: off.
-    They are states of optima that the run finds first; of rsl_ppo with --demos, of the successful demonstrations."""
+    They are states of optima that the run finds first."""
     optima: int = 64
     """Number of optima that the run finds for them, of about a second each."""
     starts_seconds: float = 0.0
@@ -97,23 +90,12 @@ class Curriculum:
     retries: float = 0.0
     """Share of the training episodes, of the task's own and of those on optima, that repeat the start of one of the last such
     episodes that failed or, on a task that ends at its goal, missed it; 0: off. They do not count for `success`."""
-    retries_goal_factor: float = 0.0
-    """No more starts are repeated when the goal's tolerances have narrowed to so many times the task's own; 0: they are to
-    the end. A failure costs so much more than all else that where many are repeated, cost is hardly learnt."""
     retries_per_failure: float = 0.0
     """Once the curriculum is over, the share that repeats starts is at most so many times that of the task's own episodes
     that went wrong lately; 0: it is `retries` in any case."""
     last_failure_price: float = 0.0
     """Price of a failure, where living does not pay, once the curriculum is over; 0: as before. A high one teaches not to
     fail, and beside a low one cost is learnt too."""
-    gap_low: float = 0.0
-    """No episode has a first constant, as Turn's speed, between this value and `gap_high` at the start of training."""
-    gap_high: float = 0.0
-    """The upper end of that gap, in the unit of the constant; not above `gap_low`: no gap."""
-    gap_step: float = 0.05
-    """How much lower it gets whenever enough of the episodes just above it succeed, once the goal is the task's own."""
-    gap_share: float = 0.2
-    """Share of the task's own episodes that begin just above the gap, within two steps, until it is closed."""
     short_episodes: float = 0.0
     """Share of the training episodes that are cut after `short_seconds`; 0: off. So more of the samples are of the starts,
     where most of a good policy's regret arises."""
@@ -139,13 +121,8 @@ class Curriculum:
             ("starts_reserve", 0.0, 1 - 1e-6),
             ("starts_goal_factor", 0.0, 1e3),
             ("retries", 0.0, 1.0),
-            ("retries_goal_factor", 0.0, 1e3),
             ("retries_per_failure", 0.0, 1e6),
             ("last_failure_price", 0.0, 1e9),
-            ("gap_low", -1e6, 1e6),
-            ("gap_high", -1e6, 1e6),
-            ("gap_step", 1e-9, 1e6),
-            ("gap_share", 1e-3, 1.0),
             ("short_episodes", 0.0, 1.0),
             ("short_seconds", 1e-3, 1e6),
             ("shaping", 0.0, 1e6),
@@ -162,15 +139,9 @@ class Curriculum:
             or self.ramp != ""
             or self.starts_on_optima > 0
             or self.retries > 0
-            or self.has_gap
             or self.short_episodes > 0
             or self.shaping > 0
         )
-
-    @property
-    def has_gap(self) -> bool:
-        """Whether episodes are left out at first."""
-        return self.gap_high > self.gap_low
 
     def check(self, task: Task) -> None:
         """Raises a ValueError that says what of this the task does not have."""
@@ -190,10 +161,6 @@ class Curriculum:
             raise ValueError(
                 f"curriculum.starts_goal_factor must be less than curriculum.goal_factor {self.goal_factor:g}, "
                 f"not {self.starts_goal_factor:g}"
-            )
-        if self.has_gap and not task.constant_draws:
-            raise ValueError(
-                f"{task.id} draws no constants, so curriculum.gap_high must not be above curriculum.gap_low"
             )
         if self.short_episodes and task.first_exit:
             raise ValueError(
@@ -244,7 +211,6 @@ class CurriculumBatch(BallbotBatch):
         params: BallbotParams,
         curriculum: Curriculum,
         gamma: float,
-        demos: str | Path | None = None,
         full: Task | None = None,
         pay: bool = True,
         failure_price: float = 0.0,
@@ -257,13 +223,12 @@ class CurriculumBatch(BallbotBatch):
             params: the robot.
             curriculum: what is easier.
             gamma: discount factor of the learner, for shaping.
-            demos: dataset of demonstrations on whose states episodes begin; default, optima are found.
-            full: the task itself, of which the demonstrations are and whose optima are found; default, `task`.
+            full: the task itself, whose optima are found; default, `task`.
             pay: whether living pays; else the reward is minus the running cost, and a failure costs its price at once.
             failure_price: of a failure, where living does not pay.
 
         Raises:
-            ValueError: the task has not what the curriculum asks for, or the demonstrations are of another task.
+            ValueError: the task has not what the curriculum asks for.
         """
         curriculum.check(task)
         super().__init__(task, num_envs, compile=False, params=params)
@@ -272,12 +237,7 @@ class CurriculumBatch(BallbotBatch):
         self._goal_factor = curriculum.goal_factor
         self._ramp = curriculum.ramp_start if curriculum.ramp else 0.0
         self._reach = curriculum.starts_seconds
-        self._gap_high = curriculum.gap_high
-        self._own_episodes, self._on_optima, self._above_gap = (
-            _Tally(),
-            _Tally(),
-            _Tally(),
-        )  # that ended, by how they began
+        self._own_episodes, self._on_optima = _Tally(), _Tally()  # that ended, by how they began
         self._has_settled = not curriculum.settled_success  # whether enough episodes of the task itself have succeeded
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
@@ -287,11 +247,9 @@ class CurriculumBatch(BallbotBatch):
         self._begun = torch.zeros(
             rows, num_envs
         )  # states, constants and passed steps at the starts of the running episodes
-        self._hard = [torch.zeros(rows, 0)] * 3  # those of the last episodes of each kind that went wrong
-        self._demos, self._full = demos, task if full is None else full
+        self._hard = [torch.zeros(rows, 0)] * 2  # those of the last episodes of each kind that went wrong
+        self._full = task if full is None else full
         self._starts: Starts | None = None
-        if demos is not None and curriculum.starts_on_optima:
-            self._starts = demonstrated_starts(demos, self._full, task.steps)
         self._set_difficulty()
 
     @property
@@ -304,8 +262,6 @@ class CurriculumBatch(BallbotBatch):
             reached[curriculum.ramp] = self._ramp
         if curriculum.starts_seconds:
             reached["starts_seconds"], reached["starts_success"] = self._reach, self._on_optima.share
-        if curriculum.has_gap:
-            reached["gap_high"], reached["gap_success"] = self._gap_high, self._above_gap.share
         return reached | ({"success": self._own_episodes.share} if reached else {})
 
     def reset(self, *args: Any, mask: torch.Tensor | None = None, **given: Any) -> torch.Tensor:
@@ -314,10 +270,6 @@ class CurriculumBatch(BallbotBatch):
         begun = torch.ones(self.num_envs, dtype=torch.bool) if mask is None else mask
         self._kind = torch.where(begun, _OWN, self._kind)
         self._again = self._again & ~begun
-        if self._gap_is_open and given.get("x") is None and given.get("c") is None:
-            self._leave_gap(begun)
-            assert self.state is not None
-            observation = self.observe(self.state)
         self._begin(begun)
         return observation
 
@@ -343,17 +295,13 @@ class CurriculumBatch(BallbotBatch):
         self._count(counted & (self._kind == _OWN), result.success)
         if self.curriculum.starts_on_optima:
             self._count_starts(counted & (self._kind == _ON_OPTIMUM), result.success)
-        if self._gap_is_open:
-            self._count_above_gap(counted & (self._kind == _ABOVE_GAP), result.success)
         if self.curriculum.retries:
             self._keep_hard(result)
         self._kind, self._again = torch.where(ended, _OWN, self._kind), self._again & ~ended
         began = self.state
-        if self._gap_is_open:
-            self._leave_gap(ended)
         if self._some_start_on_optima:
             self._start_on_optima(ended)
-        if self.curriculum.retries and self._goal_factor > self.curriculum.retries_goal_factor:
+        if self.curriculum.retries:
             self._retry(ended)
         if self.state is not began:  # some were moved
             assert self.state is not None
@@ -371,11 +319,9 @@ class CurriculumBatch(BallbotBatch):
             "goal_factor": self._goal_factor,
             "ramp": self._ramp,
             "reach": self._reach,
-            "gap_high": self._gap_high,
             "settled": self._has_settled,
             "own_episodes": self._own_episodes.state(),
             "on_optima": self._on_optima.state(),
-            "above_gap": self._above_gap.state(),
             "kind": self._kind,
             "again": self._again,
             "begun": self._begun,
@@ -386,9 +332,8 @@ class CurriculumBatch(BallbotBatch):
     def load_curriculum_state(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
         self._goal_factor, self._ramp, self._reach = state["goal_factor"], state["ramp"], state["reach"]
-        self._gap_high, self._has_settled = state["gap_high"], state["settled"]
+        self._has_settled = state["settled"]
         self._own_episodes, self._on_optima = _Tally(*state["own_episodes"]), _Tally(*state["on_optima"])
-        self._above_gap = _Tally(*state["above_gap"])
         self._kind, self._again = state["kind"], state["again"]
         self._begun, self._hard = state["begun"], list(state["hard"])
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
@@ -432,16 +377,6 @@ class CurriculumBatch(BallbotBatch):
     def _longest(self) -> float:
         """Duration of the longest optimum, s."""
         return math.inf if self._starts is None else float(self._starts.left.max()) * self.task.control_dt
-
-    def _count_above_gap(self, ended: torch.Tensor, success: torch.Tensor) -> None:
-        """Counts the ended episodes that began just above the gap, and narrows it if enough of them succeeded."""
-        if self._complete(self._above_gap, ended, success) and self._enough(self._above_gap):
-            self._gap_high = max(self._gap_high - self.curriculum.gap_step, self.curriculum.gap_low)
-            self._set_difficulty()
-
-    @property
-    def _gap_is_open(self) -> bool:
-        return self._gap_high > self.curriculum.gap_low
 
     def _complete(self, tally: "_Tally", ended: torch.Tensor, success: torch.Tensor) -> bool:
         """Counts the episodes that ended. True where `episodes` are complete now; their share of successes is then new."""
@@ -488,9 +423,9 @@ class CurriculumBatch(BallbotBatch):
         curriculum = self.curriculum
         own = getattr(self._own, curriculum.ramp) if curriculum.ramp else 0.0
         wide, easy = self._is_wide, self._is_ramping
-        if wide and not (curriculum.order == "ramp" and easy):
+        if wide:
             self._goal_factor = max(1.0, self._goal_factor * curriculum.goal_step)
-        if easy and not (curriculum.order == "goal" and wide):
+        elif easy:
             away = own - self._ramp
             self._ramp = (
                 own if abs(away) <= curriculum.ramp_step else self._ramp + math.copysign(curriculum.ramp_step, away)
@@ -505,37 +440,6 @@ class CurriculumBatch(BallbotBatch):
             task = replace(task, **{self.curriculum.ramp: self._ramp})
         self.task = widened(task, self._goal_factor)
         self._eligible: torch.Tensor | None = None
-        if self._gap_is_open:
-            self._draw_candidates()
-
-    def _draw_candidates(self) -> None:
-        """Draws constants, and finds those outside of the gap, and among them those just above it."""
-        generator = torch.Generator().manual_seed(0)
-        z = torch.rand(self.task.constant_draws, _CANDIDATES, dtype=self.dtype, generator=generator)
-        drawn = (torch.as_tensor(value, dtype=self.dtype) for value in self.task.draw_constants(tuple(z), self.params))
-        self._candidates = torch.stack(torch.broadcast_tensors(*drawn))
-        first = self._candidates[0]
-        above = (first >= self._gap_high) & (first <= self._gap_high + 2 * self.curriculum.gap_step)
-        self._outside, self._near = (~self._in_gap(first)).nonzero()[:, 0], above.nonzero()[:, 0]
-        if not len(self._near):
-            name = self._own.constant_names[0]
-            raise ValueError(f"{self._own.id} draws no {name} just above curriculum.gap_high {self._gap_high:g}")
-
-    def _in_gap(self, first: torch.Tensor) -> torch.Tensor:
-        """Whether episodes with these first constants are left out."""
-        return (first > self.curriculum.gap_low) & (first < self._gap_high)
-
-    def _leave_gap(self, begun: torch.Tensor) -> None:
-        """Draws the episodes anew that have just begun in the gap, and a share of the others just above it."""
-        assert self.state is not None
-        above = begun & (torch.rand(self.num_envs) < self.curriculum.gap_share * (self._goal_factor == 1))
-        self._kind = torch.where(above, _ABOVE_GAP, self._kind)
-        for drawn, which in ((above, self._near), (begun & ~above & self._in_gap(self.state.c[0]), self._outside)):
-            count = int(drawn.sum())
-            c = self._candidates[:, which[torch.randint(len(which), (count,))]]
-            z = torch.rand(self._own.state_draws, count, dtype=self.dtype)
-            x = torch.stack(self._own.draw_state(tuple(z), tuple(c), self.params))
-            self._move(drawn, x, c, torch.zeros(count, dtype=torch.long))
 
     def _start_on_optima(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun into states along optima."""
@@ -546,7 +450,7 @@ class CurriculumBatch(BallbotBatch):
         if self._eligible is None:  # states outside of the goal, which may be wide
             inside = self.task.goal(self._starts.x.unbind(0), self._starts.c.unbind(0))
             reached = torch.stack([excess <= 0 for excess in inside]).all(0)
-            near = ~self._in_gap(self._starts.c[0]) if self._gap_is_open else torch.ones_like(reached)
+            near = torch.ones_like(reached)
             if self._reach:
                 near = near & (self._starts.left <= max(1, round(self._reach / self.task.control_dt)))
             outside = (near & ~reached).nonzero()[:, 0]
@@ -654,20 +558,6 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int, re
     if not found:
         raise ValueError(f"{task.id}: no optimum was found on which episodes could begin")
     return _starts(found, steps)
-
-
-def demonstrated_starts(path: str | Path, task: Task, steps: int) -> Starts:
-    """The states of the successful demonstrations of a dataset, before their ends and before control step `steps`.
-
-    Raises:
-        ValueError: there is no such dataset, or it is damaged, of another task, or none of its episodes succeeds.
-    """
-    from ballbot_train.learning.demonstrations import demonstrated_states
-
-    shown = list(demonstrated_states(path, task))
-    if not shown:
-        raise ValueError(f"{path}: no demonstration succeeds, so no episode can begin on one")
-    return _starts(shown, steps)
 
 
 def _starts(found: list[tuple[np.ndarray, np.ndarray]], steps: int) -> Starts:

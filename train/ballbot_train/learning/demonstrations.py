@@ -458,49 +458,6 @@ def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task) -> None:
         )
 
 
-def demonstrated_states(path: str | Path, task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The states (T+1, 8) and constants (nc,) of the successful episodes of a dataset of `ballbot demos`.
-
-    Raises:
-        ValueError: as `load_demos`.
-    """
-    if shards.is_set(path):
-        return _states_of_shards(_opened(path, task), task)
-    _check_made_for(str(path), _metadata(Path(path)), task)
-    try:
-        arrays = _dataset(Path(path))
-        _demos(arrays, len(task.observation_scale))  # it checks the arrays
-        return _successes(arrays, task)
-    except Exception as error:  # h5py has dozens of ways to refuse a damaged file
-        raise _damaged_dataset(path, error) from error
-
-
-def _states_of_shards(opened: shards.Shards, task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
-    found = []
-    for number in opened.numbers:
-        arrays = opened.read(number)
-        try:
-            found += _successes(arrays, task)
-        except _UNFIT as error:
-            raise _damaged_shard(opened, number, error) from error
-    return found
-
-
-def _successes(arrays: Mapping[str, np.ndarray], task: Task) -> list[tuple[np.ndarray, np.ndarray]]:
-    """States (T+1, 8) and constants (nc,) of the successful episodes among some."""
-    states = files.numbers(arrays["states"], "states", (int((arrays["lengths"] + 1).sum()), 8))
-    parts = np.split(states, np.cumsum(arrays["lengths"] + 1)[:-1])
-    env = BallbotEnv(task, physics="rk4")
-    found = []
-    for each, text in zip(parts, arrays["about"], strict=True):
-        about = json.loads(str(text))
-        if about["success"]:
-            _, info = env.reset(seed=int(about["seed"]))  # constants follow from the seed
-            found.append((each, info["constants"]))
-    env.close()
-    return found
-
-
 def _dataset(path: Path) -> dict[str, np.ndarray]:
     """A dataset's HDF5 as arrays of a shard; see `_arrays_of`.
 
@@ -509,7 +466,7 @@ def _dataset(path: Path) -> dict[str, np.ndarray]:
     main = path / "data" / "main_data.hdf5"
     if not main.is_file():
         raise ValueError(f"{main} is no regular file")
-    size, declared, about = main.stat().st_size, 0, []
+    size, declared = main.stat().st_size, 0
     arrays: dict[str, list[np.ndarray]] = {name: [] for name in _IN_DATASET}
     with h5py.File(main, "r") as file:
         for i in range(len(file)):
@@ -519,10 +476,8 @@ def _dataset(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"its arrays declare more than the {size} bytes of {main.name}")
             for name, place in _IN_DATASET.items():
                 arrays[name].append(group[place][()])
-            about.append(json.dumps({name: int(group.attrs[name]) for name in ("seed", "success")}))
     lengths = np.array([len(each) for each in arrays["actions"]], np.int64)
-    joined = {name: np.concatenate(parts) for name, parts in arrays.items()}
-    return joined | {"lengths": lengths, "about": np.array(about)}
+    return {name: np.concatenate(parts) for name, parts in arrays.items()} | {"lengths": lengths}
 
 
 def _demos(arrays: Mapping[str, np.ndarray], observations: int) -> Demos:

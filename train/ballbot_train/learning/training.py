@@ -327,15 +327,10 @@ class _Run:
             self.learner.load_state_dict(state["learner"])
             best = self._restored(state["policy"])
             self.seconds = float(state["seconds"])
-            # those of earlier versions lack some columns
-            self.rows = [{name: row.get(name, math.nan) for name in _COLUMNS} for row in state["rows"]]
-            self.cpu_seconds = float(state.get("cpu_seconds", math.nan))
-            if "best_validation" in state:
-                known = state["best_validation"]  # a number in earlier versions
-                self.best = (known, math.inf) if isinstance(known, float) else (float(known[0]), float(known[1]))
-            else:  # of an earlier version, which chose the best policy on the certified episodes
-                validation = validate(best, self.task, self.robot, self.validation_episodes)
-                self.best = validation.cost, validation.mean_cost
+            self.rows = [{name: row[name] for name in _COLUMNS} for row in state["rows"]]
+            self.cpu_seconds = float(state["cpu_seconds"])
+            cost, mean_cost = state["best_validation"]
+            self.best = float(cost), float(mean_cost)
         except MemoryError:
             raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
@@ -380,9 +375,8 @@ class _Run:
     @property
     def _chosen(self) -> dict[str, Any]:
         """The evaluation whose policy is kept."""
-        known = [row for row in self.rows if not math.isnan(row["validation_cost"])] or self.rows
-        later = [row for row in known if row["iteration"] > self._preparation] if self._preparation else known
-        return min(later or known, key=lambda row: (row["validation_cost"], row["validation_mean_cost"]))
+        later = [row for row in self.rows if row["iteration"] > self._preparation] if self._preparation else self.rows
+        return min(later or self.rows, key=lambda row: (row["validation_cost"], row["validation_mean_cost"]))
 
     @property
     def best_text(self) -> str:

@@ -6,11 +6,10 @@ interval over the seeds. Each curve ends where the first of its seeds ends, so t
 """
 
 import csv
-import functools
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,7 @@ import scipy.stats
 from matplotlib.figure import Figure
 
 from ballbot_gym import files
-from ballbot_gym.lazy import load
 from ballbot_train.console import markdown
-from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.report.labels import color, label
 
 METRICS = {
@@ -124,33 +121,12 @@ def _read_run(folder: Path) -> TrainingRun:
         rows = list(csv.DictReader(text.splitlines()))
         names = [name for name in rows[0] if name is not None]
         columns = {name: np.array([float(row[name]) for row in rows]) for name in names}
-        absent = np.full(len(rows), math.nan)
-        cpu = columns.get("cpu_seconds", absent)
-        columns["minutes"] = np.where(np.isfinite(cpu), cpu, columns["seconds"]) / 60
+        columns["minutes"] = columns["cpu_seconds"] / 60
         columns["regret"] = columns["cost_ratio"] - 1
-        for name in (*AXES, *METRICS):
-            columns.setdefault(name, absent)
-        settings = json.dumps(_completed(config["settings"], _defaults(config["learner"])), sort_keys=True)
+        settings = json.dumps(config["settings"], sort_keys=True)
         return TrainingRun(folder, config["task"], config["learner"], config["seed"], settings, columns)
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise ValueError(f"{folder} holds no training of ballbot train, or a damaged one: {error!r}") from error
-
-
-@functools.cache
-def _defaults(learner: str) -> dict[str, Any]:
-    """The defaults of a learner's settings as JSON has them; none of a learner that there is no more."""
-    if learner not in LEARNERS:
-        return {}
-    algorithm = LEARNERS[learner]
-    return json.loads(json.dumps(asdict(load(f"{algorithm.module}:{algorithm.config}")())))
-
-
-def _completed(settings: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
-    """A record's settings. Those that came later have the defaults that change nothing."""
-    return defaults | {
-        name: _completed(value, defaults.get(name, {})) if isinstance(value, dict) else value
-        for name, value in settings.items()
-    }
 
 
 def grouped(runs: Sequence[TrainingRun]) -> list[LearningCurve]:

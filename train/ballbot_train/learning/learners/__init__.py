@@ -72,16 +72,17 @@ _MAY_BE_ZERO = {
     "buffer_steps",
     "candidate_episodes",
     "clone_iterations",
-    "critic_gradient_steps",
     "critic_warmup_iterations",
     "gathering_iterations",
+    "horizon",
     "rollouts_per_plan",
     "tracked_rollouts_per_plan",
     "tube_samples",
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
-_SHARES = {"batch_dear_share", "beta", "curriculum_progress", "dear_share", "final_gamma", "gae_lambda", "gamma", "tau"}
+_SHARES = {"curriculum_progress", "final_gamma", "gae_lambda", "gamma", "hard_fraction", "reset_fraction", "tau"}
 _POSITIVE = {
+    "critic_learning_rate",
     "demo_critic_learning_rate",
     "demo_std",
     "final_learning_rate",
@@ -136,11 +137,11 @@ def check_settings(settings: Any) -> None:
 _HERE = __name__
 
 LEARNERS: dict[str, Algorithm] = {
-    "apg": Algorithm(f"{_HERE}.apg", "ApgConfig", "analytic policy gradient", demonstrations=False),
-    "bc": Algorithm(f"{_HERE}.bc", "BcConfig", "behaviour cloning of demonstrations", demonstrations=True),
     "dagger": Algorithm(f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True),
     "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True),
-    "rsl_ppo": Algorithm(f"{_HERE}.rsl_ppo", "RslPpoConfig", "PPO by rsl_rl on thousands of envs", demonstrations=True),
+    "rsl_ppo": Algorithm(
+        f"{_HERE}.rsl_ppo", "RslPpoConfig", "PPO by rsl_rl on thousands of envs", demonstrations=False
+    ),
     "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True),
     "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False),
 }

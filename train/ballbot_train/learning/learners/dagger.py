@@ -17,7 +17,6 @@ the beginnings of episodes, half from states that the learner reaches from there
 states around them are labelled too.
 """
 
-import functools
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -40,35 +39,34 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry
-from ballbot_train.learning.demonstrations import Demos, load_demos
+from ballbot_train.learning.demonstrations import Demos, StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
+from ballbot_train.shards import is_set
 
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3])  # standard deviations of a tube, in a state's SI units
 _ACTIVE = 0.05  # a goal function this close to the greatest one still limits the optimum
 _SMALL = 0.3  # of the force limit
-_DEAR_AMONG = 16  # episodes that are drawn for each of the dearest
-_BISECTIONS = 6  # of the share of a back-off that has a price
+_HARD_AMONG = 16  # episodes that are drawn for each of the hard ones
 _MIN_STEPS = 2  # plans with fewer remaining control steps are not used as a guess
 
 
 class _Plan(NamedTuple):
-    """An episode: its optimum, its constants (nc,), and what the optimum keeps from its limits."""
+    """An episode: its optimum, and its constants (nc,)."""
 
     optimum: Optimum
     c: np.ndarray
-    backoff: Backoff
 
 
 @dataclass(frozen=True)
 class DaggerConfig:
     """Settings of `Dagger`."""
 
-    total_iterations: int = 50
+    iterations: int = 50
     """Number of iterations."""
     gathering_iterations: int = 35
-    """Number of iterations at the start that gather samples; the others only fit."""
+    """Iterations at the start that gather samples; the others only fit. 0, with demonstrations: behaviour cloning."""
     evaluations: int = 6
     """Number of evaluations, at equal distances."""
     episodes_per_iteration: int = 6
@@ -81,8 +79,6 @@ class DaggerConfig:
     """Rollouts of the learner per plan; the last state of each is labelled by a new optimum."""
     max_rollout_seconds: float = 2.0
     """Longest such rollout, s; the limit grows to this over the gathering iterations."""
-    beta: float = 0.8
-    """Share of these rollouts that start on the plan and not at its beginning; falls to 0.2 of it."""
     start_noise: float = 0.0
     """Standard deviation of the disturbance of a rollout's first state, in units of the tube's."""
     tube_samples: int = 1
@@ -93,42 +89,28 @@ class DaggerConfig:
     """Greatest distance from the plan at which TVLQR labels such a state, in units of the tube's standard deviations."""
     batch_episodes: int = 0
     """Optima that are found at once per gathering iteration, in place of those one by one; 0 where that does not work."""
-    batch_dear_share: float = 0.0
-    """Share of the beginnings of these that are the dearest of many that are drawn: those that cost the learner most."""
-    batch_states: int = 32
-    """States of each of these optima that become samples, each with `tube_samples` around it."""
     label_seconds: float = 4.0
     """Length of an optimum's part that becomes samples, s; after it the robot rests."""
     backoff: Backoff = Backoff(grip=EXECUTED.grip)
     """What optima keep from their limits, so that the learner's errors do not violate them."""
-    backoff_price: float = 0.0
-    """Greatest share by which the back-off may make an episode dearer than its optimum. Where it would be more, a smaller
-    part of the back-off is kept. 0: all of it is kept, at any price."""
     gradient_steps: int = 150
     """Gradient steps per iteration."""
     batch_size: int = 1024
     """Samples per gradient step."""
-    symmetry: RoutedSymmetry = "none"
-    """How the policy respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame or its fine frame, or it decides first on which
-    sides it passes obstacles (routes)."""
+    learning_rate: float = 3e-3
+    """Learning rate at the start. It falls along half a cosine."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the policy's hidden layers."""
-    learning_rate: float = 3e-3
-    """Learning rate at the start."""
-    final_learning_rate_fraction: float = 0.01
-    """Learning rate at the end, as a fraction of that at the start. It falls along half a cosine."""
-    min_cost: float = 1.0
-    """Cheaper episodes are weighted as if their optimum cost this much."""
+    symmetry: RoutedSymmetry = "none"
+    """How the actor respects the task's symmetry; see `actors.Symmetry` and `actors.RoutedSymmetry`."""
 
 
 TUNED: dict[str, DaggerConfig] = {
     "stabilize": DaggerConfig(
-        total_iterations=30,
+        iterations=30,
         gathering_iterations=20,
         evaluations=15,
         batch_episodes=4096,
-        batch_dear_share=0.25,
         label_seconds=3.0,
         symmetry="odd",
         gradient_steps=3000,
@@ -136,7 +118,7 @@ TUNED: dict[str, DaggerConfig] = {
     ),
     # Turn's episodes differ in one number only, so feedback about their plans is all that has to be learnt.
     "turn": DaggerConfig(
-        total_iterations=100,
+        iterations=100,
         gathering_iterations=70,
         evaluations=10,
         episodes_per_iteration=8,
@@ -151,7 +133,7 @@ TUNED: dict[str, DaggerConfig] = {
         backoff=Backoff(goal=0.4, force=0.02, grip=EXECUTED.grip),
     ),
     "orbit": DaggerConfig(
-        total_iterations=80,
+        iterations=80,
         gathering_iterations=60,
         evaluations=8,
         episodes_per_iteration=12,
@@ -164,10 +146,9 @@ TUNED: dict[str, DaggerConfig] = {
         backoff=Backoff(force=0.06, grip=EXECUTED.grip),  # plans at the force limit leave no force for corrections
     ),
     "weave": DaggerConfig(
-        total_iterations=250,
+        iterations=250,
         gathering_iterations=200,
         evaluations=10,
-        episodes_per_iteration=6,
         candidate_episodes=512,
         max_guesses=3,
         tracked_rollouts_per_plan=4,
@@ -180,14 +161,27 @@ TUNED: dict[str, DaggerConfig] = {
         backoff=Backoff(margin=0.06, force=0.02, grip=EXECUTED.grip),
     ),
 }
-"""Settings by name of task; every other task takes the defaults."""
+"""Exceptions by name of task; every other task takes the defaults."""
+
+_BETA = 0.8  # share of rollouts that start on the plan and not at its beginning; falls to 0.2 of it
+_HARD_SHARE = (
+    0.25  # of the beginnings of optima found at once: those that cost the learner most among many that are drawn
+)
+_BATCH_STATES = 32  # of each of these optima that become samples, each with `tube_samples` around it
+_FINAL_LEARNING_RATE_FRACTION = 0.01
+_MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
 
 
 class Dagger:
     """The learner; see `training.Learner`. An iteration's random numbers depend on seed and iteration alone."""
 
     def __init__(
-        self, task: Task, params: BallbotParams, config: DaggerConfig, seed: int = 0, samples: Samples | None = None
+        self,
+        task: Task,
+        params: BallbotParams,
+        config: DaggerConfig,
+        seed: int = 0,
+        samples: Samples | StreamedDemos | None = None,
     ):
         """Args: samples: the first samples, such as those of demonstrations; default, none.
 
@@ -199,11 +193,12 @@ class Dagger:
                 f"optima of {task.id} with this robot are not found at once; give --batch-episodes 0, which plans each alone"
             )
         self.config, self.iteration = config, 0
-        self.iterations, self.evaluations = config.total_iterations, config.evaluations
+        self.iterations, self.evaluations = config.iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
         self._fit = Fit(task, params, config.symmetry, config.hidden, seed)
         none = np.zeros((0, len(task.observation_scale)))
-        self._samples = Samples.of(none, np.zeros((0, 2))) if samples is None else samples
+        self._streamed = samples if isinstance(samples, StreamedDemos) else None
+        self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, 2)))
 
     @property
     def network(self) -> PolicyNetwork:
@@ -214,16 +209,19 @@ class Dagger:
         if routes is not None and self.iteration == 0:
             fit_routes(routes, self._task, self._params, self._seed)
         rng = np.random.default_rng([self._seed, self.iteration])
-        if self.iteration < config.gathering_iterations or not len(self._samples):
+        if self._streamed is not None:  # one shard after the other is in memory
+            demos = self._streamed.at(self.iteration)
+            self._samples = Samples.of(demos.observations, demos.actions)
+        elif self.iteration < config.gathering_iterations or not len(self._samples):
             figures = self._gather(rng)
-        progress = self.iteration / config.total_iterations
-        rate = schedules.cosine(config.learning_rate, config.final_learning_rate_fraction, progress)
+        progress = self.iteration / config.iterations
+        rate = schedules.cosine(config.learning_rate, _FINAL_LEARNING_RATE_FRACTION, progress)
         loss = self._fit.run(self._samples, config.gradient_steps, config.batch_size, rate, rng)
         self.iteration += 1
         return {"loss/imitation": loss, "train/learning_rate": rate, "train/samples": len(self._samples), **figures}
 
     def state_dict(self) -> dict[str, Any]:
-        samples = self._samples
+        samples = self._samples if self._streamed is None else Samples.of(np.zeros((0, 1)), np.zeros((0, 2)))
         return {
             "iteration": self.iteration,
             "samples": [samples.observations, samples.actions, samples.weights],
@@ -240,16 +238,16 @@ class Dagger:
         if self.config.batch_episodes:
             return self._gather_batch(rng)
         plans = self._planned(rng)
-        gains = [tube_gains(self._task, self._params, plan, c) for plan, c, _ in plans]
-        for (plan, c, _), k in zip(plans, gains, strict=True):
+        gains = [tube_gains(self._task, self._params, plan, c) for plan, c in plans]
+        for (plan, c), k in zip(plans, gains, strict=True):
             self._samples.add(self._labelled(plan, k, c, plan.cost, rng))
         if self.config.tracked_rollouts_per_plan and plans:
             self._track(plans, gains, rng)
         starts = [episode for episode in plans for _ in range(self.config.rollouts_per_plan)]
         labelled = 0
         explored = self._explore(starts, rng) if starts else ()
-        for (plan, c, backoff), (x, elapsed) in zip(starts, explored, strict=True):
-            found = self._optimum(x, c, backoff, plan.trajectory.x[elapsed:, :2])
+        for (plan, c), (x, elapsed) in zip(starts, explored, strict=True):
+            found = self._optimum(x, c, plan.trajectory.x[elapsed:, :2])
             if found is not None:
                 labelled += 1
                 k = tube_gains(self._task, self._params, found, c)
@@ -268,7 +266,7 @@ class Dagger:
         optima = batched.find_optima(task, self._params, starts, self._forces(starts, np.tile(c, (2, 1))))
         of_episodes = np.tile(optima.costs[: len(x0)], 2)  # a state counts as its episode does
         costs = np.where(np.isnan(of_episodes), optima.costs, of_episodes)
-        rows = np.repeat(np.flatnonzero(optima.solved), config.batch_states)
+        rows = np.repeat(np.flatnonzero(optima.solved), _BATCH_STATES)
         steps = rng.integers(round(config.label_seconds / task.control_dt), size=len(rows))
         x, u, gains = optima.states[rows, steps], optima.forces[rows, steps], optima.gains[rows, steps]
         near_x, near_u, of = self._around(x, u, gains, rng)
@@ -278,16 +276,16 @@ class Dagger:
         return {"train/labelled": float(optima.solved.mean())}
 
     def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Initial states (count, 8) and constants (count, nc); some of them are the dearest of those drawn."""
-        dear = round(self.config.batch_dear_share * count) if self.iteration else 0
-        drawn = [self._task.sample(rng, self._params) for _ in range(count - dear + _DEAR_AMONG * dear)]
+        """Initial states (count, 8) and constants (count, nc); some of them are those of many that cost the learner most."""
+        hard = round(_HARD_SHARE * count) if self.iteration else 0
+        drawn = [self._task.sample(rng, self._params) for _ in range(count - hard + _HARD_AMONG * hard)]
         x, c = (np.array(part) for part in zip(*drawn, strict=True))
-        if not dear:
+        if not hard:
             return x, c
-        among = slice(count - dear, None)
+        among = slice(count - hard, None)
         run = self._run(x[among], c[among], round(self.config.label_seconds / self._task.control_dt), record=False)
         costs = np.where(run.failure.numpy(), np.inf, run.cost.numpy())
-        rows = np.concatenate([np.arange(count - dear), count - dear + np.argsort(costs)[-dear:]])
+        rows = np.concatenate([np.arange(count - hard), count - hard + np.argsort(costs)[-hard:]])
         return x[rows], c[rows]
 
     def _forces(self, x: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -335,37 +333,18 @@ class Dagger:
         for x, c in drawn:
             if len(plans) < config.episodes_per_iteration:
                 with suppress(PlanError):
-                    found, backoff = self._plan(x, c)
-                    plans += [_Plan(found, c, backoff)] if found.is_optimal else []
+                    found = self._plan(x, c)
+                    plans += [_Plan(found, c)] if found.is_optimal else []
         return plans
 
-    def _plan(self, x: np.ndarray, c: np.ndarray) -> tuple[Optimum, Backoff]:
-        """The optimum of an episode from state x (8,), and the part of the back-off that it keeps.
+    def _plan(self, x: np.ndarray, c: np.ndarray) -> Optimum:
+        """The optimum of an episode from state x (8,).
 
         Raises:
             PlanError: there is none.
         """
-        config = self.config
-        find = functools.partial(
-            find_optimum, self._task, self._params, x, c, guesses=config.max_guesses, paths=self._routed(x, c)
-        )
-        if not config.backoff_price:
-            return find(config.backoff), config.backoff
-        found, kept = find(), Backoff()
-        most = (1 + config.backoff_price) * found.cost
-        low, high = 0.0, 2.0  # shares of the back-off; the first to be tried is all of it
-        for _ in range(_BISECTIONS):
-            share = (low + high) / 2
-            backoff, tried = config.backoff.times(share), None
-            with suppress(PlanError):
-                tried = find(backoff)
-            if tried is not None and tried.cost <= most:
-                found, kept, low = tried, backoff, share
-            else:
-                high = share
-            if low == 1.0:
-                break
-        return found, kept
+        config, paths = self.config, self._routed(x, c)
+        return find_optimum(self._task, self._params, x, c, config.backoff, guesses=config.max_guesses, paths=paths)
 
     def _routed(self, x: np.ndarray, c: np.ndarray) -> list[np.ndarray] | None:
         """The path on the sides that the learner's routes choose, or None where it has none."""
@@ -384,13 +363,13 @@ class Dagger:
         """Rolls the learner out along plans; TVLQR at the nearest point of the plan labels each state."""
         config = self.config
         tracked = [episode for episode in plans for _ in range(config.tracked_rollouts_per_plan)]
-        x = np.array([plan.trajectory.x[0] for plan, *_ in tracked])
+        x = np.array([plan.trajectory.x[0] for plan, _ in tracked])
         x += config.start_noise * _SPREAD * rng.standard_normal(x.shape)
         steps = min(
-            max(len(plan.trajectory.u) for plan, *_ in plans), round(config.label_seconds / self._task.control_dt)
+            max(len(plan.trajectory.u) for plan, _ in plans), round(config.label_seconds / self._task.control_dt)
         )
-        history, over, _ = self._roll(x, np.array([c for _, c, _ in tracked]), steps)
-        for i, (plan, c, _) in enumerate(tracked):
+        history, over, _ = self._roll(x, np.array([c for _, c in tracked]), steps)
+        for i, (plan, c) in enumerate(tracked):
             met = history[:, i][~over[:, i]]
             distance, nearest = map(np.asarray, KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD))
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
@@ -398,14 +377,14 @@ class Dagger:
             forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", k[nearest], off)
             self._samples.add(self._samples_of(met, forces, np.broadcast_to(c, (len(met), len(c))), plan.cost))
 
-    def _optimum(self, x: np.ndarray, c: np.ndarray, backoff: Backoff, path: np.ndarray) -> Optimum | None:
+    def _optimum(self, x: np.ndarray, c: np.ndarray, path: np.ndarray) -> Optimum | None:
         """The optimum from state x (8,), or None; guessed from a ground path (n, 2), or by the task if that is too short."""
         task = self._task
         paths = None
         if len(path) > _MIN_STEPS:
             paths = [path if task.first_exit else then_stay(path, task.steps)]
         try:
-            found = find_optimum(task, self._params, x, c, backoff, self.config.max_guesses, paths)
+            found = find_optimum(task, self._params, x, c, self.config.backoff, self.config.max_guesses, paths)
         except PlanError:
             return None
         return found if found.is_optimal else None
@@ -419,17 +398,16 @@ class Dagger:
         """
         config, dt = self.config, self._task.control_dt
         longest = max(1, round(self._share * config.max_rollout_seconds / dt))
-        on_plan = rng.random(len(plans)) < config.beta * (1 - 0.8 * self._share)
+        on_plan = rng.random(len(plans)) < _BETA * (1 - 0.8 * self._share)
         starts = [
-            int(rng.integers(len(plan.trajectory.u))) if on else 0
-            for (plan, *_), on in zip(plans, on_plan, strict=True)
+            int(rng.integers(len(plan.trajectory.u))) if on else 0 for (plan, _), on in zip(plans, on_plan, strict=True)
         ]
         steps = rng.integers(1, longest + 1, len(plans))
-        x = np.array([plan.trajectory.x[start] for (plan, *_), start in zip(plans, starts, strict=True)])
+        x = np.array([plan.trajectory.x[start] for (plan, _), start in zip(plans, starts, strict=True)])
         x += config.start_noise * _SPREAD * rng.standard_normal(x.shape)
-        history, over, _ = self._roll(x, np.array([c for _, c, _ in plans]), longest)
+        history, over, _ = self._roll(x, np.array([c for _, c in plans]), longest)
         reached = []
-        for i, (plan, *_) in enumerate(plans):
+        for i, (plan, _) in enumerate(plans):
             # the states before a failure teach most, so any of them may be chosen
             lasted = int(np.argmax(over[:, i])) if over[-1, i] else longest + 1
             k = int(steps[i]) if steps[i] < lasted else int(rng.integers(lasted))
@@ -478,7 +456,7 @@ class Dagger:
     def _samples_of(self, x: np.ndarray, u: np.ndarray, c: np.ndarray, cost: float | np.ndarray) -> Samples:
         """Samples of states (n, 8) and forces (n, 2), N, with constants (n, nc), of episodes whose optima cost `cost`."""
         observations = np.asarray(self._task.observe(x, c))
-        weights = np.broadcast_to(1 / np.maximum(cost, self.config.min_cost), len(x))
+        weights = np.broadcast_to(1 / np.maximum(cost, _MIN_COST), len(x))
         return Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights)
 
 
@@ -504,13 +482,19 @@ def make(task: Task, params: BallbotParams, config: DaggerConfig, seed: int, dem
     """Makes the learner; demonstrations, if given, are its first samples.
 
     Raises:
-        ValueError: the demonstrations are of another task.
+        ValueError: the demonstrations are missing, or of another task; or they are shards, and the settings ask for more.
     """
-    samples = None
-    if demos is not None:
+    samples: Samples | StreamedDemos | None = None
+    if demos is not None and is_set(demos):
+        if config.gathering_iterations:
+            raise ValueError(f"{demos} is a set of shards, which dagger only clones: give --gathering-iterations 0")
+        samples = StreamedDemos(demos, task, seed)
+    elif demos is not None:
         loaded = load_demos(demos, task)
-        weights = np.full(len(loaded), 1 / max(_median_cost(loaded, task), config.min_cost))
+        weights = np.full(len(loaded), 1 / max(_median_cost(loaded, task), _MIN_COST))
         samples = Samples.of(loaded.observations, loaded.actions, weights)
+    elif not config.gathering_iterations:
+        raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
     return Dagger(task, params, config, seed, samples)
 
 

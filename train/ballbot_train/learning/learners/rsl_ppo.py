@@ -216,16 +216,8 @@ class Storage(RolloutStorage):
 class RslPpo:
     """The learner; see `training.Learner`."""
 
-    def __init__(
-        self, task: Task, params: BallbotParams, config: RslPpoConfig, seed: int = 0, demos: str | Path | None = None
-    ):
-        """Args: demos: dataset of demonstrations on whose states episodes of the curriculum begin.
-
-        Raises:
-            ValueError: the task does not have what the settings ask for, or the demonstrations are of no use.
-        """
-        if demos is not None and not config.curriculum.starts_on_optima:
-            raise ValueError("rsl_ppo uses demonstrations only with --curriculum.starts-on-optima above 0")
+    def __init__(self, task: Task, params: BallbotParams, config: RslPpoConfig, seed: int = 0):
+        """Raises a ValueError where the task does not have what the settings ask for."""
         for name in ("gamma", "final_gamma"):
             if not 0 < getattr(config, name) < 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(config, name):g}")
@@ -241,7 +233,6 @@ class RslPpo:
                 params,
                 config.curriculum,
                 config.gamma,
-                demos,
                 full=task,
                 pay=config.pay,
                 failure_price=config.failure_price,
@@ -385,9 +376,5 @@ class RslPpo:
 
 
 def make(task: Task, params: BallbotParams, config: RslPpoConfig, seed: int, demos: str | Path | None) -> RslPpo:
-    """Makes the learner.
-
-    Raises:
-        ValueError: the task does not have what the settings ask for, or the demonstrations are of no use.
-    """
-    return RslPpo(task, params, config, seed, demos)
+    """Makes the learner; it uses no demonstrations. Raises a ValueError where the task lacks what the settings ask for."""
+    return RslPpo(task, params, config, seed)

@@ -29,92 +29,80 @@ from ballbot_train.learning.actors import RoutedSymmetry, spec_for
 from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
+from ballbot_train.learning.whole_episodes import WholeEpisodes
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.routes import Routes
 
 
 @dataclass(frozen=True)
 class ShacConfig:
-    """Settings of `Shac`."""
+    """Settings of `Shac` and of `WholeEpisodes`, which takes over where `horizon` is 0."""
 
-    total_iterations: int = 4000
-    """Number of iterations, each of `num_envs * horizon` env steps."""
+    iterations: int = 4000
+    """Iterations, each of `horizon` control steps of `num_envs` envs, or of as many whole episodes."""
     evaluations: int = 20
     """Number of evaluations, at equal distances."""
     num_envs: int = 512
     """Envs that are stepped together."""
     horizon: int = 50
-    """Length of a window, through which the gradient runs, in control steps."""
-    reset_fraction: float = 0.4
-    """Share of the envs that start a new episode after each window, because the first second costs most."""
-    dear_share: float = 0.0
-    """Share of the new episodes that are the dearest of 16 times as many that are drawn, as the critic expects: a good
-    policy fails nowhere else."""
+    """Control steps of a window, through which the gradient runs. 0: it runs through whole episodes, and there is no critic.
+    This takes a good policy nearer to the optimum."""
+    episode_seconds: float = 4.0
+    """Duration of whole episodes, s."""
+    learning_rate: float = 3e-3
+    """Learning rate of the policy at the start."""
+    critic_learning_rate: float = 3e-3
+    """Learning rate of the critic at the start."""
+    gamma: float = 1.0
+    """Discount factor per control step; below 1 for tasks whose cost never ends."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers of policy and critic."""
     symmetry: RoutedSymmetry = "none"
-    """How the actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame or its fine frame, or it decides first on which
-    sides it passes obstacles (routes)."""
-    learning_rate: float = 3e-3
-    """Learning rate of policy and critic at the start."""
-    finetune_learning_rate: float = 5e-4
-    """In place of the policy's `learning_rate` if training starts from a policy file."""
-    critic_warmup_iterations: int = 40
-    """Iterations that train the critic alone if training starts from a policy file."""
-    final_learning_rate_fraction: float = 0.01
-    """Learning rate at the end, as a fraction of that at the start. It falls along half a cosine."""
-    min_cost: float = 0.5
-    """Cheaper episodes are weighted as if they cost this much."""
-    gamma: float = 1.0
-    """Discount factor per control step; below 1 for tasks whose cost never ends."""
-    critic_gradient_steps: int = 4
-    """Gradient steps of the critic per iteration; with 0 it stays as it starts, LQR's cost on a task that ends at rest."""
-    critic_stride: int = 4
-    """The critic learns from every so many-th control step of a window."""
-    tau: float = 0.2
-    """Share by which the target critic moves to the critic after each iteration."""
-    max_grad_norm: float = 1.0
-    """Norm to which the policy's gradient is clipped."""
-    failure_penalty: float = 1000.0
-    """Cost of a failure in training, whenever it comes."""
+    """How the actor respects the task's symmetry; see `actors.Symmetry` and `actors.RoutedSymmetry`."""
+    reset_fraction: float = 0.4
+    """Share of the envs that start a new episode after each window, because the first second costs most."""
+    hard_fraction: float = 0.0
+    """Share of the new episodes that are hard: of 16 times as many that are drawn, those with the highest expected cost."""
     margin_clearance: float = 0.0
-    """Distance from the margins at which the penalty starts, in the margins' units."""
+    """Distance from the margins at which a penalty starts, in the margins' units."""
     margin_penalty: float = 0.0
-    """Penalty per second and squared shortfall of the clearance; 0: none. It grows linearly from 0.15 on."""
+    """Penalty per second and squared shortfall of this clearance; 0: none. It grows linearly from 0.15 on."""
     one_way: bool = False
-    """Whether the penalty is that of the task's `one_way_margins`: of Weave's, a policy that started on the nearer sides, or
-    on those of its routes, does not leave them. From scratch no way past the first obstacle was found with it."""
-    grip_clearance: float = 0.05
-    """Reserve of `dynamics.limits` below which its penalty starts; a robot with unlimited friction has none."""
-    grip_penalty: float = 3000.0
-    """Penalty per second and squared shortfall of that reserve; 0: none."""
+    """Whether the penalty keeps a policy of Weave on the sides of the obstacles on which it started. From scratch no way past
+    the first obstacle was found with it."""
     exit_softness: float = 0.0
-    """Width of the gradual first exit, in units of the goal functions; 0: episodes end at once."""
-    compile: bool = True
-    """Whether a control step is compiled, which takes half a minute at the start."""
+    """Width of the gradual first exit of windows, in units of the goal functions; 0: episodes end at once."""
 
-
-_SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
-_DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
-_ENDLESS = 10**6  # control steps: longer than any episode in training
-_DEAR_AMONG = 16  # episodes that are drawn for each of the dearest
 
 TUNED: dict[str, ShacConfig] = {
     "stabilize": ShacConfig(symmetry="odd"),
     "turn": ShacConfig(exit_softness=0.3),
     "orbit": ShacConfig(gamma=0.998),
     "weave": ShacConfig(
-        total_iterations=6000,
+        iterations=6000,
         evaluations=30,
-        reset_fraction=0.25,
         hidden=(256, 256),
         symmetry="frame",
+        reset_fraction=0.25,
         margin_clearance=0.1,
         margin_penalty=3000.0,
     ),
 }
-"""Settings by name of task; every other task takes the defaults."""
+"""Exceptions by name of task; every other task takes the defaults."""
+
+_FINAL_LEARNING_RATE_FRACTION = 0.01  # it falls along half a cosine
+_WARMUP_ITERATIONS = 40  # of the critic alone, if training starts from a policy
+_CRITIC_GRADIENT_STEPS, _CRITIC_STRIDE = 4, 4  # per iteration; of the control steps of a window from which it learns
+_TAU = 0.2  # share by which the target critic moves to the critic after each iteration
+_MAX_GRAD_NORM = 1.0  # of the policy
+_MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
+_FAILURE_PENALTY = 1000.0  # cost of a failure in training, whenever it comes
+_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 3000.0  # as of the margins, for `dynamics.limits` of robots that can slip
+_COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
+_SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
+_DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
+_ENDLESS = 10**6  # control steps: longer than any episode in training
+_HARD_AMONG = 16  # episodes that are drawn for each hard one
 
 
 class _Record(NamedTuple):
@@ -174,7 +162,7 @@ class Shac:
         torch.manual_seed(seed)  # for the networks' first weights
         self._random = torch.Generator().manual_seed(seed)
         self.config, self.iteration, self._finetuning, self._seed = config, 0, False, seed
-        self.iterations, self.evaluations = config.total_iterations, config.evaluations
+        self.iterations, self.evaluations = config.iterations, config.evaluations
         self._own = task
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
         self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
@@ -184,15 +172,16 @@ class Shac:
         self.target = Critic(task, params, config.hidden, frame, self._network.routes)
         self.target.load_state_dict(self.critic.state_dict())
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
-        self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), config.learning_rate, betas=(0.7, 0.95))
+        rate = config.critic_learning_rate
+        self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), rate, betas=(0.7, 0.95))
         self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
         self._start = self._batch.reset(seed=spawned(seed))  # (B, no) first observations of the running episodes
-        dear = round(config.dear_share * config.reset_fraction * config.num_envs)  # new episodes of an iteration
-        self._drawn = BallbotBatch(self.task, _DEAR_AMONG * dear, compile=False, params=params) if dear else None
+        hard = round(config.hard_fraction * config.reset_fraction * config.num_envs)  # new episodes of an iteration
+        self._drawn = BallbotBatch(self.task, _HARD_AMONG * hard, compile=False, params=params) if hard else None
         if self._drawn is not None:
             self._drawn.reset(seed=spawned(seed) + config.num_envs)
         self._step = self._one_step
-        if config.compile:
+        if config.iterations >= _COMPILE_FROM:
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     @property
@@ -215,11 +204,11 @@ class Shac:
         config = self.config
         if self._network.routes is not None and self.iteration == 0 and not self._finetuning:
             fit_routes(self._network.routes, self._own, self._batch.params, self._seed)
-        rate = self._annealed(config.finetune_learning_rate if self._finetuning else config.learning_rate)
+        rate = self._annealed(config.learning_rate)
         self._policy_optimizer.param_groups[0]["lr"] = rate
-        self._critic_optimizer.param_groups[0]["lr"] = self._annealed(config.learning_rate)
+        self._critic_optimizer.param_groups[0]["lr"] = self._annealed(config.critic_learning_rate)
         with torch.no_grad():
-            weight = 1 / self.target(self._start).clamp(min=config.min_cost)
+            weight = 1 / self.target(self._start).clamp(min=_MIN_COST)
         state = BatchState(*(part.detach() for part in self._state))
         start = self._start
         loss, alive, discount = torch.zeros(config.num_envs), torch.ones(config.num_envs), torch.ones(config.num_envs)
@@ -231,8 +220,8 @@ class Shac:
         loss = weight * (loss + discount * alive * self.target(last))
         self._policy_optimizer.zero_grad()
         loss.mean().backward()
-        norm = torch.nn.utils.clip_grad_norm_(self._network.parameters(), config.max_grad_norm)
-        if torch.isfinite(norm) and not (self._finetuning and self.iteration < config.critic_warmup_iterations):
+        norm = torch.nn.utils.clip_grad_norm_(self._network.parameters(), _MAX_GRAD_NORM)
+        if torch.isfinite(norm) and not (self._finetuning and self.iteration < _WARMUP_ITERATIONS):
             self._policy_optimizer.step()
         critic_loss = self._learn_values(log, last.detach())
         self._batch.state = BatchState(*(part.detach() for part in state))
@@ -280,25 +269,25 @@ class Shac:
         return cast(BatchState, self._batch.state)  # reset in __init__
 
     def _new_episodes(self, which: torch.Tensor) -> torch.Tensor:
-        """Starts new episodes in some envs (B,); returns the observations (B, no) of all. Some are the dearest of many."""
+        """Starts new episodes in some envs (B,); returns the observations (B, no) of all. Some are hard ones."""
         observations = self._batch.reset(mask=which)
         if self._drawn is None:
             return observations
         seen = self._drawn.reset()
         drawn = cast(BatchState, self._drawn.state)
         with torch.no_grad():
-            dearest = self.target(seen).topk(self._drawn.num_envs // _DEAR_AMONG).indices
-        places = which.nonzero()[:, 0][: len(dearest)]
-        dearest = dearest[: len(places)]
+            hardest = self.target(seen).topk(self._drawn.num_envs // _HARD_AMONG).indices
+        places = which.nonzero()[:, 0][: len(hardest)]
+        hardest = hardest[: len(places)]
         x, c = self._state.x.clone(), self._state.c.clone()
-        x[:, places], c[:, places] = drawn.x[:, dearest], drawn.c[:, dearest]
+        x[:, places], c[:, places] = drawn.x[:, hardest], drawn.c[:, hardest]
         self._batch.state = self._state._replace(x=x, c=c)
         return self._batch.observe(self._state)
 
     def _annealed(self, rate: float) -> float:
         """A learning rate in the present iteration."""
-        progress = self.iteration / self.config.total_iterations
-        return schedules.cosine(rate, self.config.final_learning_rate_fraction, progress)
+        progress = self.iteration / self.config.iterations
+        return schedules.cosine(rate, _FINAL_LEARNING_RATE_FRACTION, progress)
 
     def _one_step(
         self,
@@ -315,17 +304,16 @@ class Shac:
         before, force = state.x.unbind(0), result.force.unbind(0)
         x, c = result.final_x.unbind(0), state.c.unbind(0)
         cost = task.cost(before, force, c) * task.control_dt
-        cost = cost + config.failure_penalty * result.failure
+        cost = cost + _FAILURE_PENALTY * result.failure
         shaped = cost
         if config.margin_penalty:
             for margin in self._one_way_margins(observation, x, c) if config.one_way else task.margins(x, c):
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * task.control_dt * squared
-        if config.grip_penalty:
-            for limit in dynamics.limits(self._batch.params, before, force, hold=task.control_dt):
-                shortfall = (config.grip_clearance - limit).clamp(min=0)
-                shaped = shaped + config.grip_penalty * task.control_dt * shortfall**2
+        for limit in dynamics.limits(self._batch.params, before, force, hold=task.control_dt):
+            shortfall = (_GRIP_CLEARANCE - limit).clamp(min=0)
+            shaped = shaped + _GRIP_PENALTY * task.control_dt * shortfall**2
         loss = loss + discount * alive * shaped
         if config.exit_softness:
             alive = alive * torch.sigmoid(torch.stack(task.goal(x, c)).amax(0) / config.exit_softness)
@@ -353,13 +341,13 @@ class Shac:
             for record in reversed(log):
                 ahead = record.cost + config.gamma * torch.where(record.exited | record.failed, 0.0, ahead)
                 wanted.append(ahead)
-            stride = min(config.critic_stride, len(log))
+            stride = min(_CRITIC_STRIDE, len(log))
             chosen = slice(int(torch.randint(stride, (), generator=self._random)), None, stride)
             wanted = torch.cat(wanted[::-1][chosen])
             observations = torch.cat([record.observation for record in log[chosen]])
         total = 0.0
         order = torch.randperm(len(wanted), generator=self._random)
-        for part in order.chunk(config.critic_gradient_steps) if config.critic_gradient_steps else ():
+        for part in order.chunk(_CRITIC_GRADIENT_STEPS):
             value = self.critic(observations[part])
             # relative errors: small costs matter as much as great ones
             loss = torch.nn.functional.smooth_l1_loss(value.clamp(min=1e-6).log(), wanted[part].clamp(min=1e-6).log())
@@ -369,10 +357,12 @@ class Shac:
             total += float(loss.detach())
         with torch.no_grad():
             for kept, learnt in zip(self.target.parameters(), self.critic.parameters(), strict=True):
-                kept.lerp_(learnt, config.tau)
-        return total / max(1, config.critic_gradient_steps)
+                kept.lerp_(learnt, _TAU)
+        return total / _CRITIC_GRADIENT_STEPS
 
 
-def make(task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: str | Path | None) -> Shac:
+def make(
+    task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: str | Path | None
+) -> Shac | WholeEpisodes:
     """Makes the learner; it uses no demonstrations."""
-    return Shac(task, params, config, seed)
+    return Shac(task, params, config, seed) if config.horizon else WholeEpisodes(task, params, config, seed)

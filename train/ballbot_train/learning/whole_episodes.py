@@ -1,4 +1,4 @@
-"""Analytic policy gradient: the policy follows the exact gradient of the cost of whole episodes.
+"""Analytic policy gradient: the policy follows the exact gradient of the cost of whole episodes. `shac --horizon 0` is this.
 
 Each iteration draws episodes, runs them in the batched model under the policy, and differentiates their cost through physics
 and policy (Freeman et al., "Brax", 2021, call it so). There is no critic, whose errors would be followed as well, so it takes
@@ -12,9 +12,8 @@ stands for failures.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, NamedTuple, cast
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import torch
 
@@ -23,64 +22,23 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import Symmetry, average_of, spec_for
+from ballbot_train.learning.actors import average_of, spec_for
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.policy import PolicyNetwork
 
-
-@dataclass(frozen=True)
-class ApgConfig:
-    """Settings of `Apg`."""
-
-    total_iterations: int = 2000
-    """Number of iterations, each of `num_envs` whole episodes."""
-    evaluations: int = 40
-    """Number of evaluations, at equal distances."""
-    num_envs: int = 256
-    """Episodes of an iteration."""
-    episode_seconds: float = 4.0
-    """Duration of an episode in training, s; the gradient runs through all of it."""
-    hidden: tuple[int, ...] = (128, 128)
-    """Units of the policy's hidden layers. A policy file that training starts from says them, and the symmetry."""
-    symmetry: Symmetry = "none"
-    """How the policy respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged
-    over the task's mirror images, or it sees and acts in the task's frame or its fine frame."""
-    learning_rate: float = 1e-4
-    """Learning rate at the start. Three times as much made Turn's policy worse at first, and slower."""
-    final_learning_rate_fraction: float = 0.02
-    """Learning rate at the end, as a fraction of that at the start. It falls along half a cosine."""
-    max_grad_norm: float = 0.3
-    """Norm to which the gradient is clipped. It is larger in nearly every iteration."""
-    averaged_iterations: int = 20
-    """Iterations over which the policy is a running average."""
-    start_noise: float = 0.0
-    """Standard deviation by which the starts of training episodes are moved, as observed: 0.01 are 5 cm, 0.01 rad, 0.05 m/s
-    and 0.05 rad/s."""
-    goal_penalty: float = 30.0
-    """Cost of ending a first exit outside of its goal, per unit of the goal functions."""
-    goal_clearance: float = 0.1
-    """Depth in the goal, in units of the goal functions, from which this penalty is 0."""
-    failure_penalty: float = 1000.0
-    """Cost of a failure in training, where the task has no first exit. It has no gradient."""
-    margin_clearance: float = 0.0
-    """Distance from the margins at which the penalty starts, in the margins' units."""
-    margin_penalty: float = 0.0
-    """Penalty per second and squared shortfall of the clearance; 0: none."""
-    min_cost: float = 0.5
-    """Cheaper episodes are weighted as if they cost this much."""
-    compile: bool = True
-    """Whether a control step is compiled, which takes half a minute at the start."""
+if TYPE_CHECKING:
+    from ballbot_train.learning.learners.shac import ShacConfig
 
 
+_FINAL_LEARNING_RATE_FRACTION = 0.02  # it falls along half a cosine
+_MAX_GRAD_NORM = 0.3  # the gradient is larger in nearly every iteration
+_AVERAGED_ITERATIONS = 20  # over which the policy is a running average
+# of ending outside of the goal, less this depth, in units of the goal functions
+_GOAL_PENALTY, _GOAL_CLEARANCE = 30.0, 0.1
+_FAILURE_PENALTY = 1000.0  # cost of a failure in training. It has no gradient
+_MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
 _PATIENCE = 5  # control steps for which episodes go on when all have reached the goal
-
-TUNED: dict[str, ApgConfig] = {
-    "stabilize": ApgConfig(symmetry="odd"),
-    "turn": ApgConfig(total_iterations=1500, evaluations=30, episode_seconds=4.6, symmetry="frame"),
-    "orbit": ApgConfig(symmetry="frame"),
-    "weave": ApgConfig(symmetry="frame"),
-}
-"""Settings by name of task; every other task takes the defaults."""
+_COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
 
 
 class _Step(NamedTuple):
@@ -98,14 +56,13 @@ class _Step(NamedTuple):
     """(B,) bool."""
 
 
-class Apg:
+class WholeEpisodes:
     """The learner; see `training.Learner`."""
 
-    def __init__(self, task: Task, params: BallbotParams, config: ApgConfig, seed: int = 0):
+    def __init__(self, task: Task, params: BallbotParams, config: "ShacConfig", seed: int = 0):
         torch.manual_seed(seed)  # for the network's first weights
-        self._random = torch.Generator().manual_seed(seed)
         self.config, self.iteration = config, 0
-        self.iterations, self.evaluations = config.total_iterations, config.evaluations
+        self.iterations, self.evaluations = config.iterations, config.evaluations
         self.task = replace(task, duration=config.episode_seconds)
         self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
         self._batch.reset(seed=spawned(seed))
@@ -117,10 +74,10 @@ class Apg:
         """Takes a policy network to be trained."""
         config = self.config
         self._trained = network
-        self._average = average_of(network, config.averaged_iterations)
+        self._average = average_of(network, _AVERAGED_ITERATIONS)
         self._optimizer = torch.optim.Adam(network.parameters(), config.learning_rate, betas=(0.9, 0.99))
         self._step = self._one_step
-        if config.compile:
+        if config.iterations >= _COMPILE_FROM:
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     def start_from(self, network: PolicyNetwork) -> None:
@@ -137,15 +94,14 @@ class Apg:
 
     def iterate(self) -> dict[str, float]:
         config = self.config
-        rate = schedules.cosine(
-            config.learning_rate, config.final_learning_rate_fraction, self.iteration / config.total_iterations
-        )
+        progress = self.iteration / config.iterations
+        rate = schedules.cosine(config.learning_rate, _FINAL_LEARNING_RATE_FRACTION, progress)
         self._optimizer.param_groups[0]["lr"] = rate
         costs, ended_well = self._episodes()
-        loss = costs.clamp(min=config.min_cost).log().mean()
+        loss = costs.clamp(min=_MIN_COST).log().mean()
         self._optimizer.zero_grad()
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self._trained.parameters(), config.max_grad_norm)
+        norm = torch.nn.utils.clip_grad_norm_(self._trained.parameters(), _MAX_GRAD_NORM)
         if torch.isfinite(norm):
             self._optimizer.step()
         self._average.update_parameters(self._trained)
@@ -164,7 +120,6 @@ class Apg:
             "average": self._average.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "batch": list(cast(BatchState, self._batch.state)),
-            "random": self._random.get_state(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -173,16 +128,12 @@ class Apg:
         self._average.load_state_dict(state["average"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._batch.state = BatchState(*state["batch"])
-        self._random.set_state(state["random"])
 
     def _episodes(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Runs new episodes; returns their costs (B,), which have gradients, and whether they ended well (B,)."""
         config, task = self.config, self.task
         self._batch.reset()
         state = cast(BatchState, self._batch.state)
-        noise = torch.randn(state.x.shape, generator=self._random)
-        scale = config.start_noise * torch.tensor(task.observation_scale[:8])[:, None]
-        state = state._replace(x=state.x + scale * noise)
         start = state.x
         total = torch.zeros(config.num_envs)
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
@@ -192,7 +143,7 @@ class Apg:
             total = total + torch.where(alive, step.cost, 0.0)
             alive = alive & ~(step.failed & ~reached)
             if task.first_exit:
-                ends.append(torch.where(alive, total + config.goal_penalty * step.lacking, math.inf))
+                ends.append(torch.where(alive, total + _GOAL_PENALTY * step.lacking, math.inf))
                 reached = reached | (alive & step.inside)
                 patience -= bool((reached | ~alive).all())
                 if not patience:
@@ -200,9 +151,9 @@ class Apg:
             # where an episode has failed, the model goes on from its start, which leads to no infinite numbers
             state = state._replace(x=torch.where(alive, step.x, start))
         if not task.first_exit:
-            return total + config.failure_penalty * ~alive, alive
+            return total + _FAILURE_PENALTY * ~alive, alive
         least = torch.stack(ends).amin(0)
-        return torch.where(torch.isfinite(least), least, config.failure_penalty), reached
+        return torch.where(torch.isfinite(least), least, _FAILURE_PENALTY), reached
 
     def _one_step(self, state: BatchState) -> _Step:
         """One control step of every episode; compiled."""
@@ -218,10 +169,5 @@ class Apg:
                     + config.margin_penalty * task.control_dt * (config.margin_clearance - margin).clamp(min=0) ** 2
                 )
         goal = torch.stack(task.goal(x, c))
-        lacking = (goal + config.goal_clearance).clamp(min=0).sum(0)
+        lacking = (goal + _GOAL_CLEARANCE).clamp(min=0).sum(0)
         return _Step(result.final_x, cost, lacking, (goal <= 0).all(0), result.failure)
-
-
-def make(task: Task, params: BallbotParams, config: ApgConfig, seed: int, demos: str | Path | None) -> Apg:
-    """Makes the learner; it uses no demonstrations."""
-    return Apg(task, params, config, seed)
