@@ -737,14 +737,8 @@ class Playground:
     def _score(self) -> None:
         best = self.optimum_cost
         regret = self.main.cost / best - 1 if best > _LEAST_COST else math.nan
-        score = Score(
-            labels.label(self.main.name),
-            self.seconds,
-            self.main.cost,
-            regret,
-            self.main.violated,
-            any(self.plant.values()),
-        )
+        name, changed = labels.label(self.main.name), any(self.plant.values())
+        score = Score(name, self.seconds, self.main.cost, regret, self.main.violated, changed)
         self.scores = [*self.scores, score][-_EPISODES_KEPT:]
 
     def _begin_next(self) -> None:
