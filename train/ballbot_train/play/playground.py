@@ -737,8 +737,14 @@ class Playground:
     def _score(self) -> None:
         best = self.optimum_cost
         regret = self.main.cost / best - 1 if best > _LEAST_COST else math.nan
-        name, changed = labels.label(self.main.name), any(self.plant.values())
-        score = Score(name, self.seconds, self.main.cost, regret, self.main.violated, changed)
+        score = Score(
+            labels.label(self.main.name),
+            self.seconds,
+            self.main.cost,
+            regret,
+            self.main.violated,
+            any(self.plant.values()),
+        )
         self.scores = [*self.scores, score][-_EPISODES_KEPT:]
 
     def _begin_next(self) -> None:
