@@ -153,15 +153,15 @@ WRAPPERS = {
     ),
     "RescaleObservation": (
         lambda env: RescaleObservation(env, np.float32(-1), np.float32(1)),
-        "trained on observations (8,) float32 from -1 to 1, and those of BallbotStabilize-v0 are (8,) float32 from -12",
+        "trained on observations (8,) float32 from -1 to 1, and those of BallbotStabilize-v0 are (8,) float32 from -34",
     ),
     "NormalizeObservation": (NormalizeObservation, "trained on observations (8,) float32 from -inf to inf"),
     "float64": (lambda env: DtypeObservation(env, np.float64), "trained on observations (8,) float64"),
     "stacked": (stacked, "24"),
     "time": (TimeAwareObservation, "9"),
     "discrete": (lambda env: DiscretizeAction(env, 5), "2"),
-    "another robot": (lambda env: make("rolling", 8.0), "from -17.7362 to 17.7362"),
-    "another duration": (lambda env: make("paper", 4.0), "from -7.4"),
+    "another robot": (lambda env: make("rolling", 8.0), "from -5441.96 to 5441.96"),
+    "another duration": (lambda env: make("paper", 4.0), "from -1839.96 to 1839.96"),
 }
 
 

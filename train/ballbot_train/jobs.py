@@ -185,17 +185,6 @@ def _locked(out: Path) -> Iterator[None]:
         unlock(out)
 
 
-@contextmanager
-def _released_if_nothing_is_done(out: Path) -> Iterator[None]:
-    """Gives up the claim of a folder where the block fails before anything is finished."""
-    try:
-        yield
-    except BaseException:
-        if out.resolve() in _new:
-            release(out)
-        raise
-
-
 def run(
     jobs: Sequence[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]
 ) -> list[list[Entry]]:
@@ -245,7 +234,8 @@ def stream(
         else:
             yield progress.number, progress.entries()
 
-    with _locked(out), _released_if_nothing_is_done(out), ExitStack() as stack:
+    with _locked(out), ExitStack() as stack:
+        stack.push(lambda error, *_: release(out) if error and out.resolve() in _new else None)
         pool: Pool | None = None  # a cluster takes seconds to start, and there may be nothing to do
         while True:
             while pool is None or pool.has_room():

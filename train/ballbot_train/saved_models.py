@@ -86,11 +86,10 @@ def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> No
         found = getattr(model, f"{kind}_space", None)
         if found is not None and not _alike(found, wanted):
             raise PolicyError(
-                f"{name} was trained on {kind}s {_in_words(found, wanted)}, and those of {task.id} are "
-                f"{_in_words(wanted, found)}. Where a wrapper changed them, give ballbot_train.evaluate a function that does "
-                "what the wrapper did, for RescaleAction to ±350: lambda observation: "
-                "model.predict(observation, deterministic=True)[0] / 350. Give a function too, or train anew, where the "
-                "training had another robot, duration or arena"
+                f"{name} was trained on {kind}s {_in_words(found)}, and those of {task.id} are {_in_words(wanted)}. Where a "
+                "wrapper changed them, give ballbot_train.evaluate a function that does what the wrapper did, for "
+                "RescaleAction to ±350: lambda observation: model.predict(observation, deterministic=True)[0] / 350. Give a "
+                "function too, or train anew, where the training had another robot, duration or arena"
             )
 
 
@@ -103,16 +102,10 @@ def _alike(found: Any, wanted: spaces.Box) -> bool:
     )
 
 
-def _in_words(space: Any, other: Any) -> str:
-    """A space, with its bounds where they differ first from those of another of the same shape."""
+def _in_words(space: Any) -> str:
     if not isinstance(space, spaces.Box):
         return f"{space!s:.200}"
-    i = 0
-    if isinstance(other, spaces.Box) and space.shape == other.shape:
-        differs = ~np.isclose(space.low, other.low, rtol=1e-3) | ~np.isclose(space.high, other.high, rtol=1e-3)
-        i = int(np.argmax(differs))
-    low, high = space.low.ravel()[i], space.high.ravel()[i]
-    return f"{space.shape} {space.dtype} from {low:g} to {high:g}"
+    return f"{space.shape} {space.dtype} from {space.low.min():g} to {space.high.max():g}"
 
 
 def observations_of(path: str | Path) -> int:

@@ -180,22 +180,12 @@ def episode_job(
     over the robot's own optimum then too. The label tells jobs apart that differ in their randomization or robots; progress
     counts for the group, or else the task.
     """
-    what = f"{task}-{controller}-{physics}-{label}"
+    what, packed = f"{task}-{controller}-{physics}-{label}", registry.packed(controller)
     slug = "".join(sign if sign.isalnum() else "-" for sign in what)
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(
-            task,
-            controller,
-            registry.packed(controller),
-            physics,
-            seed,
-            randomization,
-            robot,
-            made_for,
-            variant,
-        ),
+        arguments=(task, controller, packed, physics, seed, randomization, robot, made_for, variant),
         items=tuple(episodes),
         group=group or task,
     )

@@ -110,11 +110,9 @@ def evaluate(
     """
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
-        known = certified.load(env.task, env.params)
-        indices = episode_indices(episodes, len(known))
+        indices = episode_indices(episodes, len(certified.load(env.task, env.params)))
         controller = as_controller(policy, env.task, env.params)
-        named = task_name(env.task)
-        results = list(iterate_episodes(env, controller, name or _name(policy), named, indices, 0, known))
+        results = run_episodes(env, controller, name or _name(policy), task_name(env.task), indices)
         return summarize(results)
     finally:
         env.close()
