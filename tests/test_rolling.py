@@ -365,7 +365,7 @@ def test_nmpc_keeps_the_friction_cone(rolling):
     controller = NmpcController(SHORT, rolling)
     episode = rollout(env, controller, options={"state": FAST})
     assert not episode.failure
-    assert controller.counts.fallbacks == 0
+    assert controller.counts.failed == 0
     limits = dynamics.limits(rolling, episode.trajectory.x[:-1], episode.trajectory.u, hold=0.02)
     assert np.min(limits) >= 0
     assert episode.cost == pytest.approx(controller.plan.cost, rel=0.02)
