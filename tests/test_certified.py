@@ -170,9 +170,9 @@ def test_set_of_other_fields_is_refused(task, robot):
         certified.load(other, robot=robot)
 
 
-def test_missing_set_says_how_to_make_one(task, tmp_path):
+def test_missing_set_says_how_to_make_one(task, robot, tmp_path):
     with pytest.raises(certified.CertificateError, match=r"no evaluation set.*ballbot certify"):
-        certified.load(task, tmp_path / "none.npz")
+        certified.load(task, tmp_path / "none.npz", robot)
 
 
 @dataclass(frozen=True)
