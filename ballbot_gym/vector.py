@@ -88,7 +88,7 @@ class VectorState(NamedTuple):
     """(B,) bool: the episode has ended, and the next one has not begun."""
 
 
-@fixed("task", "params", "randomization", "batch", "num_envs", "render_mode", "autoreset_mode")
+@fixed("task", "params", "randomization", "num_envs", "render_mode", "autoreset_mode")
 @fixed("action_space", "observation_space", "single_action_space", "single_observation_space")
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.

@@ -435,7 +435,7 @@ def test_attributes_are_given_per_env(make_vec):
 
 def test_what_envs_are_made_of_cannot_be_set(make_vec):
     vec = make_vec(3)
-    of_vec = ("batch", "render_mode", "autoreset_mode", "action_space", "single_observation_space")
+    of_vec = ("render_mode", "autoreset_mode", "action_space", "single_observation_space")
     for face, names in ((vec, of_vec), (vec.batch, ("dtype",))):
         for name in ("task", "params", "randomization", "num_envs", *names):
             with pytest.raises(AttributeError, match=f"'{name}' cannot be set"):
