@@ -33,6 +33,7 @@ MARKER = "unfinished.json"
 
 _FOLDER = "unfinished"
 _LOCK = ".lock"
+_LIMIT = 2**32  # bytes of a job's file
 _held: dict[Path, filelock.BaseFileLock] = {}
 _new: set[Path] = set()  # folders that this process claimed first, and in which nothing is finished yet
 _WORKER_DEATHS, _NODE_DEATHS = 2, 5  # of one item, after which it is not tried again
@@ -340,7 +341,7 @@ def _read(path: Path, items: int) -> dict[int, Entry]:
     if not path.exists():
         return {}
     found = {}
-    for text in path.read_text(errors="replace").split("\n")[:-1]:
+    for text in files.read(path, _LIMIT).decode(errors="replace").split("\n")[:-1]:
         try:
             line = json.loads(text)
             i, entry = line["item"], line["entry"]

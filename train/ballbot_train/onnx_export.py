@@ -20,16 +20,19 @@ from ballbot_gym.lazy import missing
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicyNetwork, load_network
-from ballbot_train.policy_files import OBSERVATION_VERSION, read_description, weights_digest
+from ballbot_train.policy_files import OBSERVATION_VERSION, PolicyError, read_description, weights_digest
+from ballbot_train.weights import own_defaults
 
 try:
     import torch
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
+_OPSET, _IR = 14, 7  # the lowest that onnx converts to; onnxruntime reads them since 1.8
 _LARGEST_ERROR = 1e-5  # of an action: float32 sums in another order differ by less than 1e-6
 
 
+@own_defaults()
 def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = PAPER) -> Path:
     """Writes a policy as an ONNX file, after checking that it acts as the policy does.
 
@@ -43,7 +46,7 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = P
         robot: by name.
 
     Raises:
-        PolicyError: as `load_network`.
+        PolicyError: as `load_network`; or the policy's actions are not finite.
         ModuleNotFoundError: onnx or onnxscript is missing.
         RuntimeError: the ONNX graph acts differently from the policy.
     """
@@ -105,7 +108,10 @@ def _traced(network: PolicyNetwork) -> Any:
     finally:
         silence.level = level
     assert program is not None
-    model = program.model_proto
+    from onnx.version_converter import convert_version
+
+    model = convert_version(program.model_proto, _OPSET)
+    model.ir_version = _IR
     model.producer_name, model.producer_version = "ballbot-gym", ballbot_gym.__version__
     for node in model.graph.node:  # the exporter notes there the files and lines of this machine
         del node.metadata_props[:]
@@ -122,6 +128,8 @@ def _check(model: Any, network: PolicyNetwork) -> None:
     (found,) = ReferenceEvaluator(model).run(None, {"observation": observations})  # pyright: ignore
     with torch.inference_mode():
         expected = network(torch.as_tensor(observations)).numpy()
+    if not np.isfinite(expected).all():
+        raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it anew")
     error = float(np.abs(found - expected).max())
     if not error < _LARGEST_ERROR:
         raise RuntimeError(f"the ONNX graph's actions differ from the policy's by {error:g}: not written")

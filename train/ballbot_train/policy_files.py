@@ -144,6 +144,8 @@ def read_description(path: str | Path) -> dict[str, Any]:
             raise TypeError("its spec is no object")
         if not isinstance(read["spec"]["task"], str):
             raise TypeError("its spec names no task")
+        if not isinstance(read.get("training", {}), dict):
+            raise TypeError("its training is no object")
     except KeyError as error:
         raise PolicyError(f"{description} is not a policy: it has no {error}") from error
     except (ValueError, TypeError) as error:

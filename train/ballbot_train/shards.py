@@ -59,7 +59,7 @@ class Shards:
         self.url = str(url).rstrip("/")
         try:
             self._files, self._root = fsspec.core.url_to_fs(self.url)
-            text = self._files.cat_file(f"{self._root}/{MANIFEST}")
+            text = self._content(MANIFEST, files.JSON_LIMIT)
         except FileNotFoundError:
             text = None
         except (ImportError, ValueError, OSError) as error:
@@ -72,13 +72,14 @@ class Shards:
 
     def _parse(self, text: bytes) -> None:
         try:
-            manifest = json.loads(text)
+            manifest = files.json_of(text, MANIFEST)
             if manifest["version"] != _VERSION:
                 raise ValueError(f"version {manifest['version']}")
             self.about = dict(manifest["about"])
             self._shards = {int(i): dict(shard) for i, shard in manifest["shards"].items()}
             for i, shard in self._shards.items():
-                if shard["file"] != _name(i) or not isinstance(shard["sha256"], str):
+                known = isinstance(shard["sha256"], str) and type(shard["episodes"]) is int
+                if shard["file"] != _name(i) or not known or shard["episodes"] < 0:
                     raise ValueError(f"shard {i}")
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ShardError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set anew") from error
@@ -106,12 +107,19 @@ class Shards:
         shard = self._shards[number]
         path = f"{self.url}/{shard['file']}"
         try:
-            content = self._files.cat_file(f"{self._root}/{shard['file']}")
-        except OSError as error:
+            content = self._content(shard["file"], _LIMIT)
+        except (OSError, files.FileError) as error:
             raise ShardError(f"{path} cannot be read: {error}") from error
         if hashlib.sha256(content).hexdigest() != shard["sha256"]:
             raise ShardError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
         return files.arrays_of(content, path, _LIMIT)
+
+    def _content(self, name: str, limit: int) -> bytes:
+        """Of a file of the set. Raises a FileError where it is larger than `limit` bytes."""
+        path = f"{self._root}/{name}"
+        if (self._files.size(path) or 0) > limit:  # some storage does not tell
+            raise files.FileError(f"{name} is larger than {limit / 2**20:.0f} MiB, the most that is read")
+        return self._files.cat_file(path)
 
     def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
         """The shards one after another, in order."""

@@ -276,7 +276,7 @@ def recovered_fractions(folder: Path, robot: str = PAPER) -> tuple[dict[tuple[st
             return {}, ""
         rows = document["rows"]
         return {(str(row["task"]), str(row["controller"])): float(row["recovered"]) for row in rows}, ""
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         return {}, f"{path} is damaged: {error!r}"
 
 

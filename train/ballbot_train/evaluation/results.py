@@ -134,7 +134,7 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
         return dict(document["about"]), [_checked(_from_json(entry)) for entry in document["episodes"]]
     except files.FileError as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, csv.Error) as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error!r}") from error
 
 
@@ -150,13 +150,13 @@ def _checked(result: Result) -> Result:
 
 def _from_json(entry: Mapping[str, Any]) -> Result:
     values: dict[str, Any] = {key: math.nan if value is None else value for key, value in entry.items()}
-    result = Result(**values)
     for field in fields(Result):
-        value, kind = getattr(result, field.name), cast(Any, field.type)
+        value, kind = values.get(field.name, field.default), cast(Any, field.type)
         fits = isinstance(value, (int, float) if kind is float else kind)
         if not fits or (isinstance(value, bool) and kind is not bool):
-            raise TypeError(f"{field.name} of an episode is {value!r}")
-    return result
+            raise TypeError(f"{field.name} of an episode is {value!r:.200}")
+        values[field.name] = kind(value)  # a whole number that no float holds is an OverflowError
+    return Result(**values)
 
 
 def _from_csv(entry: Mapping[str, str]) -> Result:

@@ -105,7 +105,7 @@ def table_section(title: str, header: Sequence[str], rows: Sequence[Sequence[str
 
 def pictures_section(title: str, pictures: Iterable[Path], lead: str = "") -> Section | None:
     """Embedded PNGs one under another, captioned with their names; None if there are none."""
-    shown = [{"name": path.stem, "base64": base64.b64encode(path.read_bytes()).decode()} for path in pictures]
+    shown = [{"name": path.stem, "base64": base64.b64encode(files.read(path)).decode()} for path in pictures]
     return Section(title, _render("pictures.html.j2", pictures=shown), lead) if shown else None
 
 
