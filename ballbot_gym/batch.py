@@ -11,7 +11,7 @@ import itertools
 import logging
 import shutil
 import types
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -664,12 +664,12 @@ def check_finite(actions: np.ndarray) -> None:
 
 def seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
     """One seed per env."""
-    if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-        seeds: list[Any] = [int(seed) + i for i in range(num_envs)]
-    elif isinstance(seed, str | bytes | Mapping | Set) or not hasattr(seed, "__iter__"):
+    if isinstance(seed, bool | str | bytes | Mapping | Set) or not isinstance(seed, int | np.integer | Iterable):
         raise TypeError(f"seed must be a whole number, or one or None for each env, not {shown(seed)}")
+    if isinstance(seed, Iterable):
+        seeds: list[Any] = list(itertools.islice(seed, num_envs + 1))  # it may have no end
     else:
-        seeds = list(itertools.islice(seed, num_envs + 1))  # it may have no end
+        seeds = [int(seed) + i for i in range(num_envs)]
     if len(seeds) != num_envs:
         found = f"more than {num_envs}" if len(seeds) > num_envs else len(seeds)
         raise ValueError(f"seed has {found} entries for {num_envs} envs")

@@ -131,3 +131,11 @@ def _is_casadi(v: Any) -> bool:
 def is_number(value: object) -> bool:
     """Whether something is one real number, and no truth value."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def is_positive(value: Any) -> bool:
+    """Whether a real number is positive, and finite as a float: a whole number may be too large for one."""
+    try:
+        return 0 < float(value) < math.inf
+    except OverflowError:
+        return False

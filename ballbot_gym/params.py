@@ -1,14 +1,13 @@
 """The robot's parameters, read from its URDF by link and joint name."""
 
 import math
-import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
 
 from ballbot_gym import files
-from ballbot_gym.ops import is_number
+from ballbot_gym.ops import is_number, is_positive
 
 _PACKAGE = Path(__file__).parent
 _IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf", _PACKAGE.parent / "urdf"
@@ -98,7 +97,7 @@ class BallbotParams:
                     )
                 continue
             # batches of robots hold tensors, whose values are not looked at
-            if is_number(value) and not 0 < value <= sys.float_info.max:
+            if is_number(value) and not is_positive(value):
                 raise ValueError(f"BallbotParams: {field.name} must be positive and finite, not {value}")
 
     @cached_property

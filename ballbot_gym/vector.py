@@ -162,9 +162,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         if engine in ("native", "loop") and torch.device(device).type != "cpu":
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
-        dtype = dtype_named(dtype)
-        self._dtype = np.float32 if dtype == torch.float32 else np.float64
-        self.batch = _batch(task, num_envs, device, dtype, compile, params, randomization, engine)
+        real: torch.dtype = dtype_named(dtype)
+        self._dtype = np.float32 if real == torch.float32 else np.float64
+        self.batch = _batch(task, num_envs, device, real, compile, params, randomization, engine)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
         fps = round(1 / self.task.control_dt)

@@ -121,13 +121,69 @@ ENVS = [
     (lambda f: stepped([0.0]), "action must have shape (2,), not (1,)"),
     (lambda f: stepped([math.nan, 0.0]), "action must be finite"),
     (lambda f: stepped(None), "action must have shape (2,), not ()"),
+    (lambda f: started(options={"sate": 1, 2: 3}), "unknown reset options ['sate', 2]; known"),
+    (constants("turn", sped=10**5000), "has no constants ['sped']"),
+    (lambda f: started("turn", options={"constants": {1: 2.0, "sped": 3.0}}), "has no constants ['sped', 1]"),
+    (lambda f: env(physics_dt=10**400), "must be a whole fraction of control_dt"),
+    (lambda f: evaluate(lambda o: [1j, 0.0], episodes=1, physics="rk4"), "action must be real numbers, not [1j, 0.0]"),
+    (lambda f: evaluate(lambda o: np.array([1j, 0.0]), episodes=1, physics="rk4"), "action must be real numbers"),
 ]
+
+NO_REAL_NUMBERS = {
+    "complex": lambda zeros: [complex(zero) for zero in zeros],
+    "complex array": lambda zeros: np.array(zeros, complex),
+    "complex number": lambda zeros: [1j, *zeros[1:]],
+    "truth values": lambda zeros: [False for _ in zeros],
+    "truth array": lambda zeros: np.zeros(len(zeros), bool),
+    "words": lambda zeros: ["0" for _ in zeros],
+    "word array": lambda zeros: np.array(["0" for _ in zeros]),
+    "objects": lambda zeros: np.array(zeros, object),
+    "nothing": lambda zeros: [None for _ in zeros],
+    "dates": lambda zeros: np.array(["2020" for _ in zeros], "M8[Y]"),
+    "masked": lambda zeros: np.ma.masked_array(zeros, [True, *zeros[1:]]),
+    "ragged": lambda zeros: [[0.0], *zeros[1:]],
+    "huge": lambda zeros: [10**400, *zeros[1:]],
+    "without digits": lambda zeros: [10**5000, *zeros[1:]],
+    "beyond float64": lambda zeros: np.array(["1e400", *zeros[1:]], np.longdouble),
+    "infinite": lambda zeros: [math.inf, *zeros[1:]],
+}
+
+
+@pytest.mark.parametrize("given", NO_REAL_NUMBERS.values(), ids=NO_REAL_NUMBERS)
+def test_single_and_vector_envs_refuse_the_same_numbers_as_actions_states_and_constants(given):
+    single, action = env(task="orbit"), given([0.0, 0.0])
+    for envs in (single, *(BallbotVectorEnv(1, "orbit", engine=engine, compile=False) for engine in ("loop", "torch"))):
+        envs.reset(seed=0)
+        with pytest.raises(ValueError, match=r"^actions? must be (real numbers|finite)"):
+            envs.step(action if envs is single else action[None] if isinstance(action, np.ndarray) else [action])
+        with pytest.raises(ValueError, match=r"^state must be .*finite numbers"):
+            envs.reset(options={"state": given([0.0] * 8)})
+        with pytest.raises(ValueError, match=r"^constants must be .*finite numbers"):
+            envs.reset(options={"constants": action})
+
+
+@pytest.mark.parametrize("huge", [1e308, 1e39, 2.0])
+def test_single_and_vector_envs_clip_the_same_actions(huge):
+    single = env()
+    single.reset(seed=0, options={"state": np.zeros(8)})
+    expected = single.step([huge, -huge])[-1]
+    assert expected["clipped"]
+    for dtype in (torch.float32, torch.float64):
+        for engine in ("native", "loop", "torch"):
+            envs = BallbotVectorEnv(1, engine=engine, dtype=dtype, compile=False)
+            envs.reset(seed=0, options={"state": np.zeros(8)})
+            infos = envs.step([[huge, -huge]])[-1]
+            assert infos["clipped"].all()
+            np.testing.assert_array_equal(infos["force"][0], expected["force"])
+
 
 TASKS = [
     (task("stabilize", duration="8"), "Stabilize: duration must be a number, not '8'"),
     (task("stabilize", duration=None), "Stabilize: duration must be a number, not None"),
     (task("stabilize", duration=True), "Stabilize: duration must be a number, not True"),
     (task("stabilize", duration=[8.0]), "Stabilize: duration must be a number, not [8.0]"),
+    (task("stabilize", rest_weight=np.float32(math.inf)), "rest_weight must be positive and finite, not inf"),
+    (task("stabilize", rest_weight=10**400), "rest_weight must be positive and finite"),
     (task("stabilize", duration=np.float32(math.nan)), "duration must be positive and finite, not nan"),
     (task("stabilize", duration=1e9), "must be 1 to 1,000,000 control steps"),
     (task("stabilize", duration=1e300), "must be 1 to 1,000,000 control steps"),
@@ -149,6 +205,9 @@ TASKS = [
 ]
 
 ROBOTS = [
+    (params(body_mass=10**400), "body_mass must be positive and finite"),
+    (params(body_mass=np.float32(math.inf)), "body_mass must be positive and finite, not inf"),
+    (lambda f: env(robot={"body_mass": 12.0}), "params must be a BallbotParams"),
     (params(body_mass=math.nan), "body_mass must be positive and finite, not nan"),
     (params(ball_mass=-1.0), "ball_mass must be positive and finite, not -1.0"),
     (params(gravity=math.nan), "gravity must be positive and finite, not nan"),
@@ -228,6 +287,7 @@ URDFS = [
 ]
 
 RANDOMIZATIONS = [
+    (randomization(body_mass=(1, 10**400)), "body_mass must be a finite range (low, high)"),
     (randomization(body_mass=(1.2, 0.8)), "body_mass must be a finite range (low, high)"),
     (randomization(body_mass=(math.nan, 1.0)), "body_mass must be a finite range"),
     (randomization(body_mass=(1.0, math.inf)), "body_mass must be a finite range"),
@@ -544,6 +604,17 @@ def batch(**given):
     return reset
 
 
+def batched(actions):
+    """Steps a batch of three."""
+
+    def step(folder):
+        made = BallbotBatch("turn", 3, compile=False)
+        made.reset(0)
+        made.step(actions)
+
+    return step
+
+
 def vector(seed=0, num_envs=3, **options):
     return lambda folder: BallbotVectorEnv(num_envs, "turn", compile=False).reset(seed=seed, options=options)
 
@@ -571,6 +642,19 @@ BATCHES = [
     (batch(seed=lambda _: [True, 2, 3]), "seeds must be whole numbers, not True"),
     (batch(seed=lambda _: [1, 2]), "seed has 2 entries for 3 envs"),
     (batch(seed=lambda _: 2**63), "seeds must be in [0, 2^63)"),
+    (batch(seed=lambda _: 10**5000), "seeds must be in [0, 2^63), not something of type int"),
+    (batch(seed=lambda _: True), "seed must be a whole number, or one or None for each env, not True"),
+    (batch(seed=lambda _: {1, 2, 3}), "seed must be a whole number, or one or None for each env, not {1, 2, 3}"),
+    (batch(seed=lambda _: itertools.count()), "seed has more than 3 entries for 3 envs"),
+    (batch(x=lambda x: x + 0j), "x must be real numbers, not one of shape (8, 3), torch.complex64"),
+    (batched([[1.0, 0.0]] * 3), "actions must be a tensor of shape (3, 2), not [[1.0, 0.0]"),
+    (batched(torch.zeros(2, 3)), "actions must be a tensor of shape (3, 2), not one of shape (2, 3)"),
+    (batched(torch.zeros(3, 2) + 0j), "actions must be real numbers, not one of shape (3, 2), torch.complex64"),
+    (batched(torch.zeros(3, 2) > 0), "actions must be real numbers, not one of shape (3, 2), torch.bool"),
+    (lambda f: BallbotBatch("turn", 10**9), "num_envs must be at most 1048576, not 1000000000"),
+    (lambda f: gymnasium.make_vec("BallbotTurn-v0", num_envs=10**9), "num_envs must be at most 1048576"),
+    (lambda f: BallbotVectorEnv(2, "turn").reset(options=[1]), "options must be a dict with 'reset_mask' and 'state'"),
+    (lambda f: BallbotVectorEnv(2, dtype="float16"), "dtype must be torch.float32 or torch.float64, not float16"),
     *(
         case
         for envs in (3, 80)  # a loop and a batch

@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import os
+import pickle
 import subprocess
 import sys
 import warnings
@@ -12,16 +13,19 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
-from ballbot_gym import BallbotEnv
+from ballbot_gym import BallbotEnv, Randomization
 from ballbot_gym.env import REWARD_PARTS
+from ballbot_gym.params import default_params
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.scene import Scene
 from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_gym.tasks.turn import Turn
 
 UPRIGHT = np.zeros(8)
 
@@ -68,6 +72,79 @@ def test_every_task_is_registered_under_its_id(task, physics):
     env.close()
 
 
+OWN = replace(default_params(), body_mass=12.0)
+VARIED = Randomization(body_mass=(0.8, 1.2), lean_noise=0.01)
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {},
+        {"duration": 2.0},
+        {"duration": np.float32(2.0), "max_episode_steps": 50},
+        {"robot": "rolling"},
+        {"robot": OWN, "randomization": VARIED},
+        {"params": OWN},
+        {"task": Turn(duration=4.0, max_speed=3.0)},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("through", ["the spec", "JSON", "pickle"])
+def test_the_spec_of_an_env_makes_the_same_env_again(keywords, through):
+    env = gymnasium.make("BallbotStabilize-v0", physics="rk4", **keywords)
+    spec = env.spec
+    if through == "JSON":
+        spec = EnvSpec.from_json(spec.to_json())
+    if through == "pickle":
+        spec = pickle.loads(pickle.dumps(spec))
+        assert spec == env.spec
+    again = gymnasium.make(spec)
+    assert again.spec.max_episode_steps == env.spec.max_episode_steps
+    for name in ("task", "params", "randomization", "physics"):
+        assert getattr(again.unwrapped, name) == getattr(env.unwrapped, name)
+    for mode in ("sync", "vector_entry_point"):
+        vector = gymnasium.make_vec(spec, num_envs=2, vectorization_mode=mode)
+        for name in ("task", "params", "randomization"):
+            assert vector.get_attr(name) == (getattr(env.unwrapped, name),) * 2
+        vector.close()
+
+
+def test_of_a_range_as_a_list_the_same_randomization_is_made():
+    assert Randomization(body_mass=[1, 1]) == Randomization()
+    assert not Randomization(body_mass=[1.0, 1.0]).active
+
+
+def test_a_reward_threshold_is_of_the_papers_robot_alone():
+    for keywords, threshold in (
+        ({}, Stabilize.reward_threshold),
+        ({"robot": OWN}, None),
+        ({"randomization": VARIED}, None),
+    ):
+        assert gymnasium.make("BallbotStabilize-v0", physics="rk4", **keywords).spec.reward_threshold == threshold
+
+
+@pytest.mark.parametrize(("limit", "steps"), [(7, 7), (1000, 20), (-1, 20), (None, 20)])
+@pytest.mark.parametrize("mode", [None, "sync", "async", "vector_entry_point"])
+def test_max_episode_steps_cuts_episodes_short_and_lengthens_none(mode, limit, steps):
+    keywords = {"physics": "rk4", "duration": 0.4, "max_episode_steps": limit}
+    if mode is None:
+        env = gymnasium.make("BallbotStabilize-v0", **keywords)
+        action = np.zeros(2)
+    else:
+        env = gymnasium.make_vec("BallbotStabilize-v0", num_envs=1, vectorization_mode=mode, **keywords)
+        action = np.zeros((1, 2))
+    env.reset(options={"state": UPRIGHT})
+    ends = []
+    while not any(ends):
+        *_, terminated, truncated, _ = env.step(action)
+        assert not terminated
+        ends.append(bool(truncated))
+    assert len(ends) == steps
+    if mode == "vector_entry_point":
+        assert env.spec.max_episode_steps == steps
+    env.close()
+
+
 def test_gymnasium_checker_has_no_complaint(task, physics):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -106,6 +183,13 @@ def test_return_and_cost_recomputed_from_states_and_forces_add_up_to_the_surviva
         # random forces topple it, so that a failure's price is among what was summed
         assert info["cost"] == pytest.approx(running + task.survival_reward * (task.duration - lived))
         assert total + cost == pytest.approx(task.survival_pay, rel=1e-12)  # the order of additions differs
+
+
+def test_success_is_told_under_the_name_that_stable_baselines3_looks_for(make_env):
+    env = make_env(physics="rk4", duration=0.1)
+    _, info = env.reset(options={"state": UPRIGHT})
+    infos = [info, *(step[-1] for step in play(env, [[0.0, 0.0]] * 5))]
+    assert [info["is_success"] for info in infos] == [info["success"] for info in infos] == [False] * 5 + [True]
 
 
 def test_reset_costs_nothing_and_reports_the_start(task, physics, make_env):

@@ -74,7 +74,7 @@ def test_a_step_is_that_of_the_batch_in_torch(task, robot):
 def test_an_env_is_the_same_bit_for_bit_wherever_it_stands(task, dtype):
     """In blocks that are full and in the remainder, alone, and where threads share the work."""
     actions = actions_of(37)
-    make = {"task": task, "engine": "native", "dtype": dtype, "duration": 0.5}
+    make = {"task": type(task)(duration=0.5), "engine": "native", "dtype": dtype}
     whole = play(BallbotVectorEnv(37, **make), actions, list(range(37)))
     for first, count in ((0, 1), (3, 16), (19, 18), (36, 1)):
         part = play(

@@ -6,6 +6,8 @@ pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from ballbot_gym import dynamics
@@ -87,6 +89,22 @@ def test_attributes_are_given_per_env():
     assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     with pytest.raises(AttributeError, match="cannot be set"):
         env.set_attr("task", None)
+
+
+def test_films_run_at_the_speed_of_the_control_steps():
+    assert make(1, render_mode="rgb_array").metadata["render_fps"] == 50
+    assert make(1, render_mode="rgb_array", control_dt=0.04).metadata["render_fps"] == 25
+    assert make(1, render_mode="rgb_array").metadata["render_modes"] == ["human", "rgb_array"]  # Stable-Baselines3's
+
+
+def test_evaluations_of_plain_envs_count_successes(tmp_path):
+    env, other = (gymnasium.make("BallbotStabilize-v0", physics="rk4", duration=0.02) for _ in range(2))
+    monitored = Monitor(env, info_keywords=("is_success",))
+    logged = EvalCallback(monitored, n_eval_episodes=3, eval_freq=8, log_path=str(tmp_path), verbose=0)
+    PPO("MlpPolicy", other, n_steps=8, batch_size=8, n_epochs=1, device="cpu").learn(16, logged)
+    successes = np.load(tmp_path / "evaluations.npz")["successes"]
+    assert successes.shape[1] == 3
+    assert successes.dtype == bool
 
 
 def test_ends_of_episodes_report_what_a_vec_monitor_reports():

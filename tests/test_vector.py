@@ -6,6 +6,7 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
@@ -21,6 +22,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.simulator import BulletSimulator
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
 
 INFO = (
@@ -230,6 +232,21 @@ def test_make_vec_gives_the_batched_env_with_the_spaces_of_the_single_one(task):
     assert {a.shape for a in (rewards, terminations, truncations)} == {(3,)}
     vec.close()
     single.close()
+
+
+@pytest.mark.parametrize(
+    "keywords", [{"duration": 2.0}, {"max_episode_steps": 30}, {"task": Turn(duration=4.0)}], ids=str
+)
+def test_the_spec_of_vector_envs_makes_the_same_ones_again_also_from_json(keywords):
+    settings = {"dtype": torch.float64, "device": torch.device("cpu"), "autoreset_mode": AutoresetMode.NEXT_STEP}
+    vec = gymnasium.make_vec("BallbotStabilize-v0", num_envs=3, **settings, **keywords)
+    for spec in (vec.spec, EnvSpec.from_json(vec.spec.to_json())):
+        again = gymnasium.make_vec(spec)
+        assert again.spec == vec.spec
+        assert (again.num_envs, again.task, again.autoreset_mode) == (3, vec.task, AutoresetMode.NEXT_STEP)
+        assert again.reset()[1]["state"].dtype == np.float64
+        again.close()
+    vec.close()
 
 
 def test_infos_have_the_form_of_gymnasiums_own_vector_env(task, make_vec):

@@ -1,7 +1,6 @@
 """Task: the one definition of an optimal-control problem that env, experts, optimizer and leaderboard use."""
 
 import math
-import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -9,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ballbot_gym import dynamics, ops
-from ballbot_gym.ops import Vector, is_number, squared
+from ballbot_gym.ops import Vector, is_number, is_positive, squared
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.symmetry import Mirror
@@ -93,7 +92,7 @@ class Task(ABC):
             value = getattr(self, field.name)
             if not is_number(value):
                 raise ValueError(f"{type(self).__name__}: {field.name} must be a number, not {value!r}")
-            if not 0 < value <= sys.float_info.max:
+            if not is_positive(value):
                 raise ValueError(f"{type(self).__name__}: {field.name} must be positive and finite, not {value}")
             object.__setattr__(self, field.name, float(value))  # so that 8 and 8.0 are the same task
         if not 0.5 <= self.duration / self.control_dt <= MAX_STEPS:
