@@ -100,7 +100,7 @@ class Weave(Task):
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         which, length, first_side, *shared = z
         stretch, offset, size = (shared[i : i + MAX_OBSTACLES] for i in (0, MAX_OBSTACLES, 2 * MAX_OBSTACLES))
-        count = 2 + (which >= 0.25) + (which >= 0.5) + (which >= 0.75)
+        count = 2 + 0.0 * which + (which >= 0.25) + (which >= 0.5) + (which >= 0.75)  # of the dtype of a batch
         distance = between(length, 6.0, 9.0)
         # Free stretches before, between and behind obstacles: 1.2 m, and the rest of the way shared out at random.
         shares = [ops.where(i < count, 0.5 + stretch[i], 0.0) for i in range(MAX_OBSTACLES)]
