@@ -13,7 +13,7 @@ from ballbot_train.commands.export import export
 from ballbot_train.onnx_export import export_onnx, observation_table
 from ballbot_train.policy import SHIPPED, PolicyController, PolicyNetwork, PolicySpec, load_policy, save_policy
 
-onnxruntime = pytest.importorskip("onnxruntime")
+onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
 
 CLOSE = 5e-6  # of actions in [−1, 1], in float32: where a policy turns into a frame and back, rounding grows
 SHIPPED_NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
@@ -51,6 +51,13 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     np.testing.assert_allclose(one_by_one, expected, atol=CLOSE)
     np.testing.assert_allclose(at_once, expected, atol=CLOSE)
     assert np.abs(at_once).max() <= 1
+
+
+def test_files_are_of_a_version_that_older_runtimes_read(tmp_path):
+    export("shac", task="weave", onnx=tmp_path / "policy.onnx")
+    model = onnx.load(tmp_path / "policy.onnx")
+    assert model.ir_version <= 7  # onnxruntime 1.16 reads up to 9
+    assert max(each.version for each in model.opset_import) <= 14  # and up to 19
 
 
 @pytest.mark.parametrize(

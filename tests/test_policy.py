@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.robots import ROBOTS, named_robot
@@ -139,6 +140,35 @@ SHIPPED = [
     for name, robot in itertools.product(TASKS, ROBOTS)
     for learner in shipped_policies(make_task(name, robot), robot)
 ]
+
+
+@pytest.fixture
+def others_defaults():
+    """What a script may have set for torch."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize(("name", "robot", "learner"), SHIPPED)
+def test_a_policy_computes_in_its_own_precision_whatever_torchs_default_is(name, robot, learner, others_defaults):
+    task = make_task(name, robot)
+    path = shipped_policies(task, robot)[learner]
+    policy = load_policy(path)
+    observations = np.random.default_rng(0).normal(size=(3, len(task.observation_scale))).astype(np.float32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        actions = policy.predict(observations)[0]
+    torch.set_default_dtype(torch.float32)
+    np.testing.assert_array_equal(actions, load_policy(path).predict(observations)[0])
+    assert actions.dtype == np.float32
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_batch_computes_in_its_own_precision_whatever_torchs_default_is(name, others_defaults):
+    batch = BallbotBatch(name, 2, compile=False)
+    observation = batch.reset(seed=0)
+    result = batch.step(torch.zeros(2, 2, dtype=torch.float32))
+    assert {part.dtype for part in (observation, result.observation, result.reward, result.cost)} == {torch.float32}
 
 
 @pytest.mark.parametrize(("name", "robot", "learner"), SHIPPED)

@@ -239,19 +239,45 @@ def bombed(members):
     members["policy.pth"] = pickle.dumps({"action_net.weight": Bomb()})
 
 
-def scaled(members):
-    weights = torch.load(io.BytesIO(members["policy.pth"]), weights_only=True)
-    weights["action_net.weight"][0, 0] = float("nan")
-    buffer = io.BytesIO()
-    torch.save(weights, buffer)
-    members["policy.pth"] = buffer.getvalue()
+def with_weights(**changes):
+    """A change of some weights, by the last words of their names."""
+
+    def change(members):
+        weights = torch.load(io.BytesIO(members["policy.pth"]), weights_only=True)
+        for name, made in changes.items():
+            weights[f"action_net.{name}"] = made(weights[f"action_net.{name}"])
+        buffer = io.BytesIO()
+        torch.save(weights, buffer)
+        members["policy.pth"] = buffer.getvalue()
+
+    return change
+
+
+def deflated(members):
+    """An inner archive of 200 kB that unpacks to 200 MB."""
+    packed = io.BytesIO()
+    with (
+        zipfile.ZipFile(io.BytesIO(members["policy.pth"])) as archive,
+        zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made,
+    ):
+        for name in archive.namelist():
+            made.writestr(name, archive.read(name))
+        made.writestr("archive/data/99", bytes(300 * 2**20))
+    members["policy.pth"] = packed.getvalue()
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (bombed, "is no saved model that can be read"),
-        (scaled, "holds NaN or infinity"),
+        (with_weights(weight=lambda weight: weight * float("nan")), "action_net.weight holds NaN or infinity"),
+        (with_weights(weight=lambda weight: weight + 1j), "action_net.weight holds torch.complex64"),
+        (with_weights(weight=lambda weight: weight.int()), "action_net.weight holds torch.int32"),
+        (with_weights(weight=lambda weight: weight + 3e38), "holds numbers beyond ±1e"),
+        (with_weights(weight=lambda weight: torch.ones(1).expand(2, 2**28)), "numbers, and stores fewer"),
+        (with_weights(bias=lambda bias: torch.zeros(3)), "is no network of linear layers that ends in 2 actions"),
+        (deflated, "unpacks to"),
+        (with_data(policy_kwargs={"activation_fn": "a" * 500_000}), "has the activation a{100}; known: elu"),
         (lambda members: members.pop("data"), "it holds no data"),
         (lambda members: members.update(data=b"{}"), "is no saved model that can be read"),
         (with_data(policy_class={"__module__": "mine"}), "has a policy of mine, which is not read; give a model with"),
