@@ -1,6 +1,7 @@
 """Trainings on several seeds, and their learning curves."""
 
 import json
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -112,7 +113,7 @@ def processes(monkeypatch):
         options["stdout"].write(f"seed {seed} says\n")
         if seed in fails:
             return SimpleNamespace(returncode=1)
-        settings = json.loads(json.dumps(vars(LEARNERS["dagger"].settings("stabilize"))))
+        settings = json.loads(json.dumps(asdict(LEARNERS["dagger"].settings("stabilize"))))
         training = {"learner": "dagger", "task": "stabilize", "seed": int(seed), "settings": settings}
         measured = {"success": 0.9 + 0.01 * int(seed), "falls": int(seed), "regret_mean": 0.1}
         described = {"spec": {"task": "x"}, "training": training, "training_seconds": 60.0, "measured": measured}

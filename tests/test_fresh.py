@@ -221,8 +221,8 @@ def test_what_does_not_act_is_refused():
         evaluate_fresh(3, "turn", 1)
     with pytest.raises(ValueError, match="trajopt is an expert"):
         evaluate_fresh("trajopt", "turn", 1)
-    with pytest.raises(ValueError, match="unknown policy 'shac'"):
-        evaluate_fresh("shac", "turn", 1)
+    with pytest.raises(ValueError, match="unknown policy 'apg'"):
+        evaluate_fresh("apg", "turn", 1)
 
 
 def test_validation_prices_an_episode_without_success_as_failing_at_once():

@@ -43,7 +43,6 @@ SETTINGS = [
     "3",
     "--hidden",
     "8",
-    "--no-compile",
     "--test-episodes",
     "8",
 ]

@@ -271,8 +271,10 @@ class OcpSolver:
         the nearest motion. Guesses that obey the constraints do not change. A step takes as long as one or two iterations.
 
         Args:
-            states, inputs, p: as `solve` takes them.
             bounds: as `solve` takes them; variables with equal bounds do not change.
+            states: as `solve` takes them.
+            inputs: as `solve` takes them.
+            p: as `solve` takes them.
 
         Returns:
             states (N+1, ns) and inputs (N, nw).

@@ -7,8 +7,13 @@ import html
 import unicodedata
 from typing import Any
 
-from rich.console import Console
-from rich.text import Text
+from ballbot_gym.lazy import missing
+
+try:
+    from rich.console import Console
+    from rich.text import Text
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 _MARKDOWN = str.maketrans({sign: f"&#{ord(sign)};" for sign in "&<>|{}`\\*"} | {"\n": " ", "\r": " "})
 
