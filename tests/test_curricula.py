@@ -422,6 +422,9 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
         ),
         ("turn", {"ramp": "max_speed", "ramp_start": 1.0}, "curriculum.ramp_start 1 is out of range"),
         ("turn", {"starts_seconds": 0.5}, "curriculum.starts_seconds needs curriculum.starts_on_optima above 0"),
+        ("turn", {"starts_success": 0.5}, "curriculum.starts_success needs curriculum.starts_on_optima above 0"),
+        ("turn", {"starts_reserve": 0.5}, "curriculum.starts_reserve needs curriculum.starts_on_optima above 0"),
+        ("turn", {"retries_per_failure": 2.0}, "curriculum.retries_per_failure needs curriculum.retries above 0"),
         ("weave", {"starts_seconds": 0.5, "starts_on_optima": 0.5}, "BallbotWeave-v0 does not end at its goal"),
         (
             "turn",

@@ -120,6 +120,12 @@ def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
         shac.Shac(task, params, replace(config, hidden=(9,))).start_from(donor.network)
 
 
+@pytest.mark.parametrize("setting", [{"one_way": True}, {"margin_clearance": 0.1}])
+def test_settings_of_shac_that_would_do_nothing_say_so(setting):
+    with pytest.raises(ValueError, match="needs margin_penalty above 0"):
+        LEARNERS["shac"].make(TASKS["stabilize"](), default_params(), shac.ShacConfig(**setting), 0, None)
+
+
 def test_the_critic_of_shac_starts_as_lqr_s_cost():
     task, params = TASKS["stabilize"](), default_params()
     learner = shac.Shac(task, params, shac.ShacConfig(num_envs=4, hidden=(8,)))

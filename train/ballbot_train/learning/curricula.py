@@ -40,6 +40,13 @@ from ballbot_train.evaluation import fresh
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
 _OWN, _ON_OPTIMUM = 0, 1  # how an episode began
+_NEEDS = {
+    "starts_seconds": "starts_on_optima",
+    "starts_success": "starts_on_optima",
+    "starts_reserve": "starts_on_optima",
+    "starts_goal_factor": "starts_on_optima",
+    "retries_per_failure": "retries",
+}
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
 
 
@@ -154,8 +161,9 @@ class Curriculum:
                 replace(task, **{self.ramp: self.ramp_start})
             except ValueError as error:
                 raise ValueError(f"curriculum.ramp_start {self.ramp_start:g} is out of range: {error}") from error
-        if self.starts_seconds and not self.starts_on_optima:
-            raise ValueError("curriculum.starts_seconds needs curriculum.starts_on_optima above 0")
+        for name, needed in _NEEDS.items():  # what would do nothing says so
+            if getattr(self, name) and not getattr(self, needed):
+                raise ValueError(f"curriculum.{name} needs curriculum.{needed} above 0; without it give 0")
         if self.starts_seconds and not task.first_exit:
             raise ValueError(f"{task.id} does not end at its goal, so curriculum.starts_seconds must be 0")
         if self.starts_on_optima and self.starts_goal_factor and self.starts_goal_factor >= self.goal_factor:

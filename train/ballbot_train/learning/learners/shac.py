@@ -364,5 +364,12 @@ class Shac:
 def make(
     task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: str | Path | None
 ) -> Shac | WholeEpisodes:
-    """Makes the learner; it uses no demonstrations."""
+    """Makes the learner; it uses no demonstrations.
+
+    Raises:
+        ValueError: a setting would do nothing, or the task does not have the symmetry that the settings ask for.
+    """
+    for name in ("margin_clearance", "one_way"):
+        if getattr(config, name) and not config.margin_penalty:
+            raise ValueError(f"{name} needs margin_penalty above 0")
     return Shac(task, params, config, seed) if config.horizon else WholeEpisodes(task, params, config, seed)
