@@ -12,7 +12,7 @@ from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
-from ballbot_train.learning import training
+from ballbot_train.learning import routing, training
 from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
 from ballbot_train.learning.learners import LEARNERS, dagger
 
@@ -92,7 +92,9 @@ def test_dagger_goes_on_from_its_state_as_if_never_stopped(demos, demonstrated):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_dagger_labels_what_it_meets_on_every_task(name):
+def test_dagger_labels_what_it_meets_on_every_task(name, monkeypatch):
+    monkeypatch.setattr(routing, "EPISODES", 60)
+    monkeypatch.setattr(routing, "_STEPS", 5)
     task = TASKS[name]()
     settings = (
         "iterations",

@@ -7,12 +7,12 @@ import html
 import unicodedata
 from typing import Any
 
-from ballbot_gym.lazy import missing
-
 try:
     from rich.console import Console
     from rich.text import Text
 except ModuleNotFoundError as error:
+    from ballbot_gym.lazy import missing  # which brings NumPy along: `ballbot --help` needs none
+
     raise missing(__name__, error.name) from error
 
 _MARKDOWN = str.maketrans({sign: f"&#{ord(sign)};" for sign in "&<>|{}`\\*"} | {"\n": " ", "\r": " "})
