@@ -40,13 +40,8 @@ from ballbot_train.evaluation import fresh
 _ARENAS = ("arena_radius", "arena_factor")  # the fields that bound the arena
 _NO_ARENA = 1e4  # of either: farther than any episode goes
 _OWN, _ON_OPTIMUM = 0, 1  # how an episode began
-_NEEDS = {
-    "starts_seconds": "starts_on_optima",
-    "starts_success": "starts_on_optima",
-    "starts_reserve": "starts_on_optima",
-    "starts_goal_factor": "starts_on_optima",
-    "retries_per_failure": "retries",
-}
+_NEEDS = {f"starts_{name}": "starts_on_optima" for name in ("seconds", "success", "reserve", "goal_factor")}
+_NEEDS["retries_per_failure"] = "retries"
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
 
 

@@ -479,11 +479,7 @@ def tube_gains(task: Task, params: BallbotParams, plan: Optimum, c: np.ndarray) 
 
 
 def make(task: Task, params: BallbotParams, config: DaggerConfig, seed: int, demos: str | Path | None) -> Dagger:
-    """Makes the learner; demonstrations, if given, are its first samples.
-
-    Raises:
-        ValueError: the demonstrations are missing, or of another task; or they are shards, and the settings ask for more.
-    """
+    """Makes the learner; demonstrations, if given, are its first samples. Raises a ValueError where they do not fit."""
     samples: Samples | StreamedDemos | None = None
     if demos is not None and is_set(demos):
         if config.gathering_iterations:

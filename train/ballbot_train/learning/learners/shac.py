@@ -364,11 +364,7 @@ class Shac:
 def make(
     task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: str | Path | None
 ) -> Shac | WholeEpisodes:
-    """Makes the learner; it uses no demonstrations.
-
-    Raises:
-        ValueError: a setting would do nothing, or the task does not have the symmetry that the settings ask for.
-    """
+    """Makes the learner, which uses no demonstrations; raises a ValueError where the task or a setting does not fit."""
     for name in ("margin_clearance", "one_way"):
         if getattr(config, name) and not config.margin_penalty:
             raise ValueError(f"{name} needs margin_penalty above 0")
