@@ -57,4 +57,10 @@ def test_files_hold_the_rows_and_the_figure_is_drawn(tmp_path):
         assert len(list(csv.DictReader(file))) == 4
     curve = robustness.curve_of(rows, "stabilize", "lqr", "mass")
     np.testing.assert_array_equal([row.level for row in curve], [-20, 0, 20])
-    assert figures.save(figures.robustness_figure(rows, "stabilize"), tmp_path / "curves.png").exists()
+    figure = figures.robustness_figure(rows, "stabilize")
+    assert figures.save(figure, tmp_path / "curves.png").exists()
+    ticks = [tick.get_text() for axis in figure.axes for tick in (*axis.get_xticklabels(), *axis.get_yticklabels())]
+    assert "100" in ticks
+    assert not any(
+        "$" in tick for tick in ticks
+    )  # logarithmic axes label their ticks by formulas, which are not parsed

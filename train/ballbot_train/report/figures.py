@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import LogFormatter
 
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
@@ -302,6 +303,10 @@ def save(figure: Figure, path: Path) -> Path:
 
 def plain(figure: Figure) -> None:
     """Shows dollar signs as they are: a name is no formula, and one that is half a formula cannot be drawn."""
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        if axis.get_scale() != "linear":  # these ticks are labelled by formulas
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(LogFormatter())
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
 
