@@ -31,6 +31,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import first_violated, outcome
 
 _log = logging.getLogger(__name__)
 
@@ -340,7 +341,7 @@ class BallbotBatch:
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c)
         if x is not None:
-            violated = first_below_zero(self.task.limits(new.x, new.c))
+            violated = first_violated(self.task.limits(new.x, new.c))
             bad = (mask & (violated >= 0)).nonzero()[:, 0].tolist()
             if bad:
                 raise ValueError(
@@ -431,45 +432,34 @@ class BallbotBatch:
         if noise.varies_robot:
             robot = _Robot.of(noise.robot(self.params, now.drawn[:4]))
 
-        rate = task.cost(x, force, c)
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
-        limits = task.limits(end, c)
-        grip = torch.zeros(0, *rate.shape, dtype=self.dtype, device=rate.device)
+        grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
         if self.params.grips:
             floor = dynamics.held_contact(robot, x, total, task.control_dt)
             first, second = (torch.minimum(*dynamics.grip_limits(robot, part)) for part in floor)
-            limits = (*limits, torch.minimum(first, second))
+            kept = (torch.minimum(first, second),)
             at_begin, at_end = (tuple(part.detach() for part in parts) for parts in floor)
             needed = torch.maximum(dynamics.needed_friction(at_begin), dynamics.needed_friction(at_end))
             grip = torch.stack((*at_begin, needed))
-        violated = first_below_zero(limits)
-        failure, reached = violated >= 0, all_of(g <= 0 for g in task.goal(end, c))
-        safe = ~failure
         steps = state.steps + 1
-        last = steps >= task.steps
-        success = safe & reached if task.first_exit else safe & reached & last
-        terminated = failure | success if task.first_exit else failure
-        truncated = last & ~terminated
+        did = outcome(task, x, force, end, c, steps.to(self.dtype), kept)
+        terminated, truncated, success, failure = (part > 0 for part in did[3:7])
         done = terminated | truncated
-        running, survive = rate * task.control_dt, task.survival_reward * task.control_dt
-        ahead = survive * (task.steps - steps).to(self.dtype)  # for the time that remains
-        reward = survive - running
-        if task.first_exit:
-            reward = reward + ahead * success
+        reward = task.survival_reward * task.control_dt - did.running + did.goal
 
         after = now._replace(x=end, steps=steps, actuator=actuator)
         new = _select(done, self._start(state.seed, state.episode + 1), after)
         result = BatchStep(
             observation=self._observe(new),
             reward=reward,
-            cost=running + ahead * failure,
+            cost=did.cost,
             terminated=terminated,
             truncated=truncated,
             final_observation=self._observe(after),
             final_x=torch.stack(end),
             success=success,
             failure=failure,
-            violated=violated,
+            violated=did.violated,
             force=torch.stack(force),
             clipped=any_of(part.abs() > 1.0 for part in asked),
             final_tilt=tilt_of(end),
@@ -613,22 +603,6 @@ def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
         return a if a is b else torch.where(mask, a, b)
 
     return _Rows(*map(chosen, new, old))
-
-
-def all_of(conditions: Any) -> torch.Tensor:
-    """Elementwise and."""
-    first, *others = conditions
-    for condition in others:
-        first = first & condition
-    return first
-
-
-def first_below_zero(values: tuple) -> torch.Tensor:
-    """(B,) index of the first value that is not ≥ 0, so of NaN too, in the values' dtype; −1 where all are."""
-    first = torch.full_like(values[0], -1.0)
-    for i in reversed(range(len(values))):
-        first = torch.where(values[i] >= 0, first, float(i))
-    return first
 
 
 def any_of(conditions: Any) -> torch.Tensor:

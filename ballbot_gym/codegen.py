@@ -23,6 +23,7 @@ except ImportError as error:
 from ballbot_gym import dynamics, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import outcome
 
 LANES = 16
 """Robots per block: as many float32 as an AVX-512 register holds."""
@@ -173,40 +174,23 @@ def _advance(
 ) -> tuple[tuple[str, Sequence[Any]], ...]:
     """One control step, as `BallbotBatch.transition` computes it, up to the start of the next episode."""
     u = tuple([casadi.fmax(casadi.fmin(part, 1.0), -1.0) * params.force_limit for part in action])
-    rate = task.cost(x, u, c)
     end = dynamics.step(params, x, u, task.control_dt, dynamics.substeps_for(task.control_dt))
-    limits, grip = task.limits(end, c), ()
+    grip, kept = (), ()
     if params.grips:
         floor = dynamics.held_contact(params, x, u, task.control_dt)
         held = [casadi.fmin(*dynamics.grip_limits(params, force)) for force in floor]
-        limits = (*limits, casadi.fmin(*held))
+        kept = (casadi.fmin(*held),)
         grip = (*floor[0], casadi.fmax(*(dynamics.needed_friction(force) for force in floor)))
-    violated: Any = -1.0
-    for i in reversed(range(len(limits))):
-        violated = ops.where(casadi.SX(limits[i] >= 0), violated, float(i))  # not ≥ 0 where it is not a number
-    failure = violated >= 0
-    reached: Any = casadi.SX(1)
-    for g in task.goal(end, c):
-        reached = casadi.logic_and(reached, g <= 0)
-    steps = taken + 1
-    last = steps >= task.steps
-    success = casadi.logic_and(casadi.logic_not(failure), reached)
-    if not task.first_exit:
-        success = casadi.logic_and(success, last)
-    terminated = casadi.logic_or(failure, success) if task.first_exit else failure
-    truncated = casadi.logic_and(last, casadi.logic_not(terminated))
-    survive, running = task.survival_reward * task.control_dt, rate * task.control_dt
-    ahead = survive * (task.steps - steps)  # for the time that remains
-    reward = survive - running + ops.where(casadi.logic_and(success, int(task.first_exit)), ahead, 0.0)
-    cost = running + ops.where(failure, ahead, 0.0)
+    did = outcome(task, x, u, end, c, taken + 1, kept)
+    reward = task.survival_reward * task.control_dt - did.running + did.goal
     clipped = casadi.logic_or(casadi.fabs(action[0]) > 1, casadi.fabs(action[1]) > 1)
     return (
         ("end", end),
         ("force", u),
         ("grip", grip),
-        ("pay", (reward, cost)),
-        ("flags", (terminated, truncated, success, failure, clipped)),
-        ("violated", (violated,)),
+        ("pay", (reward, did.cost)),
+        ("flags", (did.terminated, did.truncated, did.success, did.failure, clipped)),
+        ("violated", (did.violated,)),
     )
 
 

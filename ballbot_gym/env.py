@@ -29,6 +29,7 @@ from ballbot_gym.simulator import (
 )
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.viewer import PageScene
 
 _VIEW = math.radians(-CAMERA_YAW)
@@ -79,7 +80,7 @@ class EnvState(NamedTuple):
     """Of the randomized robot and actuator; None where nothing varies."""
 
 
-class Outcome(NamedTuple):
+class Step(NamedTuple):
     """What one control step did, as plain numbers."""
 
     terminated: bool
@@ -89,7 +90,8 @@ class Outcome(NamedTuple):
     cost: float
     force: tuple[float, float]
     success: bool
-    violated: str
+    violated: int
+    """Index in `limit_names`, or −1."""
     clipped: bool
     grip: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     """The floor's force on the ball, N, and the friction that it needs, of robots whose friction is limited."""
@@ -193,7 +195,6 @@ class BallbotEnv(gymnasium.Env):
         )
         self._noisy = self.randomization.is_noisy
         self.observation_space = observation_space(self.task, self.params)
-        self._limit_index = {name: i for i, name in enumerate(("", *self.limit_names), start=-1)}
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: Judge | None = None  # in machine code
@@ -221,7 +222,7 @@ class BallbotEnv(gymnasium.Env):
         x, c = self._draw(options)
         self._resets += 1
         self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
-        outcome = self._start(x, c)
+        start = self._start(x, c)
         self._set_constants(c)
         self._state = x
         if self._disturbance is not None:
@@ -232,7 +233,7 @@ class BallbotEnv(gymnasium.Env):
         self._steps_left = self.task.steps
         if self.render_mode == "human":
             self.render()
-        return self._observation(outcome), self._info(outcome)
+        return self._observation(start), self._info(start)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -250,12 +251,12 @@ class BallbotEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended; call reset()" if self._state else "step() before reset()"
             )
-        outcome = self._advance(*self._force(action))
+        step = self._advance(*self._force(action))
         if self.render_mode == "human":
             self.render()
-        survive, running, goal = outcome.reward
+        survive, running, goal = step.reward
         reward = survive + running + goal
-        return self._observation(outcome), reward, outcome.terminated, outcome.truncated, self._info(outcome)
+        return self._observation(step), reward, step.terminated, step.truncated, self._info(step)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -401,7 +402,7 @@ class BallbotEnv(gymnasium.Env):
             self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
 
-    def _advance(self, force: tuple[float, float], clipped: bool) -> Outcome:
+    def _advance(self, force: tuple[float, float], clipped: bool) -> Step:
         """Holds a force, N, for one control step."""
         task, c, total = self.task, self._constants, force
         if self._disturbance is not None:
@@ -410,28 +411,21 @@ class BallbotEnv(gymnasium.Env):
         before = self._state
         self._state = x = self._simulator.step(total)
         self._steps_left -= 1
-        judged = None if self._judge is None else self._judge.judge(before, force, x)
-        if judged is None:
-            rate, tilt, violated, reached, arrays = task.cost(before, force, c), None, task.violated(x, c), None, None
-        else:
-            rate, tilt, violated, reached, arrays = judged
-        running = rate * task.control_dt
-        grip = _START.grip
+        grip, kept = _START.grip, 0.0
         if self.params.grips:
             grip, lost = self._grip(before, total)
-            violated = violated or (GRIP if lost else "")
-        failure = violated != ""
-        last = self._steps_left == 0
-        success = not failure and (last or task.first_exit) and (task.is_goal(x, c) if reached is None else reached)
-        terminated = failure or (success and task.first_exit)
-        survive = task.survival_reward * task.control_dt
-        ahead = survive * self._steps_left  # for the time that remains
-        reward = (survive, -running, ahead if terminated and success else 0.0)
+            kept = -1.0 if lost else 0.0
+        steps = task.steps - self._steps_left
+        judged = None if self._judge is None else self._judge.judge(before, force, x, steps, kept)
+        if judged is None:
+            judged = outcome(task, before, force, x, c, steps, (kept,)), None, None
+        did, tilt, arrays = judged
+        terminated, truncated, success = did.terminated > 0, did.truncated > 0, did.success > 0
         if terminated:
             self._steps_left = 0
-        cost = running + ahead * failure
-        truncated = last and not terminated
-        return Outcome(terminated, truncated, reward, cost, force, success, violated, clipped, grip, tilt, arrays)
+        reward = (task.survival_reward * task.control_dt, -did.running, did.goal)
+        violated = int(did.violated)
+        return Step(terminated, truncated, reward, did.cost, force, success, violated, clipped, grip, tilt, arrays)
 
     def _grip(self, x: State, total: tuple[float, float]) -> tuple[tuple[float, ...], bool]:
         """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
@@ -443,13 +437,13 @@ class BallbotEnv(gymnasium.Env):
         needed = max(map(dynamics.needed_friction, asked))
         return (*asked[0], needed), not dynamics.keeps_grip(robot, asked)
 
-    def _start(self, x: State, c: State) -> Outcome:
+    def _start(self, x: State, c: State) -> Step:
         """What `reset` reports of a start. Raises a ValueError if it is out of range."""
         if self._judge is not None:
             self._judge.set_constants(c)
-            judged = self._judge.judge(x, _START.force, x)
-            if judged is not None and not judged[2]:
-                return _START._replace(tilt=judged[1], arrays=judged[4])
+            judged = self._judge.judge(x, _START.force, x, 0, 0.0)
+            if judged is not None and judged[0].violated < 0:
+                return _START._replace(tilt=judged[1], arrays=judged[2])
             if self._state:  # its episode goes on where this one cannot start
                 self._judge.set_constants(self._constants)
         task = self.task
@@ -502,41 +496,39 @@ class BallbotEnv(gymnasium.Env):
             x = self._disturbance.sensed(x, self.np_random)
         return self.task.observe(x, self._constants)
 
-    def _observation(self, outcome: Outcome) -> np.ndarray:
-        if outcome.arrays is None or self._noisy:
+    def _observation(self, step: Step) -> np.ndarray:
+        if step.arrays is None or self._noisy:
             return np.array(self._observed(), np.float32)
-        return outcome.arrays[0]
+        return step.arrays[0]
 
-    def _info(self, outcome: Outcome) -> dict[str, Any]:
-        survive, running, goal = outcome.reward
-        state, force = (
-            (np.array(self._state), np.array(outcome.force)) if outcome.arrays is None else outcome.arrays[1:]
-        )
+    def _info(self, step: Step) -> dict[str, Any]:
+        survive, running, goal = step.reward
+        state, force = (np.array(self._state), np.array(step.force)) if step.arrays is None else step.arrays[1:]
         info = {
             "state": state,
-            "cost": outcome.cost,
+            "cost": step.cost,
             "reward_survive": survive,
             "reward_cost": running,
             "reward_goal": goal,
-            "tilt": dynamics.tilt(self._state) if outcome.tilt is None else outcome.tilt,
-            "success": outcome.success,
-            "is_success": outcome.success,
-            "failure": outcome.violated != "",
-            "violated": self._limit_index[outcome.violated],
-            "constraint_cost": float(outcome.violated != ""),
+            "tilt": dynamics.tilt(self._state) if step.tilt is None else step.tilt,
+            "success": step.success,
+            "is_success": step.success,
+            "failure": step.violated >= 0,
+            "violated": step.violated,
+            "constraint_cost": float(step.violated >= 0),
             "force": force,
-            "clipped": outcome.clipped,
+            "clipped": step.clipped,
             "constants": self._constants_array.copy(),
         }
         if self.params.grips:
-            info["grip"] = np.array(outcome.grip)
+            info["grip"] = np.array(step.grip)
         return info
 
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 """Keys of `info` whose values add up to the reward."""
 
-_START = Outcome(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, "", False)
+_START = Step(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, -1, False)
 """What `reset` reports."""
 
 GRIP = "grip"

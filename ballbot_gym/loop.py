@@ -14,13 +14,13 @@ import numpy as np
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BatchState, BatchStep, seeds_of
 from ballbot_gym.checks import check_num_envs
-from ballbot_gym.env import BallbotEnv, Outcome, fixed
+from ballbot_gym.env import BallbotEnv, Step, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import DisturbanceState, Randomization
 from ballbot_gym.simulator import State
 from ballbot_gym.tasks import Task
 
-_NOTHING = Outcome(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, "", False)
+_NOTHING = Step(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, -1, False)
 """The outcome of a step that only starts an episode."""
 
 _NOMINAL = (1.0, 1.0, 1.0, 1.0, 1.0, 0.0)
@@ -119,7 +119,7 @@ class BallbotLoop:
         """
         if not self._started:
             raise gymnasium.error.ResetNeeded("step() before reset()")
-        outcomes: list[Outcome] = []
+        outcomes: list[Step] = []
         final_x: list[State] = []
         final_seen: list[tuple] = []
         begun: list[_Single] = []
@@ -148,7 +148,6 @@ class BallbotLoop:
             observation = np.array([single.seen() for single in self._singles], np.float32)
             tilt = np.array([dynamics.tilt(single._state) for single in self._singles], self.dtype)
         terminated, truncated, reward, cost, force, success, violated, clipped, grip, *_ = zip(*outcomes, strict=True)
-        index = np.array([self._singles[0]._limit_index[name] for name in violated])
         fields: Any = {
             "observation": observation,
             "reward": np.array([sum(parts) for parts in reward]),
@@ -158,8 +157,8 @@ class BallbotLoop:
             "final_observation": final_observation[np.logical_or(terminated, truncated)],
             "final_x": final_states,
             "success": np.array(success),
-            "failure": index >= 0,
-            "violated": index,
+            "failure": np.array(violated) >= 0,
+            "violated": np.array(violated),
             "force": np.array(force, self.dtype).T,
             "clipped": np.array(clipped),
             "final_tilt": final_tilt,
@@ -232,7 +231,7 @@ class _Single(BallbotEnv):
         """Begins the next episode."""
         self.remember(*self.start(self.seed, self.episode + 1))
 
-    def advance(self, action: list[float]) -> Outcome:
+    def advance(self, action: list[float]) -> Step:
         """Holds an action for one control step. It is finite."""
         if self._disturbance is not None:
             self._rng.seek(self, 0)

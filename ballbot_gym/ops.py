@@ -84,6 +84,12 @@ def where(condition: Any, a: Any, b: Any) -> Any:
     return library.where(condition, a, b)
 
 
+def full_like(a: Any, value: float) -> Any:
+    """A number in the shape and of the kind of `a`."""
+    library = _library(a)
+    return library.full_like(a, value) if library.__name__ in ("torch", "numpy") and hasattr(a, "shape") else value
+
+
 def between(z: Any, low: Any, high: Any) -> Any:
     """A uniform number z in [0, 1) as one in [low, high), elementwise."""
     return low + (high - low) * z

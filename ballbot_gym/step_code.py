@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ballbot_gym import dynamics, machine_code, ops, traced
+from ballbot_gym import dynamics, machine_code, traced
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import Outcome, outcome
 
 _log = logging.getLogger(__name__)
 
@@ -32,8 +33,10 @@ _TRIALS = 64
 _YIELD = 1e-4  # s, at every reset until the code is there
 _MOVED = struct.Struct("9d")  # whether all is finite, and a state
 _HELD = struct.Struct("10d")  # a state and a force
-_JUDGED = struct.Struct("5d")  # whether all is finite, cost rate, tilt, violated limit, goal reached
-_STEP = struct.Struct("18d")  # a state, a force and the state after it
+_JUDGED = struct.Struct("10d")  # whether all is finite, an outcome, and the tilt
+_STEP = struct.Struct(
+    "20d"
+)  # a state, a force, the state after it, the number of steps, and whether the ball keeps its grip
 
 State = tuple[float, ...]
 
@@ -89,9 +92,8 @@ class Motion:
         return tuple(end) if check == 0 else None
 
 
-Judgement = tuple[float, float, str, bool, tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Cost rate, 1/s, tilt, rad, the violated limit's name or "", whether the goal holds; and what is seen, float32, state and
-force as arrays."""
+Judgement = tuple[Outcome, float, tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""What a step did, the tilt after it, rad; and what is seen, float32, state and force as arrays."""
 
 
 class Judge:
@@ -102,42 +104,42 @@ class Judge:
         self._call, self._bytes, self._at, self._numbers = code.call, work.bytes, work.at, work.numbers
         self._first = work.first
         seen, first = len(task.observation_scale), work.first
-        self._seen = self._numbers[5 : 5 + seen]
+        self._seen = self._numbers[10 : 10 + seen]
         self._force, self._x = self._numbers[first + 8 : first + 10], self._numbers[first + 10 : first + 18]
-        self._names = (*task.limit_names, "")  # the last one has index −1
 
     @staticmethod
     def made(task: Task, start: bool) -> Code | None:
-        """The code for a task; see `_code`. There is none for a task that has its own idea of failure or success."""
-        kind = type(task)
-        if kind.violated is not Task.violated or kind.is_goal is not Task.is_goal:
-            return None
+        """The code for a task; see `_code`."""
 
-        def compute(before: tuple, u: tuple, x: tuple, c: tuple) -> tuple:
-            limits, goal = task.limits(x, c), task.goal(x, c)
-            violated, reached = -1.0, 1.0
-            for i in reversed(range(len(limits))):
-                violated = ops.where(limits[i] >= 0, violated, float(i))
-            for excess in goal:
-                reached = ops.where(excess <= 0, reached, 0.0)
-            judged = (task.cost(before, u, c), dynamics.tilt(x), violated, reached)
-            return (*judged, *task.observe(x, c), *limits, *goal)
+        def compute(before: tuple, u: tuple, x: tuple, step: tuple, c: tuple) -> tuple:
+            steps, kept = step
+            did = outcome(task, before, u, x, c, steps, (kept,))
+            finite = (*task.limits(x, c), *task.goal(x, c))  # an outcome does not tell
+            return (*did, dynamics.tilt(x), *task.observe(x, c), *finite)
 
-        return _code(task, compute, (8, 2, 8, len(task.constant_names)), False, start)
+        return _code(task, compute, (8, 2, 8, 2, len(task.constant_names)), False, start)
 
     def set_constants(self, c: State) -> None:
         """Makes c the constants of the episode."""
-        self._numbers[self._first + 18 :] = c
+        self._numbers[self._first + 20 :] = c
 
-    def judge(self, before: State, force: tuple[float, float], x: State) -> "Judgement | None":
-        """What a force, N, costs that led from one state to the state x, and what x is; None where Python must compute it."""
-        _STEP.pack_into(self._bytes, 8 * self._first, *before, *force, *x)
+    def judge(self, before: State, force: tuple[float, float], x: State, steps: int, kept: float) -> "Judgement | None":
+        """What a force, N, did that led from one state to the state x; None where Python must compute it.
+
+        Args:
+            before: (8,) state.
+            force: (2,), N.
+            x: (8,) state after the step.
+            steps: of the episode, this one included.
+            kept: ≥ 0 if the ball keeps its grip.
+        """
+        _STEP.pack_into(self._bytes, 8 * self._first, *before, *force, *x, steps, kept)
         self._call(self._at)
-        check, rate, tilt, violated, reached = _JUDGED.unpack_from(self._bytes)
+        check, *did, tilt = _JUDGED.unpack_from(self._bytes)
         if check != 0:
             return None
         arrays = self._seen.astype(np.float32), self._x.copy(), self._force.copy()
-        return rate, tilt, self._names[int(violated)], reached != 0, arrays
+        return Outcome(*did), tilt, arrays
 
 
 _codes: dict[Any, Code | None] = {}

@@ -14,6 +14,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.rollout import Controller
 from ballbot_gym.simulator import State, make_simulator
+from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.tunable import Tunable
 
@@ -166,19 +167,19 @@ class Runner:
         """
         task, dt = self._task, self._task.control_dt
         self.force = self._disturbance.actuate(command)
-        self.cost += task.cost(self.x, self.force, c) * dt
         total = (self.force[0] + push[0], self.force[1] + push[1])
-        slips = self._slips(total)
+        kept = -1.0 if self._slips(total) else 0.0
         x = self._simulator.step(total)
-        self.violated = task.violated(x, c) or (GRIP if slips else "")
-        if not all(map(math.isfinite, x)):
-            x = self.x
-        self.arrived = task.first_exit and not self.violated and task.is_goal(x, c)
-        self.x = x
-        sample = Sample((step + 1) * dt, dynamics.tilt(x), math.hypot(*self.force), self.cost, self._act_seconds)
+        did = outcome(task, self.x, self.force, x, c, step + 1, (kept,))
+        self.cost += did.running
+        self.violated = (*task.limit_names, GRIP, "")[int(did.violated)]
+        self.arrived = task.first_exit and did.success > 0
+        if all(map(math.isfinite, x)):
+            self.x = x
+        sample = Sample((step + 1) * dt, dynamics.tilt(self.x), math.hypot(*self.force), self.cost, self._act_seconds)
         self.samples.append(sample)
-        self.trace.append((x[0], x[1]))
-        self._states.append(x)
+        self.trace.append((self.x[0], self.x[1]))
+        self._states.append(self.x)
         self._forces.append(self.force)
         if self.violated:
             self.cost += task.survival_reward * seconds_left

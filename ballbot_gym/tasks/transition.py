@@ -1,0 +1,75 @@
+"""What a control step costs, pays and ends: the one place that says so, for an env, for batches and for generated code.
+
+It computes with `ops`, so with floats, torch, CasADi and `traced` alike. Truth values are the numbers 1 and 0, because only
+these are the same everywhere.
+"""
+
+from typing import Any, NamedTuple
+
+from ballbot_gym import ops
+from ballbot_gym.ops import Vector
+from ballbot_gym.tasks.base import Task
+
+
+class Outcome(NamedTuple):
+    """What one control step did."""
+
+    cost: Any
+    """The running cost, and for a failure the price of the time that remains."""
+    running: Any
+    """The running cost alone."""
+    goal: Any
+    """Pay for the time that remains, where the goal ends the episode. The reward is survive − running + goal, with survive =
+    survival_reward · control_dt."""
+    terminated: Any
+    truncated: Any
+    success: Any
+    failure: Any
+    violated: Any
+    """Index of the first limit that is violated, of `limit_names`; −1 for none."""
+
+
+def outcome(
+    task: Task, before: Vector, force: Vector, end: Vector, c: Vector, steps: Any, grip: tuple[Any, ...] = ()
+) -> Outcome:
+    """What a control step did.
+
+    Args:
+        task: the task.
+        before: (8,) state in which the step began.
+        force: (2,) force that was held, N.
+        end: (8,) state after it.
+        c: (nc,) constants of the episode.
+        steps: control steps of the episode, this one included.
+        grip: further limits, ≥ 0 where they hold: what keeps a ball's grip.
+    """
+    running = task.cost(before, force, c) * task.control_dt
+    violated = first_violated((*task.limits(end, c), *grip))
+    failure, last = violated >= 0, steps >= task.steps
+    reached = ops.full_like(violated, 1.0)
+    for excess in task.goal(end, c):
+        reached = ops.where(excess <= 0, reached, 0.0)
+    success = ops.where(failure, 0.0, reached)
+    if not task.first_exit:
+        success = ops.where(last, success, 0.0)
+    failed = ops.where(failure, ops.full_like(violated, 1.0), 0.0)
+    terminated = failed + success if task.first_exit else failed
+    ahead = task.survival_reward * task.control_dt * (task.steps - steps)  # pay for the time that remains
+    return Outcome(
+        cost=running + ops.where(failure, ahead, 0.0),
+        running=running,
+        goal=ops.where(success > 0, ahead, 0.0) if task.first_exit else 0.0,
+        terminated=terminated,
+        truncated=ops.where(last, 1.0 - terminated, 0.0),
+        success=success,
+        failure=failed,
+        violated=violated,
+    )
+
+
+def first_violated(limits: tuple[Any, ...]) -> Any:
+    """Index of the first limit that is not ≥ 0, so of NaN too; −1 where all are."""
+    violated = ops.full_like(limits[0], -1.0)
+    for i in reversed(range(len(limits))):
+        violated = ops.where(limits[i] >= 0, violated, float(i))
+    return violated
