@@ -10,6 +10,7 @@ Short import paths that stay where they are; each imports what it needs when it 
 | `shipped_policies` | the policies that come with the package: `ballbot_train.policy_files.shipped_policies` |
 | `save_vecnormalize` | statistics of VecNormalize beside a saved model: `ballbot_train.saved_models.save_vecnormalize` |
 | `BallbotVecEnv` | batched environments for Stable-Baselines3: `ballbot_train.learning.sb3.BallbotVecEnv` |
+| `RegretCallback` | the regret of an SB3 model while it trains: `ballbot_train.learning.callbacks.RegretCallback` |
 """
 
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ballbot_train.evaluation.evaluate import evaluate
     from ballbot_train.evaluation.fresh import evaluate_fresh
+    from ballbot_train.learning.callbacks import RegretCallback
     from ballbot_train.learning.sb3 import BallbotVecEnv
     from ballbot_train.policy import load_policy
     from ballbot_train.policy_files import shipped_policies
@@ -29,9 +31,18 @@ _LAZY = {
     "save_vecnormalize": "ballbot_train.saved_models:save_vecnormalize",
     "shipped_policies": "ballbot_train.policy_files:shipped_policies",
     "BallbotVecEnv": "ballbot_train.learning.sb3:BallbotVecEnv",
+    "RegretCallback": "ballbot_train.learning.callbacks:RegretCallback",
 }
 
-__all__ = ["BallbotVecEnv", "evaluate", "evaluate_fresh", "load_policy", "save_vecnormalize", "shipped_policies"]
+__all__ = [
+    "BallbotVecEnv",
+    "RegretCallback",
+    "evaluate",
+    "evaluate_fresh",
+    "load_policy",
+    "save_vecnormalize",
+    "shipped_policies",
+]
 
 
 def __getattr__(name: str) -> Any:

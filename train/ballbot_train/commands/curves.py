@@ -10,8 +10,8 @@ def curves(runs: tuple[Path, ...], /, metric: str = "regret", out: Path = Path("
 
     Args:
         runs: folders of `ballbot train`, or folders of such folders, as `ballbot train --seeds` makes them.
-        metric: regret, in which an episode without success counts as failing at once; regret_mean or regret_median of what
-            did not fail; success; failures; validation_cost; or validation_mean_cost.
+        metric: regret, in which an episode without success counts as failing at once; regret_mean, regret_median or
+            regret_worst of what did not fail; success; failures; validation_cost; or validation_mean_cost.
         out: folder of curves.png, of curves.csv with every point, and of curves.md with where each curve ends.
     """
     from ballbot_train.report import curves as report  # it imports matplotlib

@@ -23,7 +23,7 @@ A run is a folder:
 |---|---|
 | iteration, seconds | of training; seconds without evaluations |
 | env_steps, cpu_seconds | control steps of all envs, where the learner counts them; CPU time without evaluations |
-| cost_ratio, regret_mean, regret_median, success, failures | on the certified episodes, the test set; see `Score` |
+| cost_ratio, regret_mean, _median and _worst, success, failures | on the certified episodes, the test set; see `Score` |
 | validation_cost, validation_success, validation_failures, validation_mean_cost | on the validation set; see `Validation` |
 
 The best policy is that of the least validation_cost, and of the least validation_mean_cost among equals.
@@ -34,7 +34,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -61,6 +61,10 @@ _CONFIG = "config.json"
 _VALIDATION_SEED = 0
 _CHECKPOINT_LIMIT = 2**34  # bytes
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
+
+
+Policy = Callable[[torch.Tensor], torch.Tensor]
+"""From observations (B, no) to actions (B, 2)."""
 
 
 class Learner(Protocol):
@@ -132,16 +136,18 @@ class Score:
     """Mean of cost / optimum − 1 over the episodes that did not fail."""
     regret_median: float
     """Median of the same."""
+    regret_worst: float
+    """Worst of the same."""
     success: float
     """Share of the episodes that ended in success."""
     failures: int
     """Number of episodes that failed."""
 
 
-def score(network: PolicyNetwork, task: Task, robot: str = PAPER) -> Score:
+def score(policy: Policy, task: Task, robot: str = PAPER) -> Score:
     """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
     episodes = certified.load(task, robot)
-    (run,) = _runs(network, task, robot, (episodes.states, episodes.constants))
+    (run,) = _runs(policy, task, robot, (episodes.states, episodes.constants))
     return _score(run, task, episodes.costs)
 
 
@@ -154,6 +160,7 @@ def _score(run: BatchEpisodes, task: Task, optima: np.ndarray) -> Score:
         cost_ratio=float(priced.mean()),
         regret_mean=float(standing.mean()) if standing.size else math.nan,
         regret_median=float(np.median(standing)) if standing.size else math.nan,
+        regret_worst=float(standing.max()) if standing.size else math.nan,
         success=float(run.success.double().mean()),
         failures=int(run.failure.sum()),
     )
@@ -182,19 +189,19 @@ _COLUMNS = (
 """Of evaluations.csv."""
 
 
-def validate(network: PolicyNetwork, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES) -> Validation:
+def validate(policy: Policy, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES) -> Validation:
     """Measures a policy on the validation set, which shares no episode with the certified ones nor with `evaluate_fresh`."""
-    (run,) = _runs(network, task, robot, _validation_set(task, robot, episodes))
+    (run,) = _runs(policy, task, robot, _validation_set(task, robot, episodes))
     return _validation(run, task)
 
 
 def score_and_validate(
-    network: PolicyNetwork, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES
+    policy: Policy, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES
 ) -> tuple[Score, Validation]:
     """`score` and `validate` in one batch, in half the time."""
     known = certified.load(task, robot)
     sets = (known.states, known.constants), _validation_set(task, robot, episodes)
-    scored, validated = _runs(network, task, robot, *sets)
+    scored, validated = _runs(policy, task, robot, *sets)
     return _score(scored, task, known.costs), _validation(validated, task)
 
 
@@ -203,13 +210,11 @@ def _validation_set(task: Task, robot: str, episodes: int) -> tuple[np.ndarray, 
     return fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot)
 
 
-def _runs(
-    network: PolicyNetwork, task: Task, robot: str, *sets: tuple[np.ndarray, np.ndarray]
-) -> tuple[BatchEpisodes, ...]:
+def _runs(policy: Policy, task: Task, robot: str, *sets: tuple[np.ndarray, np.ndarray]) -> tuple[BatchEpisodes, ...]:
     """Runs all episodes of some sets of states (B, 8) and constants (B, nc) in one batch."""
     states, constants = map(np.concatenate, zip(*sets, strict=True))
     batch = BallbotBatch(task, len(states), compile=False, robot=robot)
-    run = run_episodes(batch, network, states, constants)
+    run = run_episodes(batch, policy, states, constants)
     lengths = [len(x) for x, _ in sets]
     columns = [part.split(lengths) for part in run if part is not None]  # all but the states
     return tuple(BatchEpisodes(*parts, states=None) for parts in zip(*columns, strict=True))

@@ -25,6 +25,7 @@ METRICS = {
     "regret": "mean regret, no success as failing at once",
     "regret_mean": "mean regret of what did not fail",
     "regret_median": "median regret of what did not fail",
+    "regret_worst": "worst regret of what did not fail",
     "success": "success",
     "failures": "failures of 200",
     "validation_cost": "validation cost",
@@ -36,7 +37,7 @@ AXES = {"env_steps": "env steps", "minutes": "minutes of one core"}
 """What it is drawn against."""
 
 _HIGHER_IS_BETTER = {"success"}
-_LOGARITHMIC = {"regret", "regret_mean", "regret_median"}
+_LOGARITHMIC = {"regret", "regret_mean", "regret_median", "regret_worst"}
 _POINTS = 100  # of a curve
 _RESAMPLES = 2000
 
