@@ -31,7 +31,7 @@ LANES = 16
 FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The flags of a step, in the order in which the C code writes them."""
 
-_Part = tuple[str, Sequence[Any]]
+Part = tuple[str, Sequence[Any]]
 """A pointer's name in C, and the symbols that are read from its rows, or the expressions that are written to them."""
 
 _C = {
@@ -88,12 +88,12 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
     z = _symbols("z", task.constant_draws), _symbols("y", task.state_draws)
     action, taken = _symbols("a", 2), _symbols("t", 1)
     blocks = [
-        _block(
+        block(
             "advance", (("x", x), ("c", c), ("a", action), ("t", taken)), _advance(task, params, x, c, action, taken[0])
         ),
-        _block("look", (("x", x), ("c", c)), (("seen", task.observe(x, c)), ("tilt", (_tilt(x),)))),
-        _block("draw_constants", (("z", z[0]),), (("c", task.draw_constants(z[0], params)),)),
-        _block("draw_state", (("z", z[1]), ("c", c)), (("x", task.draw_state(z[1], c, params)),)),
+        block("look", (("x", x), ("c", c)), (("seen", task.observe(x, c)), ("tilt", (_tilt(x),)))),
+        block("draw_constants", (("z", z[0]),), (("c", task.draw_constants(z[0], params)),)),
+        block("draw_state", (("z", z[1]), ("c", c)), (("x", task.draw_state(z[1], c, params)),)),
     ]
     sizes = {
         "DOUBLE": int(double),
@@ -108,7 +108,7 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
         "DRAWS": task.constant_draws + task.state_draws,
     }
     defined = [f"#define {name} {value}" for name, value in sizes.items()]
-    return "\n".join([*defined, _text("real.h"), _text("native.c"), *blocks])
+    return "\n".join([*defined, text("real.h"), text("native.c"), *blocks])
 
 
 def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
@@ -121,13 +121,13 @@ def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
     Raises:
         NotImplementedError: a function has an operation that is not known here.
     """
-    parts = [f"#define DOUBLE 1\n#define LANES {lanes}", _text("real.h"), "typedef long long casadi_int;"]
+    parts = [f"#define DOUBLE 1\n#define LANES {lanes}", text("real.h"), "typedef long long casadi_int;"]
     for function in functions:
         name = function.name()
         symbols = [casadi.SX.sym(f"in{i}", function.size1_in(i)) for i in range(function.n_in())]
         inputs = [(f"in{i}", casadi.vertsplit(part)) for i, part in enumerate(symbols)]
         outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
-        parts.append(_block(f"{name}_lanes", inputs, outputs))
+        parts.append(block(f"{name}_lanes", inputs, outputs))
         body = []
         for i, (pointer, rows) in enumerate(inputs):
             body.append(f"real {pointer}[{max(len(rows), 1)} * LANES]; gather({len(rows)}, arg[{i}], {pointer});")
@@ -165,7 +165,8 @@ static void scatter(int rows, const real *in, double *columns) {
 """CasADi's matrices have a column per stage, and blocks a row per variable. A null pointer is a 0, or not wanted."""
 
 
-def _text(name: str) -> str:
+def text(name: str) -> str:
+    """A file of C code that lies beside this one."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
@@ -203,7 +204,7 @@ def _symbols(name: str, count: int) -> tuple[Any, ...]:
     return tuple(casadi.SX.sym(f"{name}{i}") for i in range(count))
 
 
-def _block(name: str, inputs: Sequence[_Part], outputs: Sequence[_Part]) -> str:
+def block(name: str, inputs: Sequence[Part], outputs: Sequence[Part]) -> str:
     """A C function that computes expressions for `LANES` robots.
 
     Row i of every pointer p is at p + i * sp, so that rows may be those of a whole batch or of a block alone.

@@ -1,6 +1,8 @@
 """Optima of many episodes at once agree with those found one by one, and say where they are none."""
 
+import math
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -9,34 +11,62 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import batched
 from ballbot_baselines.optimum import find_optimum
-from ballbot_gym import certified, dynamics
-from ballbot_gym.robots import named_robot
+from ballbot_gym import dynamics, machine_code, ops
 from ballbot_gym.tasks import TASKS
+from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 
 COUNT = 24
 NO_CONSTANTS = np.zeros(0)
+FALLEN = np.array([0, 0, 1.3, 0, 0, 0, 5.0, 0])
+
+
+class Eight(Orbit):
+    """A task of a user: a figure eight, with no line of code for its optima."""
+
+    id = "BallbotEight-v0"
+
+    def cost(self, x, u, c):
+        px, py, *_ = ops.components(x)
+        return super().cost(x, u, c) + 0.5 * (px * py) * (px * py)
+
+
+TASK_KINDS = (*TASKS.values(), Eight)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Fresh episodes of a task, with their optima found at once and one by one."""
+
+    task: object
+    c: np.ndarray
+    optima: batched.BatchOptima
+    costs: np.ndarray
+
+
+@pytest.fixture(scope="module", params=TASK_KINDS, ids=lambda kind: kind.__name__)
+def drawn(request, params):
+    task, rng = request.param(), np.random.default_rng(3)
+    x0, c = (np.array(part) for part in zip(*(task.sample(rng, params) for _ in range(COUNT)), strict=True))
+    found = [find_optimum(task, params, x, constants) for x, constants in zip(x0, c, strict=True)]
+    costs = np.array([optimum.cost if optimum.is_optimal else math.nan for optimum in found])
+    return Drawn(task, c, batched.find_optima(task, params, x0, c), costs)
 
 
 @pytest.fixture(scope="module")
-def episodes():
-    return certified.load("stabilize", "paper")
+def optima(params):
+    """Of Stabilize; the last robot has fallen."""
+    rng = np.random.default_rng(3)
+    x0 = np.array([*(Stabilize().sample(rng, params)[0] for _ in range(COUNT)), FALLEN])
+    return batched.find_optima(Stabilize(), params, x0, np.zeros((COUNT + 1, 0)))
 
 
-@pytest.fixture(scope="module")
-def optima(episodes, params):
-    """Of certified episodes; the last robot has fallen."""
-    fallen = np.zeros(8)
-    fallen[2], fallen[6] = 1.3, 5.0
-    return batched.find_optima(Stabilize(), params, np.vstack([episodes.states[:COUNT], fallen]))
-
-
-def followed(params, x0, feedback):
+def followed(task, params, x0, c, steps, feedback):
     """Cost of an episode from x0 (8,) under feedback(k, x), in the closed form, and its states."""
-    task, x, cost, states = Stabilize(), x0, 0.0, [x0]
-    for k in range(task.steps):
+    x, cost, states = x0, 0.0, [x0]
+    for k in range(steps):
         u = np.clip(feedback(k, x), -params.force_limit, params.force_limit)
-        cost += task.control_dt * task.cost(x, u, NO_CONSTANTS)
+        cost += task.control_dt * task.cost(x, u, c)
         x = dynamics.step(params, x, u, task.control_dt, dynamics.substeps_for(task.control_dt))
         states.append(x)
     return cost, np.array(states)
@@ -46,26 +76,31 @@ def tracking(optima, i):
     return lambda k, x: optima.forces[i, k] - optima.gains[i, k] @ (x - optima.states[i, k])
 
 
-def test_costs_are_those_of_certified_optima_to_1e_4(optima, episodes):
-    assert optima.solved[:COUNT].mean() > 0.9
-    excess = (optima.costs[:COUNT] / episodes.costs[:COUNT])[optima.solved[:COUNT]] - 1
-    assert excess.min() > -1e-8
-    assert np.sort(excess)[-2] < 1e-4
-    assert excess.max() < 0.02  # one of these starts leads to another local optimum
+def test_they_cost_what_optima_one_by_one_cost_or_less(drawn):
+    assert drawn.optima.solved.mean() > 0.95
+    excess = (drawn.optima.costs / drawn.costs - 1)[drawn.optima.solved & np.isfinite(drawn.costs)]
+    assert (excess < 1e-4).mean() > 0.9  # the others are other local optima
+    assert excess.max() < 0.1
 
 
-def test_an_optimum_is_an_episode_of_the_closed_form(optima, params):
-    i = int(np.argmax(optima.solved))
-    assert np.abs(optima.forces[i]).max() <= params.force_limit
-    cost, states = followed(params, optima.states[i, 0], tracking(optima, i))
-    assert cost == pytest.approx(optima.costs[i], rel=1e-9)
-    np.testing.assert_allclose(states, optima.states[i], atol=1e-9)
+def test_they_are_episodes_of_the_closed_form_that_obey_every_constraint(drawn, params):
+    task, optima = drawn.task, drawn.optima
+    for i in np.flatnonzero(optima.solved)[:6]:
+        steps, c = optima.steps[i], drawn.c[i]
+        assert np.abs(optima.forces[i]).max() <= params.force_limit
+        cost, states = followed(task, params, optima.states[i, 0], c, steps, tracking(optima, i))
+        assert cost == pytest.approx(optima.costs[i], rel=1e-9)
+        np.testing.assert_allclose(states, optima.states[i, : steps + 1], atol=1e-8)
+        assert all(task.is_safe(tuple(x), tuple(c)) for x in states[:-1])
+        if task.first_exit:
+            assert task.is_goal(tuple(states[-1]), tuple(c))
+            assert not any(task.is_goal(tuple(x), tuple(c)) for x in states[:-1])
 
 
 def test_the_feedback_is_optimal_nearby(optima, params, rng):
     i = int(np.argmax(optima.solved))
     x0 = optima.states[i, 0] + rng.normal(scale=0.03, size=8)
-    cost, _ = followed(params, x0, tracking(optima, i))
+    cost, _ = followed(Stabilize(), params, x0, NO_CONSTANTS, Stabilize().steps, tracking(optima, i))
     assert cost < 1.01 * find_optimum(Stabilize(), params, x0, NO_CONSTANTS).cost
 
 
@@ -82,56 +117,66 @@ def test_slopes_are_those_of_the_cost_in_the_initial_state(optima, params):
         )
 
 
-def test_what_falls_is_not_solved(optima):
+def test_what_falls_is_not_solved(optima, params):
     assert not optima.solved[COUNT]
     assert np.isnan(optima.costs[COUNT])
+    found = list(batched.optimal_costs(Stabilize(), params, np.array([optima.states[0, 0], FALLEN]), np.zeros((2, 0))))
+    assert found[0] == optima.costs[0]
+    assert "no feasible episode" in str(found[1])
 
 
-def test_starting_at_the_optimum_takes_one_iteration(optima, params):
+def test_starting_at_the_optimum_takes_no_more_iterations(optima, params):
     i = np.flatnonzero(optima.solved)[:3]
-    again = batched.find_optima(Stabilize(), params, optima.states[i, 0], forces=optima.forces[i])
-    assert again.iterations.max() <= 2
-    np.testing.assert_allclose(again.costs, optima.costs[i], rtol=1e-4)
+    again = batched.find_optima(Stabilize(), params, optima.states[i, 0], np.zeros((3, 0)), forces=optima.forces[i])
+    assert (again.iterations <= optima.iterations[i]).all()
+    np.testing.assert_allclose(again.costs, optima.costs[i], rtol=1e-6)
 
 
-def test_it_says_which_tasks_and_robots_it_solves(params):
-    assert {name for name, kind in TASKS.items() if batched.solves(kind(), params)} == {"stabilize"}
-    assert not batched.solves(Stabilize(), named_robot("rolling"))
-    with pytest.raises(
-        ValueError, match=r"BallbotOrbit-v0 with this robot is not solved in batches; take find_optimum"
-    ):
-        batched.find_optima(TASKS["orbit"](), params, np.zeros((1, 8)))
+def test_without_a_compiler_optima_are_found_one_by_one(monkeypatch, params):
+    task, (x0, c) = Stabilize(max_tilt=1.3), Stabilize().sample(np.random.default_rng(1), params)
+
+    def missing(*arguments):
+        raise machine_code.NoMachineCodeError
+
+    monkeypatch.setattr(machine_code, "library", missing)
+    assert not batched.solves(task, params)
+    (cost,) = batched.optimal_costs(task, params, x0[None], c[None])
+    assert cost == pytest.approx(find_optimum(Stabilize(), params, x0, c).cost, rel=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("x0", "forces", "message"),
+    ("x0", "c", "forces", "message"),
     [
-        (np.zeros(8), None, r"x0 must have the shape \(B, 8\), not \(8,\)"),
+        (np.zeros(8), np.zeros((1, 0)), None, r"x0 must have the shape \(B, 8\), not \(8,\)"),
+        (np.zeros((2, 8)), np.zeros((1, 0)), None, r"c must have the shape \(2, 0\), not \(1, 0\)"),
         (
             np.zeros((2, 8)),
+            np.zeros((2, 0)),
             np.zeros((2, 10, 2)),
-            r"forces must have the shape \(2, at least 150, 2\), not \(2, 10, 2\)",
+            r"forces must have the shape \(2, at least 400, 2\), not \(2, 10, 2\)",
         ),
     ],
 )
-def test_wrong_shapes_are_refused(x0, forces, message, params):
+def test_wrong_shapes_are_refused(x0, c, forces, message, params):
     with pytest.raises(ValueError, match=message):
-        batched.find_optima(Stabilize(), params, x0, forces)
+        batched.find_optima(Stabilize(), params, x0, c, forces)
 
 
 def test_no_episodes_are_no_error(params):
-    assert batched.find_optima(Stabilize(), params, np.zeros((0, 8))).costs.shape == (0,)
+    assert batched.find_optima(Stabilize(), params, np.zeros((0, 8)), np.zeros((0, 0))).costs.shape == (0,)
 
 
-def test_an_optimum_does_not_depend_on_the_others(optima, params):
+def test_an_optimum_does_not_depend_on_the_others(drawn, params):
     some = [20, 3, 15, 7, 11]
-    found = batched.find_optima(Stabilize(), params, optima.states[some, 0])
-    for name in ("costs", "states", "forces", "gains", "slopes", "iterations"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(optima, name)[some], err_msg=name)
+    found = batched.find_optima(drawn.task, params, drawn.optima.states[some, 0], drawn.c[some])
+    for name in ("costs", "steps", "states", "forces", "gains", "slopes", "iterations"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(drawn.optima, name)[some], err_msg=name)
 
 
 def test_threads_do_not_disturb_each_other(optima, params):
     starts = [optima.states[i : i + 4, 0] for i in (0, 4)]
     with ThreadPoolExecutor(2) as threads:
-        found = list(threads.map(lambda x0: batched.find_optima(Stabilize(), params, x0).costs, starts))
+        found = list(
+            threads.map(lambda x0: batched.find_optima(Stabilize(), params, x0, np.zeros((4, 0))).costs, starts)
+        )
     np.testing.assert_array_equal(np.concatenate(found), optima.costs[:8])

@@ -200,7 +200,8 @@ def test_a_share_of_the_beginnings_is_what_costs_the_learner_most():
     assert len(learner._beginnings(16, np.random.default_rng(0))[0]) == 16
 
 
-def test_optima_at_once_are_refused_where_they_cannot_be_found():
+def test_optima_at_once_are_refused_where_they_cannot_be_found(monkeypatch):
+    monkeypatch.setattr(dagger.batched, "solves", lambda task, params: False)
     with pytest.raises(ValueError, match=r"optima of BallbotTurn-v0 with this robot .* give --batch-episodes 0"):
         dagger.Dagger(make_task("turn"), default_params(), replace(TINY_DAGGER, batch_episodes=2))
 

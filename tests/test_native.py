@@ -302,7 +302,7 @@ def test_without_a_compiler_envs_run_in_python_or_torch(monkeypatch, caplog):
 def test_an_operation_that_is_not_known_as_c_is_refused():
     x = casadi.SX.sym("x")
     with pytest.raises(NotImplementedError, match="not known as C"):
-        codegen._block("odd", [("x", [x])], [("y", [casadi.erf(x)])])
+        codegen.block("odd", [("x", [x])], [("y", [casadi.erf(x)])])
 
 
 @needs_compiler
@@ -320,7 +320,7 @@ def test_every_operation_that_is_known_as_c_does_what_casadis_does(tmp_path, mon
         casadi.logic_or(less, same), casadi.logic_and(a, b), casadi.if_else(less, a, b), casadi.if_else(a, b, 3.0),
         casadi.if_else(less, a, np.inf), casadi.if_else(same, -np.inf, casadi.if_else(less, 1.0, 0.0)),
     ]  # fmt: skip
-    block = codegen._block("every", [("a", [a]), ("b", [b])], [("y", values)])
+    block = codegen.block("every", [("a", [a]), ("b", [b])], [("y", values)])
     head = f"#define LANES {codegen.LANES}\n#include <math.h>\n#include <stdint.h>\ntypedef double real;\n"
     head += "".join(
         f"#define real_{name} {name}\n" for name in ("sqrt", "fabs", "sin", "cos", "tan", "atan", "acos", "exp", "log")

@@ -1,66 +1,74 @@
-"""Optima of thousands of episodes, by iLQR with force limits in compiled code, for tasks that end at rest without obstacles.
+"""Optima of thousands of episodes of any task at once, by `ilqr.py`.
 
-Every episode starts from its cheapest simulated recovery (`righting.steering`). Each iteration first sweeps backwards with
-the box-constrained Riccati recursion of Tassa et al., "Control-limited differential dynamic programming" (2014). Then it
-simulates the new feedback, with shorter steps where the cost rises. Sweep and simulation are one call of compiled code each,
-which takes a fraction of a millisecond.
+The search is that of `search.py`, for all episodes together:
 
-Only the first seconds of an episode are optimized. LQR's cost-to-go stands for the rest, where the robot is nearly at rest.
-The returned cost is that of the whole episode, simulated in the closed form under these forces and then LQR's. So it is never
-below the optimum.
+- Tasks that end at rest without obstacles start from the cheapest simulated recovery (`righting.steering`).
+- Slaloms are first solved without their obstacles and with forces held longer. That predicts what every choice of sides costs
+  (`sides.py`), and the likely ones are compared, with forces held longer too.
+- First-exit tasks are first solved along each guessed path with a free length of the steps, then for whole numbers of control
+  steps near the best arrivals.
+- All others are solved along their guessed paths.
 
-Margins are not part of the optimization. Episodes that violate one, or that no recovery survives, are not solved.
-`benchmarks/batched_optima.py` measures it on Stabilize.
+What remains unsolved is left to `find_optimum`. `benchmarks/batched_optima.py` compares both.
 """
 
-import functools
 import itertools
-import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 
-import casadi
 import numpy as np
 
-from ballbot_baselines import righting
-from ballbot_baselines.compiled import LANES, InPlace, in_lanes
-from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
-from ballbot_gym import dynamics, ops
+from ballbot_baselines import guess, righting, search
+from ballbot_baselines.ilqr import MARGIN, Options, Solutions, ilqr
+from ballbot_baselines.optimum import find_optimum
+from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, shooting_parameters
+from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-_SECONDS = 3.0  # optimized; LQR's cost-to-go counts for the rest
 # of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s
 _FAMILY = tuple(itertools.product((7.0, 14.0), (1.0, 1.4), (0.0,), (1.0,)))
 _SIDEWAYS_FAMILY = tuple(itertools.product((7.0, 10.0, 14.0), (1.0, 1.8), (-0.6, -0.3, 0.3, 0.6), (0.3,)))
-_MOST_ITERATIONS = 15
-_SHORTER_STEPS = (0.5, 0.2, 0.05, 0.01)  # shares of a step that are tried in turn where the whole step raises the cost
-_TOLERANCE = 1e-5  # relative: an iteration that promises to lower the cost by less is the last
-_SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
-_FORCE_BACKOFF = 1e-7  # of the force limit, as in `shooting.Backoff`
-_AT_ONCE = 256  # episodes in memory between iterations
-_NO_GAINS, _NO_STATES, _NO_FORCES = np.zeros((1, 1, 16)), np.zeros((1, 1, 8)), np.zeros((1, 1, 2))
-
-_one_at_a_time = threading.Lock()  # a task's compiled functions read and write the same arrays in every call
+# Tries in turn from guesses that are motions, and from those that are none. Small multipliers suit limits that are far away.
+_MOTION = tuple(Options(bends=0, width=width, multiplier=1e-3) for width in (0.2, 0.02))
+_PATH = tuple(Options(bends=bends, width=width, multiplier=1e-2) for bends, width in ((3, 0.2), (6, 0.2), (1, 0.05)))
+_GOAL = tuple(replace(options, multiplier=0.1) for options in _PATH)
+_ROUGH_PATH, _ROUGH_GOAL = (
+    tuple(replace(options, tolerance=1e-4, violation=1e-3) for options in tries) for tries in (_PATH, _GOAL)
+)
+# Greater multipliers and narrow prices at first keep a motion on its side of the obstacles.
+_SIDES = tuple(
+    Options(bends=bends, width=width, multiplier=multiplier, tolerance=1e-4, violation=1e-3)
+    for bends, width, multiplier in ((6, 0.02, 10.0), (3, 0.05, 1.0), (3, 0.2, 0.1))
+)
+_ROUGH_SOLUTION = tuple(Options(bends=bends, width=0.02, multiplier=1.0) for bends in (1, 0, 3))
+_SIDES_DOUBT = 0.005  # relative: how differently the coarse grid and rough solutions may order choices of sides
+_SAME = 0.02  # m: rough solutions that are nowhere farther apart are the same
+_AT_ONCE = 256  # episodes in memory
+_GUESSES = 5  # as of `find_optimum`
 
 
 @dataclass(frozen=True)
 class BatchOptima:
-    """Optima of B episodes of n control steps.
+    """Optima of B episodes of at most n control steps.
 
     | field | shape | meaning |
     |---|---|---|
     | costs | (B,) | NaN where not solved |
-    | solved | (B,) bool | it converged, and no margin is violated |
-    | states | (B, n+1, 8) | |
+    | solved | (B,) bool | it converged, and obeys every constraint |
+    | steps | (B,) | control steps, fewer than n where a goal is reached |
+    | states | (B, n+1, 8) | after its end an episode's last state is repeated |
     | forces | (B, n, 2) | N |
     | gains | (B, n, 2, 8) | K of the feedback u − K (x' − x) about the optimum, N per unit of the state |
     | slopes | (B, n, 8) | of the remaining cost with respect to each state but the last |
-    | iterations | (B,) | |
+    | iterations | (B,) | of the last search |
     """
 
     costs: np.ndarray
     solved: np.ndarray
+    steps: np.ndarray
     states: np.ndarray
     forces: np.ndarray
     gains: np.ndarray
@@ -69,354 +77,326 @@ class BatchOptima:
 
 
 def solves(task: Task, params: BallbotParams) -> bool:
-    """Whether `find_optima` solves this task: it comes to rest in an equilibrium, and only tilt and arena limit it."""
-    if task.first_exit or params.grips:
+    """Whether `find_optima` can solve this task here: C code can be compiled, and has all operations of the task."""
+    try:
+        ilqr(task, params)
+    except (machine_code.NoMachineCodeError, NotImplementedError):
         return False
-    x, c = task.sample(np.random.default_rng(0), params)
-    reference = task.reference(x, c, params)
-    free = len(task.margins(tuple(x), tuple(c))) == len(Task.margins(task, tuple(x), tuple(c)))
-    return free and not len(c) and len(reference.x) == 1 and is_equilibrium(params, reference.x[0], reference.u[0])
+    return True
 
 
-def find_optima(task: Task, params: BallbotParams, x0: np.ndarray, forces: np.ndarray | None = None) -> BatchOptima:
+def find_optima(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, forces: np.ndarray | None = None
+) -> BatchOptima:
     """Optimizes B episodes on one core.
 
     Args:
         task: one that `solves` admits.
+        params: the robot.
         x0: (B, 8) initial states.
-        forces: (B, k, 2) N, of episodes to start from where they are cheaper than the simulated recoveries, as those of a
-            policy; k at least `optimized_steps(task)`.
+        c: (B, nc) constants.
+        forces: (B, at least n, 2) N, of episodes to start from where they are cheaper than the simulated recoveries, as those
+            of a policy; for tasks that end at rest without obstacles.
 
     Raises:
-        ValueError: the task is none that it solves, or an array has the wrong shape.
+        ValueError: an array has the wrong shape.
+        machine_code.NoMachineCodeError, NotImplementedError: the task is none that `solves` admits.
     """
-    if not solves(task, params):
-        raise ValueError(f"{task.id} with this robot is not solved in batches; take find_optimum")
-    x0 = np.asarray(x0, np.float64)
+    x0, c = np.asarray(x0, np.float64), np.asarray(c, np.float64)
     if x0.ndim != 2 or x0.shape[1] != 8:
         raise ValueError(f"x0 must have the shape (B, 8), not {x0.shape}")
-    steps, count = optimized_steps(task), len(x0)
-    if forces is not None and (forces.shape[::2] != (count, 2) or forces.shape[1] < steps):
-        raise ValueError(f"forces must have the shape ({count}, at least {steps}, 2), not {forces.shape}")
-    solver = _solver(task, params)
-    n = task.steps
+    count, n, nc = len(x0), task.steps, len(task.constant_names)
+    if c.shape != (count, nc):
+        raise ValueError(f"c must have the shape ({count}, {nc}), not {c.shape}")
+    if forces is not None and (forces.shape[::2] != (count, 2) or forces.shape[1] < n):
+        raise ValueError(f"forces must have the shape ({count}, at least {n}, 2), not {forces.shape}")
     optima = BatchOptima(
         costs=np.full(count, np.nan),
         solved=np.zeros(count, bool),
+        steps=np.full(count, n),
         states=np.zeros((count, n + 1, 8)),
         forces=np.zeros((count, n, 2)),
         gains=np.zeros((count, n, 2, 8)),
         slopes=np.zeros((count, n, 8)),
         iterations=np.zeros(count, int),
     )
-    with _one_at_a_time:
-        for first in range(0, count, _AT_ONCE):
-            rows = np.arange(first, min(first + _AT_ONCE, count))
-            solver.solve(x0[rows], None if forces is None else forces[rows, :steps], optima, rows)
+    for first in range(0, count, _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        batch = _Batch(
+            task,
+            params,
+            x0[rows],
+            c[rows],
+            BatchOptima(**{f.name: getattr(optima, f.name)[rows] for f in fields(optima)}),
+        )
+        batch.search(None if forces is None else forces[rows, :n])
     optima.solved[:] = np.isfinite(optima.costs)
     return optima
 
 
-def optimized_steps(task: Task) -> int:
-    """Control steps at the start of an episode that `find_optima` optimizes."""
-    return min(task.steps, round(_SECONDS / task.control_dt))
+def optimal_costs(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> Iterator[float | str]:
+    """The cost of each optimum from x0 (B, 8) with constants c (B, nc), or a sentence that says why there is none.
+
+    `find_optima` finds nearly all, and `find_optimum` the rest.
+    """
+    costs = find_optima(task, params, x0, c).costs if solves(task, params) else np.full(len(x0), np.nan)
+    for cost, x, constants in zip(costs.tolist(), x0, c, strict=True):
+        if not math.isnan(cost):
+            yield cost
+            continue
+        try:
+            optimum = find_optimum(task, params, x, constants)
+        except PlanError as error:
+            yield str(error)
+        else:
+            yield optimum.cost if optimum.is_optimal else f"only a feasible episode was found ({optimum.solver_status})"
 
 
 @dataclass(frozen=True)
-class _Episodes:
-    """B simulated episodes, the steps first: states (n+1, B, 8), forces (n, B, 2), N.
+class _Guesses:
+    """J guesses: of which episodes, states (J, n+1, 8 or 9), actions (J, n, 2), and numbers of steps (J,)."""
 
-    `held` (B,) are their costs, `cost` (B,) those with LQR's cost-to-go, infinite where a margin is violated.
-    """
-
+    of: np.ndarray
     x: np.ndarray
-    u: np.ndarray
-    held: np.ndarray
-    cost: np.ndarray
+    a: np.ndarray
+    steps: np.ndarray
 
-    def of(self, rows: np.ndarray) -> "_Episodes":
-        """Some of them, copied."""
-        return _Episodes(self.x[:, rows], self.u[:, rows], self.held[rows], self.cost[rows])
+    def some(self, chosen: np.ndarray) -> "_Guesses":
+        return _Guesses(self.of[chosen], self.x[chosen], self.a[chosen], self.steps[chosen])
 
-    def put(self, rows: np.ndarray, others: "_Episodes") -> None:
-        """Puts others in the place of some of them."""
-        self.x[:, rows], self.u[:, rows], self.held[rows], self.cost[rows] = (
-            others.x,
-            others.u,
-            others.held,
-            others.cost,
-        )
-
-    def improve(self, rows: np.ndarray, others: "_Episodes") -> np.ndarray:
-        """Puts others in the place of some of them where they are cheaper, and says where (len(rows),)."""
-        cheaper = others.cost < self.cost[rows]
-        self.put(rows[cheaper], others.of(cheaper))
-        return cheaper
+    @classmethod
+    def joined(cls, of: Sequence[int], motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> "_Guesses":
+        """Of states (n+1, 8) and actions (n, 2), whose n may differ."""
+        steps = np.array([len(a) for _, a in motions])
+        most = steps.max(initial=0)
+        x, a = np.zeros((len(steps), most + 1, motions[0][0].shape[1])), np.zeros((len(steps), most, 2))
+        for i, (states, actions) in enumerate(motions):
+            x[i, : len(states)], a[i, : len(actions)] = states, actions
+        return cls(np.asarray(of), x, a, steps)
 
 
-class _Solver:
-    """The optimizer of one task."""
+class _Batch:
+    """The search of some episodes, which fills in their `BatchOptima`."""
 
-    def __init__(self, task: Task, params: BallbotParams):
-        self._task, self._steps = task, optimized_steps(task)
-        rest = task.reference(np.zeros(8), np.zeros(0), params)
-        self._rest = rest.x[-1]
-        self._lqr, self._p = discrete_lqr(task, params, rest.x[-1], rest.u[-1], np.zeros(0))
-        limit = params.force_limit * (1 - _FORCE_BACKOFF)
-        n, rest_steps = self._steps, task.steps - self._steps
-        follow, steer, sweep = in_lanes(
-            f"{task.id}-batch",
-            (
-                _following(task, params, limit),
-                _steering(task, params, limit, self._rest[:2]),
-                _sweeping(task, params, limit),
-            ),
-        )
-        self._follow, self._follow_to_end = _Call(follow, n), _Call(follow, max(rest_steps, 1))
-        self._steer, self._sweep = _Call(steer, n), _Call(sweep, n, last_alone=True)
-        self._lqr_gains, self._at_rest = self._lqr.reshape(1, 1, 16), self._rest.reshape(1, 1, 8)
-        self._end_value = np.array([2 * self._p[i, j] for i, j in _UPPER])
-        times = task.control_dt * np.arange(n)
-        self._fading = {fade: np.exp(-times / fade) for *_, fade in (*_FAMILY, *_SIDEWAYS_FAMILY)}
+    def __init__(self, task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, optima: BatchOptima):
+        self._task, self._params, self._x0, self._c, self._optima = task, params, x0, c, optima
+        self._solver = ilqr(task, params)
 
-    def solve(self, x0: np.ndarray, forces: np.ndarray | None, optima: BatchOptima, rows: np.ndarray) -> None:
-        """Optimizes B episodes, and writes those that some recovery survives into `optima`.
+    def search(self, forces: np.ndarray | None) -> None:
+        task = self._task
+        if task.first_exit:
+            self._arrive()
+        elif task.passed_obstacles(self._c[0]) is not None and task.steps % search.COARSE == 0:
+            self._weave()
+        elif len(task.reference(self._x0[0], self._c[0], self._params).x) == 1:
+            self._keep(self._recoveries(forces), _MOTION)
+            self._follow_paths(np.flatnonzero(np.isnan(self._optima.costs)))
+        else:
+            self._follow_paths(np.arange(len(self._x0)))
 
-        Args:
-            x0: (B, 8) initial states.
-            forces: (B, T, 2) to start from where they are cheaper than recoveries.
-            optima: to be filled. Costs stay NaN where it did not converge, or a margin is violated.
-            rows: (B,) of these.
-        """
-        current = self._recoveries(x0)
-        if forces is not None:
-            current.improve(np.arange(len(x0)), self._roll(x0, forces.swapaxes(0, 1), _NO_GAINS, _NO_STATES))
-        active = np.flatnonzero(np.isfinite(current.cost))
-        current, iterations = current.of(active), 0
-        while len(active):
-            change, gains, slopes, promised = self._backward(current)
-            iterations += 1
-            before, x = current, current.x[:-1]
-            current = self._roll(x[0], before.u + change, gains, x)
-            dearer = np.flatnonzero(~(current.cost < before.cost))
-            current.put(dearer, before.of(dearer))
-            for share in _SHORTER_STEPS:
-                if len(dearer):
-                    u = before.u[:, dearer] + share * change[:, dearer]
-                    tried = self._roll(x[0, dearer], u, gains[:, dearer], x[:, dearer])
-                    dearer = dearer[~current.improve(dearer, tried)]
-            stuck = np.isin(np.arange(len(active)), dearer)
-            converged = ~stuck & (promised < _TOLERANCE * before.cost)
-            over = stuck | converged | (iterations == _MOST_ITERATIONS)
-            if over.any():
-                optima.iterations[rows[active[over]]] = iterations
-                self._write(
-                    optima, rows[active[over]], current.of(over), gains[:, over], slopes[:, over], converged[over]
-                )
-                active, current = active[~over], current.of(~over)
+    def _given(self, c: np.ndarray) -> np.ndarray:
+        """Parameters of `ilqr`, (J, np), of constants (J, nc)."""
+        backoff = replace(Backoff(), margin=MARGIN, goal=MARGIN)
+        rest = shooting_parameters(self._task, self._params, c[0], backoff)[1 + c.shape[1] :]
+        return np.column_stack([c, np.tile(rest, (len(c), 1))])
 
-    def _write(
+    def _solve(
         self,
-        optima: BatchOptima,
-        rows: np.ndarray,
-        episodes: _Episodes,
-        gains: np.ndarray,
-        slopes: np.ndarray,
-        converged: np.ndarray,
-    ) -> None:
-        """Writes episodes, followed by LQR, with gains (T, B, 16) and slopes (T, B, 8), into rows (B,) of `optima`."""
-        n, costs = self._steps, episodes.held
-        margins = self._task.margins(episodes.x[0], np.zeros(0))
-        room = np.min(np.broadcast_arrays(*margins), axis=0)
-        optima.states[rows, : n + 1] = episodes.x.swapaxes(0, 1)
-        optima.forces[rows, :n] = episodes.u.swapaxes(0, 1)
-        optima.gains[rows, :n] = gains.swapaxes(0, 1).reshape(len(rows), n, 2, 8)
-        optima.slopes[rows, :n] = slopes.swapaxes(0, 1)
-        if n < self._task.steps:
-            x, u, running, rooms = self._follow_to_end(episodes.x[-1:], _NO_FORCES, self._lqr_gains, self._at_rest)
-            costs, room = costs + _total(running), np.minimum(room, rooms.min(axis=(0, 2)))
-            x = np.concatenate([episodes.x[-1:], x])
-            optima.states[rows, n:], optima.forces[rows, n:] = x.swapaxes(0, 1), u.swapaxes(0, 1)
-            optima.gains[rows, n:] = self._lqr
-            optima.slopes[rows, n:] = 2 * _product(x[:-1] - self._rest, self._p).swapaxes(0, 1)
-        optima.costs[rows] = np.where(converged & (room >= 0), costs, np.nan)
+        guesses: _Guesses,
+        tries: Sequence[Options],
+        coarseness: int = 1,
+        c: np.ndarray | None = None,
+        free_time: bool = False,
+        chosen_sides: np.ndarray | None = None,
+    ) -> Solutions:
+        """Solves guesses with some options in turn until they are solved, and on chosen sides (J, obstacles) of obstacles."""
+        task, n = self._task, guesses.a.shape[1]
+        solver, lengths = (
+            (ilqr(task, self._params, True), 1.0) if free_time else (self._solver, coarseness * task.control_dt)
+        )
+        given = self._given((self._c if c is None else c)[guesses.of])
+        if free_time:
+            bounds = task.control_dt / 4, task.duration / n
+            given = np.column_stack([given, np.tile(bounds, (len(given), 1))])
 
-    def _recoveries(self, x0: np.ndarray) -> _Episodes:
+        def right(some: _Guesses, found: Solutions, chosen: np.ndarray | None) -> np.ndarray:
+            return (
+                found.solved if chosen is None else found.solved & (self._sides(some.of, found.x) == chosen).all(axis=1)
+            )
+
+        found = solver.solve(guesses.x, guesses.a, guesses.steps, lengths, given, tries[0])
+        for options in tries[1:]:
+            left = np.flatnonzero(~right(guesses, found, chosen_sides))
+            if not len(left):
+                break
+            some = guesses.some(left)
+            again = solver.solve(some.x, some.a, some.steps, lengths, given[left], options)
+            better = again.solved & ~found.solved[left]
+            better |= right(some, again, None if chosen_sides is None else chosen_sides[left])
+            for field in fields(Solutions):
+                getattr(found, field.name)[left[better]] = getattr(again, field.name)[better]
+        found.costs[~found.solved] = np.inf
+        return found
+
+    def _sides(self, of: Sequence[int] | np.ndarray, paths: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+        """(J, most obstacles) on which sides ground paths (n, at least 2) pass; 0 where there is no obstacle."""
+        obstacles = [np.asarray(self._task.passed_obstacles(c)) for c in self._c]
+        found = np.zeros((len(of), max(map(len, obstacles))), int)
+        for row, (i, path) in enumerate(zip(of, paths, strict=True)):
+            found[row, : len(obstacles[i])] = search.side_choice(path, obstacles[i])
+        return found
+
+    def _keep(self, guesses: _Guesses, tries: Sequence[Options], chosen_sides: np.ndarray | None = None) -> np.ndarray:
+        """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,)."""
+        if not len(guesses.of):
+            return np.zeros(0)
+        found, optima, limit = (
+            self._solve(guesses, tries, chosen_sides=chosen_sides),
+            self._optima,
+            self._params.force_limit,
+        )
+        for i in np.argsort(-found.costs, kind="stable"):  # the cheapest last
+            row, steps = guesses.of[i], guesses.steps[i]
+            if not found.solved[i] or found.costs[i] >= optima.costs[row]:
+                continue
+            optima.costs[row], optima.steps[row], optima.iterations[row] = found.costs[i], steps, found.iterations[i]
+            optima.states[row, : steps + 1], optima.states[row, steps + 1 :] = (
+                found.x[i, : steps + 1],
+                found.x[i, steps],
+            )
+            for kept, values, unit in (
+                (optima.forces, found.a, limit),
+                (optima.gains, found.gains, limit),
+                (optima.slopes, found.slopes, 1.0),
+            ):
+                kept[row, :steps], kept[row, steps:] = unit * values[i, :steps], 0
+        return found.costs
+
+    def _recoveries(self, forces: np.ndarray | None) -> _Guesses:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
-        n, count = self._steps, len(x0)
-        best = _Episodes(np.zeros((n + 1, count, 8)), np.zeros((n, count, 2)), np.zeros(count), np.full(count, np.inf))
+        task, x0, count, n = self._task, self._x0, len(self._x0), self._task.steps
+        given, times = self._given(self._c), task.control_dt * np.arange(n)
+        best = np.full(count, np.inf)
+        x, a = np.zeros((count, n + 1, 8)), np.zeros((count, n, 2))
+
+        def improve(rows: np.ndarray, simulated: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+            cheaper = simulated[2] < best[rows]
+            for kept, values in zip((x, a, best), simulated, strict=True):
+                kept[rows[cheaper]] = values[cheaper]
+
         side = righting.leaning_aside(x0, np.ones(count)).T
+        targets = np.array([task.reference(x, c, self._params).x[0, :2] for x, c in zip(x0, self._c, strict=True)])
+        path = np.zeros((count, n, 8))
+        path[..., :2] = targets[:, None]
         for family in (_FAMILY, _SIDEWAYS_FAMILY):
-            rows = np.flatnonzero(np.isinf(best.cost))
+            rows = np.flatnonzero(np.isinf(best))
             for bandwidth, seconds, lean, fade in family if len(rows) else ():
-                aside = lean * self._fading[fade][:, None, None] * side[rows]
-                best.improve(
-                    rows,
-                    self._episodes(x0[rows], self._steer(x0[None, rows], aside, np.array([[[bandwidth, seconds]]]))),
+                path[..., 6:] = lean * np.exp(-times / fade)[None, :, None] * side[:, None]
+                followed = self._solver.follow(x0[rows], task.control_dt, given[rows], path[rows], (bandwidth, seconds))
+                improve(rows, followed)
+        if forces is not None:
+            improve(
+                np.arange(count), self._solver.simulate(x0, task.control_dt, given, forces / self._params.force_limit)
+            )
+        return _Guesses(np.arange(count), x, a, np.full(count, n)).some(np.isfinite(best))
+
+    def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> _Guesses:
+        """Guesses along ground paths (steps+1, 2)."""
+        motions = [self._motion(path, self._task.control_dt, self._x0[i]) for i, path in zip(of, paths, strict=True)]
+        return _Guesses.joined(of, [(x[::coarseness], a[::coarseness]) for x, a in motions])
+
+    def _motion(self, path: np.ndarray, length: float, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, u = guess.along_path(self._params, path, length, start=x0)
+        return x, u / self._params.force_limit
+
+    def _paths(self, rows: np.ndarray) -> tuple[list[int], list[np.ndarray]]:
+        """Guessed paths, and of which episodes."""
+        of, paths = [], []
+        for i in rows.tolist():
+            some = self._task.guess_paths(self._x0[i], self._c[i], self._params)[:_GUESSES]
+            of += [i] * len(some)
+            paths += some
+        return of, paths
+
+    def _follow_paths(self, rows: np.ndarray) -> None:
+        """Along guessed paths; several of an episode are first compared with forces held longer."""
+        if not len(rows):
+            return
+        of, paths = self._paths(rows)
+        chosen = np.arange(len(of))
+        if len(of) > len(rows) and self._task.steps % search.COARSE == 0:
+            found = self._solve(self._along(of, paths, search.COARSE), _ROUGH_PATH, search.COARSE)
+            chosen = _contenders(np.array(of), found, search.BASIN_DOUBT)
+        self._keep(self._along([of[i] for i in chosen], [paths[i] for i in chosen]), _PATH)
+
+    def _arrive(self) -> None:
+        """The episodes of first-exit tasks, as `Shooting.in_whole_steps` does it for one."""
+        task, n = self._task, FREE_TIME_INTERVALS
+        of, paths = self._paths(np.arange(len(self._x0)))
+        motions = []
+        for i, path in zip(of, paths, strict=True):
+            length = (len(path) - 1) * task.control_dt / n
+            x, a = self._motion(guess.resampled(path, n), length, self._x0[i])
+            motions.append((np.column_stack([x, np.full(n + 1, length)]), a))
+        relaxed = self._solve(_Guesses.joined(of, motions), _ROUGH_GOAL, free_time=True)
+        chosen = _contenders(np.array(of), relaxed, search.BASIN_DOUBT)
+        arrivals = np.ceil(relaxed.x[chosen, 0, 8] * n / task.control_dt).astype(int)
+        costs: dict[tuple[int, int], float] = {}
+        wanted = [
+            (i, s)
+            for i, arrival in zip(chosen.tolist(), arrivals.tolist(), strict=True)
+            for s in range(arrival - 1, arrival + 2)
+        ]
+        while wanted := [(i, s) for i, s in wanted if 1 <= s <= task.steps]:
+            resampled = [
+                (
+                    guess.resampled(relaxed.x[i, :, :8], s),
+                    guess.resampled(np.vstack([relaxed.a[i], relaxed.a[i, -1:]]), s)[:-1],
                 )
-        return best
+                for i, s in wanted
+            ]
+            found = self._keep(_Guesses.joined([of[i] for i, _ in wanted], resampled), _GOAL)
+            costs.update(zip(wanted, found.tolist(), strict=True))
+            wanted = []
+            for i in chosen.tolist():
+                tried = {s: cost for (j, s), cost in costs.items() if j == i}
+                best = min(tried, key=lambda s: tried[s], default=0)
+                if tried and math.isfinite(tried[best]):
+                    wanted += [(i, s) for s in (best - 1, best + 1) if s not in tried]
 
-    def _roll(self, x0: np.ndarray, u: np.ndarray, gains: np.ndarray, about: np.ndarray) -> _Episodes:
-        """Simulates u − K (x − about)."""
-        return self._episodes(x0, self._follow(x0[None], u, gains, about))
-
-    def _episodes(self, x0: np.ndarray, simulated: Sequence[np.ndarray]) -> _Episodes:
-        """Episodes of the optimized steps, with LQR's cost-to-go after them."""
-        after, u, costs, room = simulated
-        held, off = _total(costs), after[-1] - self._rest
-        safe = room.min(axis=(0, 2)) > 0  # NaN is not
-        with np.errstate(over="ignore", invalid="ignore"):  # of what fell
-            cost = np.where(safe, held + (_product(off, self._p) * off).sum(axis=1), np.inf)
-        return _Episodes(np.concatenate([x0[None], after]), u, held, cost)
-
-    def _backward(self, episodes: _Episodes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Changes of the forces (T, B, 2), feedback K (T, B, 16), slopes of the cost-to-go (T, B, 8), and by how much the
-        linear model says that the changes lower the costs (B,).
-        """
-        count = len(episodes.cost)
-        slope = 2 * _product(episodes.x[-1] - self._rest, self._p)
-        end = np.concatenate([np.tile(self._end_value, (count, 1)), slope, np.zeros((count, 1))], axis=1)
-        ahead, change, gains, slopes = self._sweep(end[None], episodes.x[-2::-1], episodes.u[::-1])
-        return change[::-1], gains[::-1], slopes[::-1], ahead[-1, :, -1]
-
-
-# NumPy's own sums and products add in an order that depends on the number of episodes.
-
-
-def _total(costs: np.ndarray) -> np.ndarray:
-    """(B,) sums of (n, B, 1)."""
-    return np.cumsum(costs[..., 0], axis=0)[-1]
-
-
-def _product(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """(..., 8) products of rows (..., 8) and a matrix (8, 8)."""
-    return functools.reduce(np.add, (rows[..., i, None] * row for i, row in enumerate(matrix)))
+    def _weave(self) -> None:
+        """Slaloms: likely choices of sides are compared with forces held longer."""
+        task, coarse, every = self._task, search.COARSE, range(len(self._x0))
+        straight = [search.straight_path(task, self._params, self._x0[i], self._c[i]) for i in every]
+        away = np.array([task.without_obstacles(c) for c in self._c])
+        free = self._solve(self._along(list(every), straight, coarse), _ROUGH_PATH, coarse, c=away)
+        of, paths = [], []
+        for i in np.flatnonzero(free.solved).tolist():
+            likely = search.likely_paths(task, self._params, self._x0[i], self._c[i], free.x[i], float(free.costs[i]))
+            of += [i] * len(likely)
+            paths += likely
+        if not of:
+            return
+        along = self._along(of, paths, coarse)
+        rough = self._solve(along, _SIDES, coarse, chosen_sides=self._sides(of, paths))
+        chosen = _contenders(along.of, rough, _SIDES_DOUBT)
+        if not len(chosen):
+            return
+        x = np.array([guess.resampled(states, task.steps) for states in rough.x[chosen]])
+        a = np.repeat(rough.a[chosen], coarse, axis=1)
+        near = _Guesses(along.of[chosen], x, a, np.full(len(chosen), task.steps))
+        left = chosen[np.isinf(self._keep(near, _ROUGH_SOLUTION, self._sides(near.of, x)))]
+        if len(left):
+            self._keep(self._along([of[i] for i in left], [paths[i] for i in left]), _PATH)
 
 
-@functools.lru_cache(maxsize=4)
-def _solver(task: Task, params: BallbotParams) -> _Solver:
-    return _Solver(task, params)
-
-
-class _Call:
-    """A function of `LANES` episodes and one control step, for n steps of any number of episodes.
-
-    Its first result is its first argument in the next step. Arguments and results are arrays (n, B, k). Arguments may have
-    n = 1 or B = 1: the same for all steps or episodes. CasADi sees them as (k, n · LANES).
-    """
-
-    def __init__(self, step: casadi.Function, n: int, last_alone: bool = False):
-        """Makes it. With `last_alone`, the first result is returned for the last step alone."""
-        function = step.mapaccum(n)
-        self._arguments = [self._array(function.size_in(i)) for i in range(function.n_in())]
-        first, *others = results = [self._array(function.size_out(i)) for i in range(function.n_out())]
-        self._evaluate = InPlace(function, self._arguments, results)
-        self._wanted = [first[-1:] if last_alone else first, *others]
-
-    @staticmethod
-    def _array(size: tuple[int, int]) -> np.ndarray:
-        return np.zeros((size[1] // LANES, LANES, size[0]))
-
-    def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
-        count = max(array.shape[1] for array in arguments)
-        each = []
-        for kept, given in zip(self._arguments, arguments, strict=True):
-            if given.shape[1] == count:
-                each.append((kept, given))
-            else:
-                kept[:] = given  # the same for all episodes
-        results = [np.empty((len(kept), count, kept.shape[2])) for kept in self._wanted]
-        for first in range(0, count, LANES):
-            width = min(LANES, count - first)
-            episodes, lanes = slice(first, first + width), slice(width)
-            for kept, given in each:
-                kept[:, lanes] = given[:, episodes]  # other lanes compute what was there before
-            self._evaluate()
-            for result, kept in zip(results, self._wanted, strict=True):
-                result[:, episodes] = kept[:, lanes]
-        return results
-
-
-# The functions of one control step and one episode.
-
-
-def _held(task: Task, params: BallbotParams, x: casadi.SX, u: Sequence[casadi.SX]) -> list[casadi.SX]:
-    """State after the step, force, cost, and the least margin."""
-    force = casadi.vertcat(*u)
-    after = dynamics.step(params, x, force, task.control_dt, dynamics.substeps_for(task.control_dt))
-    room = casadi.mmin(casadi.vertcat(*task.margins(after, casadi.SX(0, 1))))
-    return [after, force, task.control_dt * task.cost(x, force, casadi.SX(0, 1)), room]
-
-
-def _following(task: Task, params: BallbotParams, limit: float) -> casadi.Function:
-    """u − K (x − about) held."""
-    x, u, k, about = (casadi.SX.sym(name, size) for name, size in (("x", 8), ("u", 2), ("k", 16), ("about", 8)))
-    forces = u - casadi.reshape(k, 8, 2).T @ (x - about)
-    clipped = [ops.clip(forces[i], -limit, limit) for i in range(2)]
-    return casadi.Function("follow_step", [x, u, k, about], _held(task, params, x, clipped))
-
-
-def _steering(task: Task, params: BallbotParams, limit: float, target: np.ndarray) -> casadi.Function:
-    """The cascade's force held; gains are its bandwidth and time constant."""
-    x, aside, gains = (casadi.SX.sym(name, size) for name, size in (("x", 8), ("aside", 2), ("gains", 2)))
-    u = righting.steering(params, x, aside, gains[0], gains[1], tuple(map(float, target)), limit)
-    return casadi.Function("steer_step", [x, aside, gains], _held(task, params, x, u))
-
-
-def _sweeping(task: Task, params: BallbotParams, limit: float) -> casadi.Function:
-    """One control step of the Riccati recursion.
-
-    What is ahead, and comes out for the step before: 36 second derivatives of the cost-to-go in the order of `_UPPER`, its 8
-    slopes, and by how much the changes lower the cost. The other results are the change of the force (2,), K (16,), and the
-    slopes again.
-    """
-    ahead, x, u = (casadi.SX.sym(name, size) for name, size in (("ahead", 45), ("x", 8), ("u", 2)))
-    z, dt = casadi.vertcat(x, u), task.control_dt
-    linear = casadi.jacobian(dynamics.step(params, x, u, dt, _SUBSTEPS), z)
-    of_cost, slope_of_cost = casadi.hessian(dt * task.cost(x, u, casadi.SX(0, 1)), z)
-    value = casadi.SX(8, 8)
-    for k, (i, j) in enumerate(_UPPER):
-        value[i, j] = value[j, i] = ahead[k]
-    hessian = of_cost + linear.T @ value @ linear
-    slope = slope_of_cost + linear.T @ ahead[36:44]
-    of_force, mixed = hessian[8:, 8:], hessian[8:, :8]
-    change, inverse = _box_step(of_force, slope[8:], -limit - u, limit - u)
-    feedback = inverse @ mixed
-    moved = of_force @ change + slope[8:]
-    before = hessian[:8, :8] - mixed.T @ feedback
-    promised = ahead[44] - 0.5 * casadi.dot(change, moved + slope[8:])
-    slope_before = slope[:8] + mixed.T @ change - feedback.T @ moved
-    out = casadi.vertcat(*(before[i, j] for i, j in _UPPER), slope_before, promised)
-    return casadi.Function(
-        "sweep_step", [ahead, x, u], [out, change, casadi.vec(feedback.T), slope_before], {"cse": True}
-    )
-
-
-_UPPER = [(i, j) for i in range(8) for j in range(i, 8)]
-
-
-def _box_step(hessian: casadi.SX, gradient: casadi.SX, low: casadi.SX, high: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
-    """The d (2,) within [low, high] that minimizes ½ dᵀHd + gᵀd, and the inverse of H (2, 2) in its free components.
-
-    In two dimensions it is the free minimum, or else the least of the minima on the four edges.
-    """
-    a, b, c = hessian[0, 0], hessian[0, 1], hessian[1, 1]
-    determinant = a * c - b * b
-    inverse = casadi.vertcat(casadi.horzcat(c, -b), casadi.horzcat(-b, a)) / determinant
-    free = -inverse @ gradient
-    inside = casadi.logic_and(casadi.mmin(free - low) >= 0, casadi.mmin(high - free) >= 0)
-    on_edges = []
-    for edge in (low, high):
-        first = casadi.vertcat(edge[0], ops.clip(-(gradient[1] + b * edge[0]) / c, low[1], high[1]))
-        second = casadi.vertcat(ops.clip(-(gradient[0] + b * edge[1]) / a, low[0], high[0]), edge[1])
-        on_edges += [first, second]
-    costs = [0.5 * casadi.dot(tried, hessian @ tried) + casadi.dot(gradient, tried) for tried in on_edges]
-    step, least = on_edges[0], costs[0]
-    for tried, cost in zip(on_edges[1:], costs[1:], strict=True):
-        step = casadi.if_else(cost < least, tried, step)
-        least = casadi.fmin(cost, least)
-    step = casadi.if_else(inside, free, step)
-    moves = [casadi.logic_and(step[i] > low[i], step[i] < high[i]) for i in range(2)]
-    both = casadi.logic_and(*moves)
-    alone = casadi.diag(casadi.vertcat(casadi.if_else(moves[0], 1 / a, 0), casadi.if_else(moves[1], 1 / c, 0)))
-    return step, casadi.if_else(both, inverse, alone)
+def _contenders(of: np.ndarray, found: Solutions, doubt: float) -> np.ndarray:
+    """Which of J solutions are within a relative doubt of the cheapest of their episode, without repetitions."""
+    kept: dict[int, list[int]] = {}
+    for i in np.argsort(found.costs, kind="stable").tolist():
+        others = kept.setdefault(int(of[i]), [])
+        if not math.isfinite(found.costs[i]) or (others and found.costs[i] > found.costs[others[0]] * (1 + doubt)):
+            continue
+        if all(np.abs(found.x[i, :, :2] - found.x[j, :, :2]).max() > _SAME for j in others):
+            others.append(i)
+    return np.array(sorted(itertools.chain(*kept.values())), int)

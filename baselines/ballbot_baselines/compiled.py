@@ -15,7 +15,8 @@ LANES = 8
 """Stages that `in_lanes` computes at once: as many float64 as an AVX-512 register holds."""
 
 # Without -O2, GCC leaves the upper halves of vector registers dirty, which slows all SSE code that runs afterwards.
-_SIMD = ("-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
+SIMD = ("-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
+"""Flags of the compiler for functions of `LANES` stages."""
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +46,7 @@ def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
     try:
-        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, _SIMD)
+        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, SIMD)
     except NotImplementedError:  # an operation that only CasADi knows as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)

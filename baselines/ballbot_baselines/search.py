@@ -14,7 +14,9 @@ from ballbot_baselines import guess, righting, sides
 from ballbot_baselines.ocp import OcpSolution
 from ballbot_baselines.shooting import BARRIER, NEAR_BARRIER, Shooting, shooting_solver
 from ballbot_gym import dynamics
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import cubic, then_stay
+from ballbot_gym.tasks import Task
 
 FROM_RIGHTING = -1
 """The `guess` of an optimum that was found from a simulated recovery."""
@@ -24,12 +26,12 @@ ALL_GUESSES = 2**10
 
 _QUICK_ITERATIONS = 80  # of the first try where there is one guessed path; a second guess is tried before more
 _HIGH_BARRIER = 1.0  # from one start in thousands fatrop goes in circles with the usual one, and not with this
-_COARSE = 2  # control steps per interval when several guesses are compared
+COARSE = 2
+"""Control steps per interval when several guesses are compared."""
 _COARSEST = 4  # the same when choices of sides are compared first
 _ROUGH = 1e-4  # tolerance there: costs are then right to 1e-5 of their value, in four iterations less
-_BASIN_DOUBT = (
-    0.01  # paths whose coarse costs differ by less than this share may be ordered differently on the env's grid
-)
+BASIN_DOUBT = 0.01
+"""Paths whose coarse costs differ by less than this share may be ordered differently on the env's grid."""
 _SIDE_DOUBT = 0.01  # choices of sides whose predicted cost exceeds the best by more than this share are not solved
 _COARSEST_DOUBT = 0.005  # relative: how differently the coarsest grid may order choices of sides; 0.0035 was measured
 _GRID_DOUBT = 0.002  # the same of the coarse grid; 0.0007 was measured
@@ -62,7 +64,7 @@ def search(episode: Shooting, guesses: int, paths: list[np.ndarray] | None) -> l
 def _attempts(episode: Shooting, guesses: int, given: list[np.ndarray] | None) -> Iterator[list[Found]]:
     task, x0, c, params = episode.task, episode.x0, episode.c, episode.params
     paths = task.guess_paths(x0, c, params) if given is None else given
-    likely = given is None and guesses > 1 and task.steps % _COARSE == 0
+    likely = given is None and guesses > 1 and task.steps % COARSE == 0
     obstacles = task.passed_obstacles(c) if likely else None
     if obstacles is not None:
         found = _from_likely_sides(episode, paths, guesses, obstacles)
@@ -101,15 +103,15 @@ def _from_paths(episode: Shooting, paths: list[np.ndarray]) -> list[Found]:
     if task.first_exit:
         tried = [(i, episode.relaxed_along(path)) for i, path in enumerate(paths)]
         found = [t for t in tried if not t[1].is_optimal]
-        for i, relaxed in _distinct([t for t in tried if t[1].is_optimal], _BASIN_DOUBT):
+        for i, relaxed in _distinct([t for t in tried if t[1].is_optimal], BASIN_DOUBT):
             found += [(i, solution) for solution in episode.in_whole_steps(relaxed)]
         return found
-    if len(paths) == 1 or task.steps % _COARSE:
-        return _refined(episode, [], _BASIN_DOUBT, paths)
-    solver = shooting_solver(task, episode.params, task.steps // _COARSE)
+    if len(paths) == 1 or task.steps % COARSE:
+        return _refined(episode, [], BASIN_DOUBT, paths)
+    solver = shooting_solver(task, episode.params, task.steps // COARSE)
     starts = [episode.along(path) for path in paths]
-    coarse = [(i, episode.solve(solver, x[::_COARSE], a[::_COARSE], _COARSE)) for i, (x, a) in enumerate(starts)]
-    return _refined(episode, [t for t in coarse if t[1].is_optimal], _BASIN_DOUBT, paths)
+    coarse = [(i, episode.solve(solver, x[::COARSE], a[::COARSE], COARSE)) for i, (x, a) in enumerate(starts)]
+    return _refined(episode, [t for t in coarse if t[1].is_optimal], BASIN_DOUBT, paths)
 
 
 def _refined(episode: Shooting, coarse: list[Found], doubt: float, paths: list[np.ndarray]) -> list[Found]:
@@ -191,56 +193,87 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
     """
     task, params, x0, c = episode.task, episode.params, episode.x0, episode.c
     iterations, side_doubt, grid_doubt = _QUICK_ITERATIONS, _SIDE_DOUBT, _GRID_DOUBT
-    coarsest, tolerance = (_COARSEST if task.steps % _COARSEST == 0 else _COARSE), _ROUGH
+    coarsest, tolerance = (_COARSEST if task.steps % _COARSEST == 0 else COARSE), _ROUGH
     if params.grips:
         iterations, side_doubt, grid_doubt = _GRIPPING_ITERATIONS, _GRIPPING_DOUBT, _GRIPPING_DOUBT
-        coarsest, tolerance = _COARSE, None
+        coarsest, tolerance = COARSE, None
 
     def solved_from(path: np.ndarray, barrier: float, episode: Shooting = episode) -> OcpSolution:
         solver = shooting_solver(task, params, task.steps // coarsest, "fatrop", iterations, barrier, tolerance)
         x, a = episode.along(path)
         return episode.solve(solver, x[::coarsest], a[::coarsest], coarsest)
 
-    free = solved_from(_straight(episode), NEAR_BARRIER, replace(episode, c=task.without_obstacles(c)))
+    free = solved_from(straight_path(task, params, x0, c), NEAR_BARRIER, replace(episode, c=task.without_obstacles(c)))
     if not free.success:
         return []
-    along = guess.resampled(free.states[:, :2], task.steps)
-    prediction = sides.predict(task, params, x0, c, along, obstacles)
-    rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
-    row_of = [rows[_side_choice(path, obstacles)] for path in paths]
-    predicted = free.cost + prediction.costs[row_of]
+    predicted, motions = _predicted_sides(task, params, x0, c, paths, free.states, free.cost)
     solved: list[Found] = []
     for i in np.argsort(predicted, kind="stable")[:most].tolist():
         if solved and predicted[i] > predicted[solved[0][0]] * (1 + side_doubt):
             break
-        motion = np.column_stack([along[:, 0], prediction.y[row_of[i]]])
+        motion = motions[i]
         for start, barrier in ((motion, NEAR_BARRIER), (motion, BARRIER), (paths[i], BARRIER)):
             solution = solved_from(start, barrier)
             if solution.success:
                 solved.append((i, solution))
                 break
-    if coarsest > _COARSE and len(_distinct(solved, _COARSEST_DOUBT)) > 1:
+    if coarsest > COARSE and len(_distinct(solved, _COARSEST_DOUBT)) > 1:
         solved = _on_coarse_grid(episode, _distinct(solved, _COARSEST_DOUBT)) or solved
     return _refined(episode, solved, grid_doubt, paths[:most])
 
 
+def _predicted_sides(
+    task: Task,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    paths: list[np.ndarray],
+    free: np.ndarray,
+    cost: float,
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """What each guessed path's choice of sides is predicted to cost, and its predicted motion (steps+1, 2).
+
+    From the states (n+1, 8) and the cost of the motion without obstacles.
+    """
+    obstacles = task.passed_obstacles(c)
+    assert obstacles is not None
+    along = guess.resampled(free[:, :2], task.steps)
+    prediction = sides.predict(task, params, x0, c, along, obstacles)
+    rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
+    row_of = [rows[side_choice(path, obstacles)] for path in paths]
+    return cost + prediction.costs[row_of], [np.column_stack([along[:, 0], prediction.y[row]]) for row in row_of]
+
+
+def likely_paths(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, free: np.ndarray, cost: float
+) -> list[np.ndarray]:
+    """The guessed path of every choice of sides that may be the best, the likeliest first.
+
+    From the states (n+1, 8) and the cost of the motion without obstacles.
+    """
+    paths = task.guess_paths(x0, c, params)
+    predicted, _ = _predicted_sides(task, params, x0, c, paths, free, cost)
+    doubt = _GRIPPING_DOUBT if params.grips else _SIDE_DOUBT
+    order = np.argsort(predicted, kind="stable")
+    return [paths[i] for i in order if predicted[i] <= predicted.min() * (1 + doubt)]
+
+
 def _on_coarse_grid(episode: Shooting, solved: list[Found]) -> list[Found]:
-    """Solutions with forces held for `_COARSE` control steps, from those on the coarsest grid."""
-    n = episode.task.steps // _COARSE
+    """Solutions with forces held for `COARSE` control steps, from those on the coarsest grid."""
+    n = episode.task.steps // COARSE
     solver = shooting_solver(episode.task, episode.params, n, "fatrop", _QUICK_ITERATIONS, NEAR_BARRIER, _ROUGH)
-    found = [(i, episode.solve(solver, *_on_grid(solution, n), _COARSE)) for i, solution in solved]
+    found = [(i, episode.solve(solver, *_on_grid(solution, n), COARSE)) for i, solution in solved]
     return [(i, solution) for i, solution in found if solution.success]
 
 
-def _straight(episode: Shooting) -> np.ndarray:
+def straight_path(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> np.ndarray:
     """(steps+1, 2) m, from the position and velocity of x0 to rest where the task's reference ends."""
-    task, x0 = episode.task, episode.x0
-    goal = task.reference(x0, episode.c, episode.params).x[-1, :2]
+    goal = task.reference(x0, c, params).x[-1, :2]
     steps = min(task.steps, round(_STRAIGHT_SECONDS / task.control_dt))
     return then_stay(cubic(x0[:2], x0[4:6], goal, np.zeros(2), steps, task.control_dt), task.steps)
 
 
-def _side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
-    """The sides on which a guessed path passes obstacles (n, 3), where it crosses their x."""
+def side_choice(path: np.ndarray, obstacles: np.ndarray) -> tuple[int, ...]:
+    """The sides on which a path (k, at least 2) passes obstacles (n, 3), where it is nearest to their x."""
     nearest = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
     return tuple(1 if path[k, 1] > y else -1 for k, y in zip(nearest, obstacles[:, 1], strict=True))

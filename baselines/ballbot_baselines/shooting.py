@@ -26,7 +26,9 @@ BARRIER = 0.1
 NEAR_BARRIER = 1e-3
 """The same near a solution of nearly the same problem: it takes about half the iterations."""
 
-_FREE_TIME_INTERVALS = 60
+FREE_TIME_INTERVALS = 60
+"""Of a first-exit task whose time is free."""
+
 _MOST_ITERATIONS = 200
 
 
@@ -141,7 +143,7 @@ def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolve
         inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
         final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], p),
     )
-    return OcpSolver(ocp, _FREE_TIME_INTERVALS, solver, _tolerance(params))
+    return OcpSolver(ocp, FREE_TIME_INTERVALS, solver, _tolerance(params))
 
 
 def _tolerance(params: BallbotParams) -> float:
@@ -188,14 +190,14 @@ class Shooting:
 
     def relaxed_along(self, path: np.ndarray) -> OcpSolution:
         """The solution with a free interval length from a ground path (n+1, 2), m, one point for each control step."""
-        h = (len(path) - 1) * self.task.control_dt / _FREE_TIME_INTERVALS
-        x, u = guess.along_path(self.params, guess.resampled(path, _FREE_TIME_INTERVALS), h, start=self.x0)
+        h = (len(path) - 1) * self.task.control_dt / FREE_TIME_INTERVALS
+        x, u = guess.along_path(self.params, guess.resampled(path, FREE_TIME_INTERVALS), h, start=self.x0)
         return self._in_free_time(x, u / self.params.force_limit, h)
 
     def relaxed(self, x: np.ndarray, a: np.ndarray) -> OcpSolution:
         """The solution with a free interval length from a guess."""
-        h = len(a) * self.task.control_dt / _FREE_TIME_INTERVALS
-        return self._in_free_time(*_resampled(x, a, _FREE_TIME_INTERVALS), h)
+        h = len(a) * self.task.control_dt / FREE_TIME_INTERVALS
+        return self._in_free_time(*_resampled(x, a, FREE_TIME_INTERVALS), h)
 
     def in_whole_steps(self, relaxed: OcpSolution) -> list[OcpSolution]:
         """Solutions that arrive after whole numbers of control steps.
@@ -203,7 +205,7 @@ class Shooting:
         The search begins at the arrival of a solution with a free interval length, and goes both ways while the cost falls.
         """
         most = self.task.steps
-        arrival = relaxed.states[0, 8] * _FREE_TIME_INTERVALS / self.task.control_dt
+        arrival = relaxed.states[0, 8] * FREE_TIME_INTERVALS / self.task.control_dt
         steps = min(max(1, math.ceil(arrival)), most)
 
         def arriving(steps: int) -> list[OcpSolution]:

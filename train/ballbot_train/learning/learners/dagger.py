@@ -263,11 +263,14 @@ class Dagger:
         lasted = np.where(over[-1], over.argmax(0), longest + 1)
         reached = history[rng.integers(lasted), np.arange(len(x0))]
         starts = np.concatenate([x0, reached])
-        optima = batched.find_optima(task, self._params, starts, self._forces(starts, np.tile(c, (2, 1))))
+        constants = np.tile(c, (2, 1))
+        forces = None if task.first_exit else self._forces(starts, constants)
+        optima = batched.find_optima(task, self._params, starts, constants, forces)
         of_episodes = np.tile(optima.costs[: len(x0)], 2)  # a state counts as its episode does
         costs = np.where(np.isnan(of_episodes), optima.costs, of_episodes)
         rows = np.repeat(np.flatnonzero(optima.solved), _BATCH_STATES)
-        steps = rng.integers(round(config.label_seconds / task.control_dt), size=len(rows))
+        most = np.minimum(round(config.label_seconds / task.control_dt), optima.steps[rows])
+        steps = rng.integers(most)
         x, u, gains = optima.states[rows, steps], optima.forces[rows, steps], optima.gains[rows, steps]
         near_x, near_u, of = self._around(x, u, gains, rng)
         of = np.concatenate([rows, rows[of]])
@@ -289,9 +292,8 @@ class Dagger:
         return x[rows], c[rows]
 
     def _forces(self, x: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """(B, n, 2) N, of the learner in episodes from states (B, 8), as far as `batched.find_optima` takes them."""
-        steps = batched.optimized_steps(self._task)
-        history, _, _ = self._roll(x, c, steps)
+        """(B, n, 2) N, of the learner in episodes from states (B, 8)."""
+        history, _, _ = self._roll(x, c, self._task.steps)
         with torch.no_grad():
             actions = self.network(torch.as_tensor(self._task.observe(history[:-1], c), dtype=torch.float32))
         return self._params.force_limit * actions.transpose(0, 1).double().numpy()

@@ -1,0 +1,413 @@
+"""Local optima of thousands of episodes of any task, by iLQR in compiled code (`ilqr.c`), a SIMD lane for each episode.
+
+The problem is that of `shooting.py`. A guess that is no motion is first bent toward one by a few Newton steps on the
+dynamics. Then each iteration sweeps backwards with the box-constrained Riccati recursion of Tassa et al., "Control-limited
+differential dynamic programming" (2014), and simulates the new feedback, with a shorter step where that raises the cost.
+
+The other inequalities g ≥ 0 are the task's margins, its goal and the robot's friction. Each costs m·w·f(g/w) with a
+multiplier m, a width w that shrinks, and the logarithm f(t) = −log(1 + t), which goes on as a parabola below t = −½ (Ben-Tal
+and Zibulevsky, "Penalty/barrier multiplier methods for convex programming problems", 1997). So constraints that are not
+violated yet are felt too, and steps can stay long.
+"""
+
+import ctypes
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+
+from ballbot_baselines import righting
+from ballbot_baselines.compiled import LANES, SIMD
+from ballbot_baselines.shooting import shooting_ocp
+from ballbot_gym import codegen, dynamics, machine_code, ops
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+OPTIMAL = 0
+"""The status of a solution that met the tolerances; every other one did not."""
+MARGIN = 2e-5
+"""By how much constraints are kept, so that they hold where a solution misses one by `Options.violation`."""
+
+_SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
+_LEAST_CURVATURE = 1e-9  # of the cost along an action, so that steps of no length have a best one
+_LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
+_OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
+
+
+_READ = ("width", "least_width", "shrink", "factor", "tolerance", "violation", "iterations", "bends")  # by ilqr.c
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of the solver. Widths are in the unit of the constraints."""
+
+    width: float = 0.2
+    """Of the constraints' prices, at first."""
+    multiplier: float = 0.1
+    """Of every constraint, at first."""
+    least_width: float = 2e-4
+    """Where it ends."""
+    shrink: float = 0.5
+    """How it shrinks whenever the multipliers change."""
+    factor: float = 10.0
+    """By which a multiplier changes at most."""
+    tolerance: float = 1e-5
+    """Relative: the last iteration promises to lower the cost by less."""
+    violation: float = MARGIN
+    """By which a constraint is missed at most, besides what the caller keeps of it."""
+    iterations: float = 60
+    """After which it gives up."""
+    bends: float = 3
+    """Newton steps on the dynamics, for guesses that are no motions; 0 for those that are."""
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Of J problems of at most n steps; those with fewer have no meaning at the end.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | x | (J, n+1, ns) | states; ns is 9 with the length of a step, s, where that is free |
+    | a | (J, n, 2) | actions |
+    | gains | (J, n, 2, ns) | K of the feedback a − K (x' − x) |
+    | slopes | (J, n, ns) | of the remaining cost with respect to each state but the last |
+    | costs | (J,) | |
+    | solved | (J,) bool | |
+    | iterations | (J,) | |
+    """
+
+    x: np.ndarray
+    a: np.ndarray
+    gains: np.ndarray
+    slopes: np.ndarray
+    costs: np.ndarray
+    solved: np.ndarray
+    iterations: np.ndarray
+
+
+class Ilqr:
+    """The solver of a task and a robot.
+
+    With `free_time`, the length of the steps is free, within the last two parameters of each problem.
+
+    Raises:
+        machine_code.NoMachineCodeError: it cannot be compiled here.
+        NotImplementedError: the task has an operation that `codegen` does not know.
+    """
+
+    def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
+        stage = _Stage(task, params, free_time)
+        name = f"{task.id}-ilqr{'-free' if free_time else ''}"
+        library = ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD)))
+        self.states, self._sizes = stage.ns, stage.sizes
+        self._solve, self._follow = library.solve, library.follow
+        count, pointer = ctypes.c_int64, ctypes.c_void_p
+        self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 14], None
+        self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 8], None
+
+    def solve(
+        self, x: np.ndarray, a: np.ndarray, steps: Any, lengths: Any, given: np.ndarray, options: Options = Options()
+    ) -> Solutions:
+        """Solves J problems from guesses.
+
+        Args:
+            x: (J, n+1, ns) states.
+            a: (J, n, 2) actions.
+            steps: (J,) or one number of steps, n at most.
+            lengths: (J,) or one length of a step, s; 1 where it is free.
+            given: (J, np) parameters: p of `shooting_ocp` but the first, and the bounds of a free length, s.
+            options: of the solver.
+        """
+        jobs, n = a.shape[:2]
+        path, end = (
+            np.full((jobs, *shape), float(options.multiplier))
+            for shape in ((n, self._sizes["PATH"]), (self._sizes["END"],))
+        )
+        x, a = np.array(x, np.float64, order="C"), np.array(a, np.float64, order="C")
+        gains, slopes = np.zeros((jobs, n, 2, self.states)), np.zeros((jobs, n, self.states))
+        costs, missed = np.zeros(jobs), np.zeros(jobs)
+        status, iterations = np.zeros(jobs, np.int64), np.zeros(jobs, np.int64)
+        each = (np.ascontiguousarray(np.broadcast_to(steps, jobs), np.int64), *self._given(jobs, lengths, given))
+        arrays = (
+            np.array([getattr(options, name) for name in _READ]),
+            *each,
+            x,
+            a,
+            path,
+            end,
+            gains,
+            slopes,
+            costs,
+            missed,
+            status,
+            iterations,
+        )
+        self._solve(jobs, n, *(array.ctypes.data for array in arrays))
+        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, iterations)
+
+    def follow(
+        self, x0: np.ndarray, length: float, given: np.ndarray, paths: np.ndarray, settings: tuple[float, float]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Simulates J episodes in which `righting.steering` follows a path.
+
+        Args:
+            x0: (J, 8) initial states.
+            length: of a step, s.
+            given: as of `solve`.
+            paths: (J, n, 8) positions, velocities, accelerations, and leans that are added; SI units.
+            settings: of the feedback, its bandwidth, rad/s, and its time constant, s.
+
+        Returns:
+            States (J, n+1, 8), actions (J, n, 2), and costs (J,), which are infinite where a margin is violated.
+        """
+        return self._simulated(
+            x0, np.zeros((*paths.shape[:2], 2)), length, given, np.ascontiguousarray(paths), settings
+        )
+
+    def simulate(
+        self, x0: np.ndarray, length: float, given: np.ndarray, a: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same under actions a (J, n, 2)."""
+        return self._simulated(x0, np.array(a, np.float64, order="C"), length, given, None, (0.0, 0.0))
+
+    def _simulated(
+        self,
+        x0: np.ndarray,
+        a: np.ndarray,
+        length: float,
+        given: np.ndarray,
+        paths: np.ndarray | None,
+        settings: tuple[float, float],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        jobs, n = a.shape[:2]
+        x, costs, missed = np.zeros((jobs, n + 1, self.states)), np.zeros(jobs), np.zeros(jobs)
+        x[:, 0] = x0
+        followed = None if paths is None else paths.ctypes.data
+        before = *self._given(jobs, length, given), np.tile(np.array(settings, np.float64), (jobs, 1))
+        of_steps, of_problems, of_feedback = (array.ctypes.data for array in before)
+        after = (array.ctypes.data for array in (x, a, costs, missed))
+        self._follow(jobs, n, of_steps, of_problems, followed, of_feedback, *after)
+        return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
+
+    def _given(self, jobs: int, lengths: Any, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        shapes = ((lengths, (jobs,)), (given, (jobs, self._sizes["PARAMS"])))
+        lengths, given = (np.ascontiguousarray(np.broadcast_to(part, shape), np.float64) for part, shape in shapes)
+        return lengths, given
+
+
+@functools.lru_cache(maxsize=8)
+def ilqr(task: Task, params: BallbotParams, free_time: bool = False) -> Ilqr:
+    """The solver, made once."""
+    return Ilqr(task, params, free_time)
+
+
+class _Stage:
+    """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
+
+    def __init__(self, task: Task, params: BallbotParams, free_time: bool):
+        self._ocp, self._params, self._substeps = (
+            shooting_ocp(task, params),
+            params,
+            dynamics.substeps_for(task.control_dt),
+        )
+        self._free, self.ns = free_time, 9 if free_time else 8
+        symbol = casadi.SX.sym
+        self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
+        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time)
+        self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
+        self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
+        self._following, self._step = symbol("following", self.ns), symbol("step", 2)
+        path, end = self._path(self._a), self._ocp.final_inequalities(self._x[:8], self._all)
+        self._multipliers, self._end_multipliers = symbol("m", path.shape[0]), symbol("e", end.shape[0])
+        self._upper = [(i, j) for i in range(self.ns) for j in range(i, self.ns)]
+        self.sizes = {
+            "DOUBLE": 1,
+            "LANES": LANES,
+            "STATES": self.ns,
+            "PATH": path.shape[0],
+            "END": end.shape[0],
+            "PARAMS": self._p.shape[0],
+        }
+
+    def source(self) -> str:
+        """The whole C code."""
+        defined = [f"#define {name} {value}" for name, value in self.sizes.items()]
+        own = Path(__file__).with_name("ilqr.c").read_text(encoding="utf-8")
+        blocks = [self._sweep(), self._end(), self._hold(), self._bend(), self._steer()]
+        return "\n".join([*defined, codegen.text("real.h"), *blocks, own])
+
+    def _length(self, x: casadi.SX) -> casadi.SX:
+        return x[8] if self._free else self._dt
+
+    def _after(self, x: casadi.SX, a: casadi.SX, substeps: int) -> casadi.SX:
+        length = self._length(x)
+        after = dynamics.step(self._params, x[:8], self._params.force_limit * a, length, substeps)
+        return casadi.vertcat(after, length) if self._free else after
+
+    def _path(self, a: casadi.SX) -> casadi.SX:
+        return self._ocp.inequalities(self._x[:8], a, self._all)
+
+    def _rate(self, a: casadi.SX) -> casadi.SX:
+        return self._ocp.cost(self._x[:8], a, self._all)
+
+    def _sweep(self) -> str:
+        """One control step of the Riccati recursion.
+
+        What is ahead, and comes out for the step before: second derivatives of the cost-to-go in the order of `_upper`, its
+        slopes, and by how much the changes lower the cost. `open` says that x need not be a motion.
+        """
+        x, a, ns = self._x, self._a, self.ns
+        z, squares = casadi.vertcat(x, a), len(self._upper)
+        ahead, damping, open_ = (
+            casadi.SX.sym("ahead", squares + ns + 1),
+            casadi.SX.sym("damping"),
+            casadi.SX.sym("open"),
+        )
+        reached, cost, limits = self._after(x, a, _SUBSTEPS), self._rate(a), self._path(a)
+        linear, of_limits = casadi.jacobian(reached, z), casadi.jacobian(limits, z)
+        push, stiffness = _price_slopes(limits, self._multipliers, self._width)
+        value = casadi.SX(ns, ns)
+        for k, (i, j) in enumerate(self._upper):
+            value[i, j] = value[j, i] = ahead[k]
+        slope_ahead = ahead[squares : squares + ns] + value @ (open_ * (reached - self._following))
+        of_cost, slope = casadi.hessian(cost, z)
+        if self._free:  # how the cost of a step bends with its length would make the recursion indefinite
+            of_cost[8, :], of_cost[:, 8] = 0, 0
+        # `push` is 0 in steps of no length, because their multipliers are
+        slope = slope + linear.T @ slope_ahead - of_limits.T @ push
+        hessian = of_cost + linear.T @ value @ linear + of_limits.T @ casadi.diag(stiffness) @ of_limits
+        over = casadi.vertcat(*(a[i] - _clipped(a[i]) for i in range(2)))
+        of_action = hessian[ns:, ns:] + casadi.diag(_LEAST_CURVATURE + damping + _OVER * (over != 0))
+        of_change, mixed = slope[ns:] + _OVER * over, hessian[ns:, :ns]
+        bound = _LARGEST_ACTION + 1e9 * open_
+        change, inverse = _box_step(of_action, of_change, -bound - a, bound - a)
+        feedback = inverse @ mixed
+        moved = of_action @ change + of_change
+        before = hessian[:ns, :ns] - mixed.T @ feedback
+        promised = ahead[squares + ns] - 0.5 * casadi.dot(change, moved + of_change)
+        slope_before = slope[:ns] + mixed.T @ change - feedback.T @ moved
+        out = casadi.vertcat(*(before[i, j] for i, j in self._upper), slope_before, promised)
+        return _block(
+            "sweep",
+            (ahead, x, a, self._dt, self._multipliers, self._p, self._width, damping, self._following, open_),
+            (out, change, casadi.vec(feedback.T), slope_before),
+        )
+
+    def _end(self) -> str:
+        """The cost of the last state, with what is ahead of the last step, and its constraints."""
+        x, p = self._x, self._all
+        limits, cost = self._ocp.final_inequalities(x[:8], p), self._ocp.final_cost(x[:8], p)
+        push, stiffness = _price_slopes(limits, self._end_multipliers, self._width)
+        of_limits, held = casadi.jacobian(limits, x), casadi.SX.sym("held", push.shape[0])
+        # How the goal bends counts: its functions are squares, which have no slope in its middle.
+        curved = casadi.substitute(casadi.hessian(casadi.dot(held, limits), x)[0], held, push)
+        hessian = casadi.hessian(cost, x)[0] - curved + of_limits.T @ casadi.diag(stiffness) @ of_limits
+        slope = casadi.gradient(cost, x) - of_limits.T @ push
+        ahead = casadi.vertcat(*(hessian[i, j] for i, j in self._upper), slope, 0)
+        return _block("end", (x, self._end_multipliers, self._p, self._width), (ahead, cost, limits))
+
+    def _hold(self) -> str:
+        """The feedback's action held for a control step: the next state, action, cost, constraints and their price."""
+        about = casadi.SX.sym("about", self.ns)
+        wanted = self._a + self._share * self._step - self._feedback(self._x - about)
+        taken = casadi.vertcat(*(_clipped(wanted[i]) for i in range(2)))
+        limits = self._path(taken)
+        price = casadi.sum1(_price(limits, self._multipliers, self._width))
+        return _block(
+            "hold",
+            (
+                self._x,
+                self._a,
+                self._step,
+                self._share,
+                self._gain,
+                about,
+                self._dt,
+                self._p,
+                self._multipliers,
+                self._width,
+            ),
+            (self._after(self._x, taken, self._substeps), taken, self._rate(taken), limits, price),
+        )
+
+    def _bend(self) -> str:
+        """The same to first order, from a guess that is no motion: how the next state moves, and the action."""
+        moved, x, a = casadi.SX.sym("moved", self.ns), self._x, self._a
+        bent = a + self._share * self._step - self._feedback(moved)
+        reached = self._after(x, a, _SUBSTEPS)
+        change = casadi.jtimes(reached, casadi.vertcat(x, a), casadi.vertcat(moved, bent - a))
+        return _block(
+            "bend",
+            (x, moved, self._following, a, self._step, self._share, self._gain, self._dt, self._p),
+            (change + reached - self._following, bent),
+        )
+
+    def _steer(self) -> str:
+        """The action of `righting.steering` along a path."""
+        path, settings = casadi.SX.sym("path", 8), casadi.SX.sym("settings", 2)
+        target, velocity, acceleration, aside = (tuple(casadi.vertsplit(path[i : i + 2])) for i in (0, 2, 4, 6))
+        limit, x = self._params.force_limit, tuple(casadi.vertsplit(self._x[:8]))
+        loops = settings[0], settings[1]
+        force = righting.steering(self._params, x, aside, *loops, target, limit, velocity, acceleration)
+        return _block("steer", (self._x, path, settings, self._p), (casadi.vertcat(*force) / limit,))
+
+    def _feedback(self, off: casadi.SX) -> casadi.SX:
+        return casadi.reshape(self._gain, self.ns, 2).T @ off
+
+
+def _block(name: str, inputs: Sequence[casadi.SX], outputs: Sequence[casadi.SX]) -> str:
+    parts = [
+        [casadi.vertsplit(casadi.densify(casadi.SX(v))) if v.numel() else [] for v in vs] for vs in (inputs, outputs)
+    ]
+    return codegen.block(
+        name, *([(f"{kind}{i}", part) for i, part in enumerate(some)] for kind, some in zip("io", parts, strict=True))
+    )
+
+
+def _clipped(a: casadi.SX) -> casadi.SX:
+    return ops.clip(a, -_LARGEST_ACTION, _LARGEST_ACTION)
+
+
+def _price(limits: casadi.SX, multipliers: casadi.SX, width: casadi.SX) -> casadi.SX:
+    ratio = limits / width
+    below = casadi.fmin(ratio + 0.5, 0)
+    return multipliers * width * (2 * below * below - 2 * below - casadi.log(1 + (ratio - below)))
+
+
+def _price_slopes(limits: casadi.SX, multipliers: casadi.SX, width: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
+    """By how much the price falls, and how it bends, per constraint."""
+    ratio = limits / width
+    below = casadi.fmin(ratio + 0.5, 0)
+    inside = 1 / (1 + (ratio - below))
+    return multipliers * (inside - 4 * below), multipliers / width * inside * inside
+
+
+def _box_step(hessian: casadi.SX, gradient: casadi.SX, low: casadi.SX, high: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
+    """The d (2,) within [low, high] that minimizes ½ dᵀHd + gᵀd, and the inverse of H (2, 2) in its free components.
+
+    In two dimensions it is the free minimum, or else the least of the minima on the four edges.
+    """
+    a, b, c = hessian[0, 0], hessian[0, 1], hessian[1, 1]
+    determinant = a * c - b * b
+    inverse = casadi.vertcat(casadi.horzcat(c, -b), casadi.horzcat(-b, a)) / determinant
+    free = -inverse @ gradient
+    inside = casadi.logic_and(casadi.mmin(free - low) >= 0, casadi.mmin(high - free) >= 0)
+    on_edges = []
+    for edge in (low, high):
+        first = casadi.vertcat(edge[0], ops.clip(-(gradient[1] + b * edge[0]) / c, low[1], high[1]))
+        second = casadi.vertcat(ops.clip(-(gradient[0] + b * edge[1]) / a, low[0], high[0]), edge[1])
+        on_edges += [first, second]
+    costs = [0.5 * casadi.dot(tried, hessian @ tried) + casadi.dot(gradient, tried) for tried in on_edges]
+    step, least = on_edges[0], costs[0]
+    for tried, cost in zip(on_edges[1:], costs[1:], strict=True):
+        step = casadi.if_else(cost < least, tried, step)
+        least = casadi.fmin(cost, least)
+    step = casadi.if_else(inside, free, step)
+    moves = [casadi.logic_and(step[i] > low[i], step[i] < high[i]) for i in range(2)]
+    both = casadi.logic_and(*moves)
+    alone = casadi.diag(casadi.vertcat(casadi.if_else(moves[0], 1 / a, 0), casadi.if_else(moves[1], 1 / c, 0)))
+    return step, casadi.if_else(both, inverse, alone)
