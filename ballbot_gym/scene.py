@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ballbot_gym.engines import State
+from ballbot_gym.engines.bullet_client import connect, has_pybullet, import_pybullet, load_robot, load_urdf
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import State, connect, has_pybullet, import_pybullet, load_robot, load_urdf
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.viewer import import_viser
 

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from ballbot_gym import dynamics
 from ballbot_gym.checks import finite_array, real_array, reset_options
+from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
 from ballbot_gym.env import (
     REWARD_PARTS,
     check_constant_names,
@@ -27,7 +28,6 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.scene import Scene, check_render_mode
-from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
 
@@ -135,7 +135,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             render_mode: None or "rgb_array", which draws every env in turn.
             autoreset_mode: an `AutoresetMode`, or its value or name; default, SAME_STEP.
-            physics: "rk4". Gymnasium's own vector envs run "bullet".
+            physics: "rk4". Gymnasium's own vector envs run the others.
             max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
@@ -603,13 +603,14 @@ def _most_steps(max_episode_steps: int | None, task: Task) -> int:
 
 def _check_physics(physics: str, task: Task, num_envs: int) -> None:
     """Raises a ValueError that says how to get other physics than the closed form."""
-    if physics == "bullet":
-        raise ValueError(
-            'these vector environments run physics="rk4"; for PyBullet: '
-            f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics="bullet"), or "async"'
-        )
-    if physics != "rk4":
+    if physics not in PHYSICS:
         raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
+    if physics != "rk4":
+        raise ValueError(
+            f'these vector environments run physics="rk4"; for {PHYSICS_NAMES[physics]}: '
+            f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics="{physics}")'
+            ', or "async"'
+        )
 
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:

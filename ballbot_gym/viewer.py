@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym.drawing import BALL, FORCE, FORCE_SCALE, PUSH, Drawing, GroundPath, Robot, arrow, pose
+from ballbot_gym.engines import State
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import State
 from ballbot_gym.tasks.marker import Marker
 
 HOST, PORT = "127.0.0.1", 8080

@@ -17,11 +17,11 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from ballbot_gym import BallbotEnv, Randomization
+from ballbot_gym.engines import installed_physics
 from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.scene import Scene
-from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -221,7 +221,9 @@ def test_same_seed_is_bit_identical_across_resets_and_instances(task, physics):
 def test_same_seed_is_bit_identical_across_processes():
     result = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=True)
     theirs = json.loads(result.stdout.splitlines()[-1])
-    assert theirs == {f"{task} {physics}": digest(task, physics) for task, physics in itertools.product(TASKS, PHYSICS)}
+    assert theirs == {
+        f"{task} {physics}": digest(task, physics) for task, physics in itertools.product(TASKS, installed_physics())
+    }
 
 
 def test_reset_repeats_with_the_seed_in_the_middle_of_an_episode(task, physics, make_env):
@@ -241,8 +243,8 @@ def test_different_seeds_and_following_episodes_differ(task, make_env):
     assert all((a != b).any() for a, b in itertools.combinations(starts, 2))
 
 
-def test_bullet_and_rk4_draw_the_same_episodes(task, make_env):
-    (_, a), (_, b) = (make_env(task, physics=physics).reset(seed=4) for physics in PHYSICS)
+def test_every_physics_draws_the_same_episodes(task, physics, make_env):
+    (_, a), (_, b) = (make_env(task, physics=name).reset(seed=4) for name in (physics, "rk4"))
     np.testing.assert_array_equal(a["state"], b["state"])
     np.testing.assert_array_equal(a["constants"], b["constants"])
 
@@ -415,7 +417,7 @@ def test_bad_action_is_refused_and_changes_nothing(make_env, physics, action, pr
 @pytest.mark.parametrize(
     ("kwargs", "error", "problem"),
     [
-        ({"physics": "mujoco"}, ValueError, "unknown physics 'mujoco'; known: 'bullet', 'rk4'"),
+        ({"physics": "dart"}, ValueError, "unknown physics 'dart'; known: 'bullet', 'mujoco', 'rk4'"),
         ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'"),
         ({"task": "juggle"}, ValueError, "unknown task 'juggle'; known: 'stabilize'"),
         (
@@ -646,7 +648,7 @@ def test_frame_rate_is_that_of_the_control_steps(make_env):
 
 
 if __name__ == "__main__":  # the other process of test_same_seed_is_bit_identical_across_processes
-    print(json.dumps({f"{task} {physics}": digest(task, physics) for task in TASKS for physics in PHYSICS}))
+    print(json.dumps({f"{task} {physics}": digest(task, physics) for task in TASKS for physics in installed_physics()}))
 
 
 # --- functions of the observation as controllers ---

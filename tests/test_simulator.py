@@ -11,10 +11,13 @@ import pybullet
 import pytest
 
 from ballbot_gym import dynamics
+from ballbot_gym.engines import make_simulator
+from ballbot_gym.engines.bullet import BulletSimulator
+from ballbot_gym.engines.bullet_client import import_pybullet
+from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import ROBOTS, named_robot
 from ballbot_gym.scene import Scene
-from ballbot_gym.simulator import PHYSICS, BulletSimulator, Rk4Simulator, import_pybullet, make_simulator
 from ballbot_gym.vector import BallbotVectorEnv
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
@@ -24,7 +27,7 @@ GENTLE = (0.0, 0.0, 0.2, -0.1, 1.0, -2.0, 0.5, 0.3)
 
 def held(params, physics, x, u, seconds, physics_dt):
     """The state after holding u for some seconds."""
-    simulator = PHYSICS[physics](params, seconds, physics_dt)
+    simulator = make_simulator(physics, params, seconds, physics_dt)
     simulator.reset(x)
     try:
         return np.array(simulator.step(u))
@@ -162,7 +165,7 @@ def test_substeps_in_bullet_are_bitwise_as_many_steps(params):
 
 
 def test_reset_leaves_no_trace_of_what_was_before(params, physics):
-    simulator = PHYSICS[physics](params, 0.02)
+    simulator = make_simulator(physics, params, 0.02)
     runs = []
     for _ in range(2):
         simulator.reset(START)
@@ -172,7 +175,7 @@ def test_reset_leaves_no_trace_of_what_was_before(params, physics):
 
 
 def test_two_simulators_do_not_disturb_each_other(params, physics):
-    alone, beside, other = (PHYSICS[physics](params, 0.02) for _ in range(3))
+    alone, beside, other = (make_simulator(physics, params, 0.02) for _ in range(3))
     for simulator in (alone, beside):
         simulator.reset(START)
     expected = [alone.step(FORCE) for _ in range(10)]
@@ -218,7 +221,7 @@ def test_running_out_of_clients_says_what_to_do(params, monkeypatch):
 @pytest.mark.parametrize("physics_dt", [0.003, 0.03, 0.0, -0.001])
 def test_physics_step_must_be_a_whole_fraction_of_the_control_step(params, physics, physics_dt):
     with pytest.raises(ValueError, match=r"whole fraction of control_dt = 0\.02 s"):
-        PHYSICS[physics](params, 0.02, physics_dt)
+        make_simulator(physics, params, 0.02, physics_dt)
 
 
 def test_missing_pybullet_names_the_remedy(monkeypatch, make_env):

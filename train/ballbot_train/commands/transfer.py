@@ -48,7 +48,7 @@ def transfer(
         frictions: coefficients of friction of the floor, for a robot whose ball rolls; default, the robot's own.
         episodes: how many of each task's certified episodes.
         quick: only 3 episodes of each task.
-        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed, with contact where the ball rolls.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed, with contact where the ball rolls.
         seed: of the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
         workers: who does the work.

@@ -101,7 +101,7 @@ def run(
         robot: what they run on, by name.
         frictions: of the floors; None is the robot's own.
         episodes: certified episodes of each task, from the first.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         on_progress: called with a task and a number of finished episodes.

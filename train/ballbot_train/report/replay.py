@@ -131,7 +131,7 @@ def certified_replay(
         task: name of a task.
         controllers: names of controllers, or paths of policy files.
         episode: index of the episode.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         skip_planless: leave out controllers that find no plan.
         robot: by name.
         frictions: coefficients of friction of the floors, for a robot whose ball rolls; default, its own. Controllers
