@@ -18,14 +18,14 @@ from ballbot_gym.checks import finite_array, real_array, reset_options
 from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.picture import YAW, PictureScene
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot, named_robot, own_fields
-from ballbot_gym.scene import CAMERA_YAW, Scene, check_render_mode, window_trouble
+from ballbot_gym.scene import Window, check_render_mode, window_trouble
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.viewer import PageScene
 
-_VIEW = math.radians(-CAMERA_YAW)
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 
 
@@ -153,8 +153,8 @@ class BallbotEnv(gymnasium.Env):
             task: a name in `TASKS`, or a Task.
             physics: "bullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the closed-form model.
                 Default, the first of these that is installed; "rk4" comes with a warning.
-            render_mode: None; "rgb_array", which PyBullet draws; or "human": PyBullet's window, or a page in the browser
-                where none can open.
+            render_mode: None; "rgb_array", which needs no display; or "human": PyBullet's window, or a page in the
+                browser where none can open.
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
                 10 ms for rk4.
@@ -170,7 +170,7 @@ class BallbotEnv(gymnasium.Env):
             RuntimeError: render_mode="human" where neither a window nor a page can open.
         """
         self._spec: EnvSpec | None = None
-        self._scene: Scene | PageScene | None = None
+        self._scene: PictureScene | Window | PageScene | None = None
         self._state: State = ()  # until the first reset
         physics = default_physics() if physics is None else physics
         if not isinstance(physics, str) or physics not in PHYSICS:
@@ -298,7 +298,7 @@ class BallbotEnv(gymnasium.Env):
 
     def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:
         """Keys for `gymnasium.utils.play.play(env, noop=np.zeros(2))`: w, a, s, d push the ball as seen on the screen."""
-        ahead = np.array([math.sin(_VIEW), math.cos(_VIEW)])
+        ahead = np.array([math.sin(-YAW), math.cos(-YAW)])
         aside = np.array([-ahead[1], ahead[0]])
         ways = {"w": ahead, "a": aside, "s": -ahead, "d": -aside}
         pairs = {(one, other): ways[one] + ways[other] for one in "ws" for other in "ad"}
@@ -369,12 +369,13 @@ class BallbotEnv(gymnasium.Env):
             self._scene.close()
             self._scene = None
 
-    def _make_scene(self) -> "Scene | PageScene":
+    def _make_scene(self) -> PictureScene | Window | PageScene:
         """A picture, a window, or a page in the browser where no window can open."""
-        human = self.render_mode == "human"
-        if human and (reason := window_trouble()):
+        if self.render_mode != "human":
+            return PictureScene(self.params)
+        if reason := window_trouble():
             return PageScene(self.params, self.task.control_dt, reason)
-        return Scene(self.params, human=human)
+        return Window(self.params)
 
     def _check_open(self) -> None:
         if self._closed:

@@ -25,9 +25,9 @@ from ballbot_gym.env import (
 )
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.picture import PictureScene
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
-from ballbot_gym.scene import Scene, check_render_mode
 from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
 
@@ -152,7 +152,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'rgb_array'")
-        check_render_mode(render_mode)
         if engine not in _ENGINES:
             raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
         self._spec: EnvSpec | None = None
@@ -181,7 +180,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         for array in (self._none, self._nothing, self._everywhere):
             array.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
-        self._scene: Scene | None = None
+        self._scene: PictureScene | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -318,7 +317,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if self.batch.state is None:
             raise gymnasium.error.ResetNeeded("render() before reset()")
         if self._scene is None:
-            self._scene = Scene(self.params)
+            self._scene = PictureScene(self.params)
         images = []
         for x, c in zip(self.batch.state.x.T.tolist(), np.array(self.batch.state.c.T.tolist()), strict=True):
             self._scene.set_markers(self.task.markers(c))

@@ -21,9 +21,7 @@ from ballbot_gym.engines import installed_physics
 from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import ActionController, rollout
-from ballbot_gym.scene import Scene
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 
@@ -540,28 +538,6 @@ def test_rendering_does_not_change_the_trajectory(task, physics, make_env, rng):
             if mode:
                 env.render()
     np.testing.assert_array_equal(states[0], states[1])
-
-
-def test_what_a_task_marks_is_drawn_and_removed_again(params):
-    scene = Scene(params, width=160, height=120)
-    bare = scene.draw(tuple(UPRIGHT))
-    scene.set_markers([Marker((0.5, 0.5), 0.2, 0.5, (0.9, 0.1, 0.1, 1.0))])
-    marked = scene.draw(tuple(UPRIGHT))
-    scene.set_markers([])
-    after = scene.draw(tuple(UPRIGHT))
-    scene.close()
-    assert (marked != bare).any()
-    np.testing.assert_array_equal(after, bare)
-
-
-def test_camera_follows_the_ball(params):
-    scene = Scene(params, width=160, height=120)
-    orange = []
-    for x in (0.0, 20.0):
-        frame = scene.draw((x, -x, *UPRIGHT[2:]))
-        orange.append(np.argwhere((frame[..., 0] > 120) & (frame[..., 2] < 60)).mean(axis=0))
-    scene.close()
-    np.testing.assert_allclose(orange[0], orange[1], atol=2)  # pixels
 
 
 def test_without_a_display_and_without_viser_the_window_is_refused(monkeypatch, make_env):

@@ -428,7 +428,7 @@ def test_a_certified_set_is_of_one_robot(tmp_path):
 
 
 def test_transfer_tells_who_was_made_for_what(tmp_path):
-    arguments = {"tasks": ("stabilize",), "controllers": ("lqr",), "robot": "paper", "physics": "rk4", "workers": 1}
+    arguments = {"tasks": ("stabilize",), "controllers": ("lqr",), "robot": "paper", "physics": ("rk4",), "workers": 1}
     transfer(episodes=2, made_for=("paper", "kugle"), out=tmp_path, **arguments)
     rows = list(csv.DictReader((tmp_path / "transfer.csv").open()))
     assert [(row["made_for"], row["robot"], row["episodes"]) for row in rows] == [
