@@ -21,7 +21,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import YAW, PictureScene
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot, named_robot, own_fields
-from ballbot_gym.scene import Window, check_render_mode, window_trouble
+from ballbot_gym.scene import Window, check_render_mode, usable_render_modes, window_trouble
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.viewer import PageScene
@@ -182,7 +182,8 @@ class BallbotEnv(gymnasium.Env):
         self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
+        fps = round(1 / self.task.control_dt)
+        self.metadata = {**self.metadata, "render_modes": usable_render_modes(), "render_fps": fps}
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.randomization = checked_randomization(randomization)
         self._disturbance = (

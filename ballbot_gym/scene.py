@@ -10,6 +10,7 @@ import sys
 import weakref
 from collections.abc import Sequence
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 from ballbot_gym.engines import State
@@ -36,20 +37,28 @@ def check_render_mode(render_mode: str | None) -> None:
             ) from error
 
 
+def usable_render_modes() -> list[str]:
+    """The render modes of this machine, without "human" where it is plain that neither a window nor a page can open."""
+    return ["rgb_array"] if _plain_trouble() and find_spec("viser") is None else ["human", "rgb_array"]
+
+
 def window_trouble() -> str:
     """Why no window can open; "" where one can."""
+    trouble = _plain_trouble()
+    return trouble or (_trouble_of(os.environ.get("DISPLAY", "")) if sys.platform.startswith("linux") else "")
+
+
+def _plain_trouble() -> str:
+    """The same, where no window need be tried for it."""
     if not has_pybullet():
         return "PyBullet is not installed"
-    if not sys.platform.startswith("linux"):
-        return ""
-    return _trouble_of(os.environ.get("DISPLAY", ""))
+    needs_display = sys.platform.startswith("linux")
+    return "DISPLAY is not set" if needs_display and not os.environ.get("DISPLAY", "") else ""
 
 
 @cache
 def _trouble_of(display: str) -> str:
     """The same on an X server. PyBullet ends its process where it cannot open a window, so another one tries it first."""
-    if not display:
-        return "DISPLAY is not set"
     command = [sys.executable, "-c", _OPEN_WINDOW]
     try:
         tried = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, timeout=_OPENING_SECONDS)

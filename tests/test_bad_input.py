@@ -799,7 +799,7 @@ TYPED = [
     ("benchmark --episodes 1e9", "invalid"),
     ("benchmark --seed -1", "seed must be at least 0, not -1"),
     ("benchmark --workers 0", "workers must be at least 1, not 0"),
-    ("benchmark --physics mujoco", "invalid choice"),
+    ("benchmark --physics dart", "invalid choice"),
     ("robustness --stresses wind", "unknown stress wind; known: push"),
     ("robustness --episodes 500", "episodes must be 1 to 200"),
     ("basins --points 4", "points must be odd, and 3 to 501, not 4"),

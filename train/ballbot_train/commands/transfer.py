@@ -119,7 +119,7 @@ def _compare(
         ["task", "made for", "controller", "friction", "engines", "ends otherwise", "regret apart"],
         [
             [d.task, d.made_for, d.controller, f"{d.friction:g}", f"{d.first}, {d.second}", f"{len(d.episodes)}/{d.of}",
-             f"{d.regret:+.2%}"]
+             f"{d.regret:+.2%}" if d.both else "–"]
             for d in found
         ],
     )  # fmt: skip
