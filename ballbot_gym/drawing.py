@@ -26,6 +26,8 @@ PUSH = "#1a9e5c"
 GHOST_OPACITY = 0.4
 FORCE_SCALE = 1 / 400
 """Length of the force's arrow, m/N."""
+LARGEST_PUSH_ARROW = 1.0
+"""m: longer arrows of pushes are cut."""
 LEAST_FORCE = 2.0
 """N: smaller forces get no arrow."""
 _NEAR, _FAR = 3.0, 6.0  # m from the last robot: from where on another counts less, and from where on not at all
@@ -128,3 +130,12 @@ def arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] 
         return None
     ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
     return ball, ball + FORCE_SCALE * np.array([*robot.u, 0.0])
+
+
+def push_arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:
+    """Start and end (3,), m, of the arrow of a push, which ends at the ball's centre; None where there is none."""
+    if robot.push is None or not (size := float(np.hypot(*robot.push))) > 0:
+        return None
+    ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
+    length = min(FORCE_SCALE * size, LARGEST_PUSH_ARROW) / size
+    return ball - length * np.array([*robot.push, 0.0]), ball

@@ -15,24 +15,18 @@ from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
 from ballbot_gym.checks import finite_array, real_array, reset_options
+from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
+from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.picture import YAW, PictureScene
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot, named_robot, own_fields
-from ballbot_gym.scene import CAMERA_YAW, Scene, check_render_mode, window_trouble
-from ballbot_gym.simulator import (
-    PHYSICS,
-    BulletContactSimulator,
-    Rk4Simulator,
-    State,
-    default_physics,
-    make_simulator,
-)
+from ballbot_gym.scene import Window, check_render_mode, usable_render_modes, window_trouble
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.viewer import PageScene
 
-_VIEW = math.radians(-CAMERA_YAW)
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 
 
@@ -78,6 +72,8 @@ class EnvState(NamedTuple):
     """State of the random number generator."""
     disturbance: DisturbanceState | None
     """Of the randomized robot and actuator; None where nothing varies."""
+    memory: tuple[float, ...] = ()
+    """What the simulator remembers besides the state; see `Simulator.memory`."""
 
 
 class Step(NamedTuple):
@@ -131,8 +127,8 @@ class BallbotEnv(gymnasium.Env):
 
     Only robots whose friction is limited have `grip`. Such a robot has lost its grip if it needs more friction, or a floor
     that pulls, when a step begins or at its end. The closed form cannot say how it slips, so with physics="rk4" that is a
-    failure, and `violated` is the index of "grip". PyBullet simulates the contact of a rolling ball: it slips or leaves the
-    floor, and that by itself is no failure. `grip` is then the force at the end of the step.
+    failure, and `violated` is the index of "grip". PyBullet and MuJoCo simulate the contact of a rolling ball: it slips or
+    leaves the floor, and that by itself is no failure. `grip` is then the force at the end of the step.
 
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
@@ -157,12 +153,13 @@ class BallbotEnv(gymnasium.Env):
 
         Args:
             task: a name in `TASKS`, or a Task.
-            physics: "bullet", the URDF in PyBullet, or "rk4", the closed-form model; default, "bullet" where PyBullet is
-                installed, else "rk4" with a warning.
-            render_mode: None; "rgb_array", which PyBullet draws; or "human": PyBullet's window, or a page in the browser
-                where none can open.
+            physics: "bullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the closed-form model.
+                Default, the first of these that is installed; "rk4" comes with a warning.
+            render_mode: None; "rgb_array", which needs no display; or "human": PyBullet's window, or a page in the
+                browser where none can open.
             params: the robot as a BallbotParams; the same as robot.
-            physics_dt: s, the simulator's step; default 1 ms for Bullet and 10 ms for rk4.
+            physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
+                10 ms for rk4.
             randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
                 and 5 kB of memory that PyBullet never frees.
             robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
@@ -171,11 +168,11 @@ class BallbotEnv(gymnasium.Env):
         Raises:
             ValueError: an unknown task, physics or render mode, or a task field out of its range.
             TypeError: a keyword that is no field of the task.
-            ImportError: physics="bullet" or render_mode="rgb_array" without a usable PyBullet.
+            ImportError: physics="bullet" without a usable PyBullet, or "mujoco" without MuJoCo.
             RuntimeError: render_mode="human" where neither a window nor a page can open.
         """
         self._spec: EnvSpec | None = None
-        self._scene: Scene | PageScene | None = None
+        self._scene: PictureScene | Window | PageScene | None = None
         self._state: State = ()  # until the first reset
         physics = default_physics() if physics is None else physics
         if not isinstance(physics, str) or physics not in PHYSICS:
@@ -187,7 +184,8 @@ class BallbotEnv(gymnasium.Env):
         self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
+        fps = round(1 / self.task.control_dt)
+        self.metadata = {**self.metadata, "render_modes": usable_render_modes(), "render_fps": fps}
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.randomization = checked_randomization(randomization)
         self._disturbance = (
@@ -281,7 +279,7 @@ class BallbotEnv(gymnasium.Env):
     def slip(self) -> float:
         """Speed of the ball's lowest point over the floor, m/s: 0 in models whose ball cannot slip."""
         self._check_open()
-        return math.hypot(*self._simulator.slip()) if isinstance(self._simulator, BulletContactSimulator) else 0.0
+        return math.hypot(*self._simulator.slip())
 
     def render(self) -> np.ndarray | None:
         """The current state as an image (height, width, 3), uint8, or in the window of render_mode="human"."""
@@ -302,7 +300,7 @@ class BallbotEnv(gymnasium.Env):
 
     def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:
         """Keys for `gymnasium.utils.play.play(env, noop=np.zeros(2))`: w, a, s, d push the ball as seen on the screen."""
-        ahead = np.array([math.sin(_VIEW), math.cos(_VIEW)])
+        ahead = np.array([math.sin(-YAW), math.cos(-YAW)])
         aside = np.array([-ahead[1], ahead[0]])
         ways = {"w": ahead, "a": aside, "s": -ahead, "d": -aside}
         pairs = {(one, other): ways[one] + ways[other] for one in "ws" for other in "ad"}
@@ -321,7 +319,8 @@ class BallbotEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("get_state() before reset()")
         disturbance = None if self._disturbance is None else self._disturbance.get_state()
         rng = dict(self.np_random.bit_generator.state)
-        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance)
+        memory = self._simulator.memory()
+        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance, memory)
 
     def set_state(self, state: EnvState) -> None:
         """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
@@ -344,13 +343,15 @@ class BallbotEnv(gymnasium.Env):
         self.np_random.bit_generator.state = state.rng
         if self._disturbance is not None and state.disturbance is not None:
             self._disturbance.set_state(state.disturbance)
-        self._restore_simulator()
+        self._restore_simulator(state.memory)
 
     def __getstate__(self) -> dict[str, Any]:
         self.np_random  # noqa: B018  an env that was never seeded is seeded here, so that its copy draws the same episodes
-        return {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_scene", "_judge")}
+        kept = {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_scene", "_judge")}
+        return kept | {"_memory": () if self._closed else self._simulator.memory()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        memory = state.pop("_memory")
         self.__dict__.update(state)
         self._scene = self._judge = None
         self._simulator = make_simulator(self.physics, self.params, self.task.control_dt, self._physics_dt)
@@ -359,7 +360,7 @@ class BallbotEnv(gymnasium.Env):
         elif self._state:
             self._use_code(start=False)
             self._set_constants(self._constants)
-            self._restore_simulator()
+            self._restore_simulator(memory)
 
     def close(self) -> None:
         """Releases the physics client and the window; may be called again."""
@@ -370,12 +371,13 @@ class BallbotEnv(gymnasium.Env):
             self._scene.close()
             self._scene = None
 
-    def _make_scene(self) -> "Scene | PageScene":
+    def _make_scene(self) -> PictureScene | Window | PageScene:
         """A picture, a window, or a page in the browser where no window can open."""
-        human = self.render_mode == "human"
-        if human and (reason := window_trouble()):
+        if self.render_mode != "human":
+            return PictureScene(self.params)
+        if reason := window_trouble():
             return PageScene(self.params, self.task.control_dt, reason)
-        return Scene(self.params, human=human)
+        return Window(self.params)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -396,11 +398,11 @@ class BallbotEnv(gymnasium.Env):
         if self._judge is None and (code := Judge.made(self.task, start)) is not None:
             self._judge = Judge(code, self.task)
 
-    def _restore_simulator(self) -> None:
-        """Puts the simulator into the env's state. Joint positions and velocities are all that Bullet remembers of a step."""
+    def _restore_simulator(self, memory: tuple[float, ...] = ()) -> None:
+        """Puts the simulator into the env's state, and what it remembers besides into its memory."""
         if self._disturbance is not None and self.randomization.varies_robot:
             self._simulator.set_params(self._disturbance.params)
-        self._simulator.reset(self._state)
+        self._simulator.reset(self._state, memory)
 
     def _advance(self, force: tuple[float, float], clipped: bool) -> Step:
         """Holds a force, N, for one control step."""

@@ -14,10 +14,10 @@ import numpy as np
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BatchState, BatchStep, seeds_of
 from ballbot_gym.checks import check_num_envs
+from ballbot_gym.engines import State
 from ballbot_gym.env import BallbotEnv, Step, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import DisturbanceState, Randomization
-from ballbot_gym.simulator import State
 from ballbot_gym.tasks import Task
 
 _NOTHING = Step(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, -1, False)

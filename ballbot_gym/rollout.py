@@ -10,10 +10,10 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym.checks import real_array
+from ballbot_gym.engines import default_physics, make_simulator
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.simulator import default_physics, make_simulator
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
@@ -179,7 +179,7 @@ def simulate(
 ) -> Trajectory:
     """Runs a controller without a task, from state x0 (8,) for `duration` s. Forces are clipped to the robot's limit.
 
-    `physics` is by default "bullet" where PyBullet is installed, else "rk4" with a warning.
+    `physics` is "bullet", "mujoco" or "rk4"; default, the first that is installed, as for environments.
     """
     simulator = make_simulator(default_physics() if physics is None else physics, params, control_dt)
     x = np.asarray(x0, np.float64)

@@ -1,4 +1,4 @@
-"""Scene: draws states of the ballbot with PyBullet.
+"""The window of render_mode="human", by PyBullet, and why none can open where none can.
 
 It has its own physics client, so that drawing never changes a trajectory.
 """
@@ -8,64 +8,57 @@ import os
 import subprocess
 import sys
 import weakref
+from collections.abc import Sequence
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
-
+from ballbot_gym.engines import State
+from ballbot_gym.engines.bullet_client import connect, has_pybullet, import_pybullet, load_robot, load_urdf
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import State, connect, has_pybullet, import_pybullet, load_robot, load_urdf
+from ballbot_gym.picture import YAW
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.viewer import import_viser
 
-CAMERA_YAW = -55.0
-"""Direction in which pictures look, degrees from the y axis, positive to the left: from behind a robot that moves along x."""
-
-_CAMERA = (4.0, CAMERA_YAW, -22.0)  # distance, m, yaw and pitch, deg
-
-
-_NO_PICTURES = (
-    'render_mode="rgb_array" draws with it. Without it, render_mode="human" shows the robot on a page in the browser, '
-    "where viser is installed."
-)
+_CAMERA = (4.0, math.degrees(YAW), -22.0)  # distance, m, yaw and pitch, deg
 _OPEN_WINDOW = "import os, pybullet; pybullet.connect(pybullet.GUI); print('a window', flush=True); os._exit(0)"
 _OPENING_SECONDS = 60.0
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Raises an error that says what to do where a render mode cannot draw on this machine.
-
-    Raises:
-        ImportError: "rgb_array" without PyBullet.
-        RuntimeError: "human" where neither a window nor a page can open.
-    """
-    if render_mode == "rgb_array":
-        import_pybullet(_NO_PICTURES)
-    elif render_mode == "human" and (trouble := window_trouble()):
+    """Raises a RuntimeError that says what to do if render_mode is "human" where neither window nor page can open."""
+    if render_mode == "human" and (trouble := window_trouble()):
         try:
             import_viser()
         except ImportError as error:
-            modest = 'render_mode="rgb_array"' if has_pybullet() else "an environment without a render mode"
             raise RuntimeError(
                 f'render_mode="human" opens a window, and {trouble}; it shows a page instead where viser is installed: '
-                f"{error}. Or take {modest}, which needs neither"
+                f'{error}. Or take render_mode="rgb_array", which needs neither'
             ) from error
+
+
+def usable_render_modes() -> list[str]:
+    """The render modes of this machine, without "human" where it is plain that neither a window nor a page can open."""
+    return ["rgb_array"] if _plain_trouble() and find_spec("viser") is None else ["human", "rgb_array"]
 
 
 def window_trouble() -> str:
     """Why no window can open; "" where one can."""
+    trouble = _plain_trouble()
+    return trouble or (_trouble_of(os.environ.get("DISPLAY", "")) if sys.platform.startswith("linux") else "")
+
+
+def _plain_trouble() -> str:
+    """The same, where no window need be tried for it."""
     if not has_pybullet():
         return "PyBullet is not installed"
-    if not sys.platform.startswith("linux"):
-        return ""
-    return _trouble_of(os.environ.get("DISPLAY", ""))
+    needs_display = sys.platform.startswith("linux")
+    return "DISPLAY is not set" if needs_display and not os.environ.get("DISPLAY", "") else ""
 
 
 @cache
 def _trouble_of(display: str) -> str:
     """The same on an X server. PyBullet ends its process where it cannot open a window, so another one tries it first."""
-    if not display:
-        return "DISPLAY is not set"
     command = [sys.executable, "-c", _OPEN_WINDOW]
     try:
         tried = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, timeout=_OPENING_SECONDS)
@@ -76,66 +69,42 @@ def _trouble_of(display: str) -> str:
     return "" if opened else f"PyBullet can open none on DISPLAY={display}"
 
 
-class Scene:
-    """Draws the ballbot on a floor with 1 m squares, with PyBullet's software renderer or in its window.
+class Window:
+    """PyBullet's window, which shows a ballbot on a floor with 1 m squares. Its camera follows the ball."""
 
-    The camera follows the ball.
-    """
-
-    def __init__(self, params: BallbotParams, human: bool = False, width: int = 640, height: int = 480):
-        """Args: human opens a window instead of drawing into arrays; width and height in pixels.
+    def __init__(self, params: BallbotParams):
+        """Opens the window.
 
         Raises:
             ImportError: PyBullet is missing or was built without NumPy.
-            RuntimeError: human where no window can open.
+            RuntimeError: no window can open.
         """
-        bullet = import_pybullet(_NO_PICTURES)
-        if human and (trouble := window_trouble()):
+        if trouble := window_trouble():
             raise RuntimeError(f"no window can open: {trouble}")
-        self._client = connect(bullet, bullet.GUI if human else bullet.DIRECT)
+        bullet = import_pybullet()
+        self._client = connect(bullet, bullet.GUI)
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
-        self._bullet, self._human, self._size = bullet, human, (width, height)
-        if human:
-            bullet.configureDebugVisualizer(bullet.COV_ENABLE_GUI, 0, physicsClientId=self._client)
+        self._bullet = bullet
+        bullet.configureDebugVisualizer(bullet.COV_ENABLE_GUI, 0, physicsClientId=self._client)
         self._robot, self._joints = load_robot(bullet, self._client, params)
-        self._params = params
         self._markers: list[int] = []
         self._add_floor()
 
-    def set_markers(self, markers: list[Marker]) -> None:
+    def set_markers(self, markers: Sequence[Marker]) -> None:
         """Replaces the task's markers."""
         for body in self._markers:
             self._bullet.removeBody(body, physicsClientId=self._client)
         self._markers = [body for marker in markers for body in self._add_marker(marker)]
 
-    def draw(self, x: State) -> np.ndarray | None:
-        """Shows state x; returns (height, width, 3) uint8, or None in a window."""
+    def draw(self, x: State) -> None:
+        """Shows state x."""
         bullet, client = self._bullet, self._client
         for i, joint in enumerate(self._joints):
             bullet.resetJointState(self._robot, joint, x[i], 0.0, physicsClientId=client)
-        target = (x[0], x[1], 0.5)
-        if self._human:
-            bullet.resetDebugVisualizerCamera(*_CAMERA, target, physicsClientId=client)
-            return None
-        width, height = self._size
-        view = bullet.computeViewMatrixFromYawPitchRoll(target, *_CAMERA, 0, 2)
-        projection = bullet.computeProjectionMatrixFOV(45, width / height, 0.1, 60)
-        image = bullet.getCameraImage(
-            width,
-            height,
-            view,
-            projection,
-            lightDirection=(-4, -6, 12),
-            lightDistance=20,
-            shadow=1,
-            renderer=bullet.ER_TINY_RENDERER,
-            flags=bullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=client,
-        )[2]
-        return np.reshape(image, (height, width, 4))[:, :, :3].astype(np.uint8)
+        bullet.resetDebugVisualizerCamera(*_CAMERA, (x[0], x[1], 0.5), physicsClientId=client)
 
     def close(self) -> None:
-        """Closes the window or releases the client; may be called again."""
+        """Closes the window; may be called again."""
         self._release()
 
     def _add_floor(self) -> None:

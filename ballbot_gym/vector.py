@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from ballbot_gym import dynamics
 from ballbot_gym.checks import finite_array, real_array, reset_options
+from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
 from ballbot_gym.env import (
     REWARD_PARTS,
     check_constant_names,
@@ -24,10 +25,9 @@ from ballbot_gym.env import (
 )
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.picture import PictureScene
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
-from ballbot_gym.scene import Scene, check_render_mode
-from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
 
@@ -135,7 +135,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             render_mode: None or "rgb_array", which draws every env in turn.
             autoreset_mode: an `AutoresetMode`, or its value or name; default, SAME_STEP.
-            physics: "rk4". Gymnasium's own vector envs run "bullet".
+            physics: "rk4". Gymnasium's own vector envs run the others.
             max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
@@ -152,7 +152,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'rgb_array'")
-        check_render_mode(render_mode)
         if engine not in _ENGINES:
             raise ValueError(f"unknown engine {engine!r}; known: {', '.join(map(repr, _ENGINES))}")
         self._spec: EnvSpec | None = None
@@ -181,7 +180,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         for array in (self._none, self._nothing, self._everywhere):
             array.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
-        self._scene: Scene | None = None
+        self._scene: PictureScene | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -318,7 +317,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if self.batch.state is None:
             raise gymnasium.error.ResetNeeded("render() before reset()")
         if self._scene is None:
-            self._scene = Scene(self.params)
+            self._scene = PictureScene(self.params)
         images = []
         for x, c in zip(self.batch.state.x.T.tolist(), np.array(self.batch.state.c.T.tolist()), strict=True):
             self._scene.set_markers(self.task.markers(c))
@@ -603,13 +602,14 @@ def _most_steps(max_episode_steps: int | None, task: Task) -> int:
 
 def _check_physics(physics: str, task: Task, num_envs: int) -> None:
     """Raises a ValueError that says how to get other physics than the closed form."""
-    if physics == "bullet":
-        raise ValueError(
-            'these vector environments run physics="rk4"; for PyBullet: '
-            f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics="bullet"), or "async"'
-        )
-    if physics != "rk4":
+    if physics not in PHYSICS:
         raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
+    if physics != "rk4":
+        raise ValueError(
+            f'these vector environments run physics="rk4"; for {PHYSICS_NAMES[physics]}: '
+            f'gymnasium.make_vec("{task.id}", num_envs={num_envs}, vectorization_mode="sync", physics="{physics}")'
+            ', or "async"'
+        )
 
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.drawing import BALL, FORCE, FORCE_SCALE, PUSH, Drawing, GroundPath, Robot, arrow, pose
+from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrow, pose, push_arrow
+from ballbot_gym.engines import State
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.simulator import State
 from ballbot_gym.tasks.marker import Marker
 
 HOST, PORT = "127.0.0.1", 8080
@@ -32,7 +32,6 @@ _LINE_HEIGHT = 0.008  # m, so that lines on the floor do not flicker
 _SHADOW, _SHADOW_HEIGHT = 0.3, 0.003  # opacity, and m above the floor
 _MOST_SEGMENTS = 120  # of a path
 _DASH = 2  # a dashed line shows every second segment
-_LARGEST_PUSH_ARROW = 1.0  # m
 _FOLLOW = 0.15  # share of the distance by which the camera follows in each drawing
 _GRAB_REACH = 3.0  # m, the farthest that a drag counts
 
@@ -189,11 +188,7 @@ class Viewer:
         ball.position, body.position, body.wxyz = place.ball, place.body, place.turn
         keys = {key, f"force {robot.name}", f"push {robot.name}"}
         self._draw_arrow(f"force {robot.name}", arrow(params, robot), FORCE)
-        push = None
-        if robot.push is not None and (size := float(np.hypot(*robot.push))) > 0:
-            length = min(FORCE_SCALE * size, _LARGEST_PUSH_ARROW) / size
-            push = place.ball - length * np.array([*robot.push, 0.0]), place.ball
-        self._draw_arrow(f"push {robot.name}", push, PUSH)
+        self._draw_arrow(f"push {robot.name}", push_arrow(params, robot), PUSH)
         return keys
 
     def _add_robot(self, params: BallbotParams, robot: Robot, grab: bool) -> list[Any]:
@@ -292,7 +287,7 @@ class Viewer:
 
 
 class PageScene:
-    """Shows an environment in a page instead of a window, in real time. It has the methods of `Scene`."""
+    """Shows an environment in a page instead of a window, in real time. It has the methods of `PictureScene`."""
 
     def __init__(self, params: BallbotParams, frame_seconds: float, reason: str):
         """Starts the page and says its address on stderr.

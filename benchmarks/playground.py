@@ -97,7 +97,7 @@ def measure(
         task: name of a task.
         controller: of the robot.
         ghosts: controllers beside it.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         growth: MiB that memory may grow after the first minute.
         out: folder of the tables.
     """

@@ -22,8 +22,8 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from ballbot_gym import TASKS, BallbotEnv, files
+from ballbot_gym.engines.bullet import BulletSimulator
 from ballbot_gym.params import default_params
-from ballbot_gym.simulator import BulletSimulator
 
 _CONTROL_DT = 0.02  # s
 _EPISODE = 40  # control steps after which the raw loop resets, about as long as random forces leave the robot upright

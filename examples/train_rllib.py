@@ -39,7 +39,7 @@ def main(
         gamma: discount.
         every: iterations from one report to the next.
         episodes: certified episodes that are run in the end.
-        physics: of those, "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        physics: of those, "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of everything that is drawn.
         ray: address of a cluster whose nodes have ballbot-gym; default, a Ray of its own on this machine.
         save: folder of a checkpoint in the end.

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import ballbot_gym
+from ballbot_gym.engines import installed_physics
 from ballbot_gym.params import default_params
-from ballbot_gym.simulator import PHYSICS
 from ballbot_gym.tasks import TASKS
 from ballbot_train import cli
 
@@ -29,7 +29,7 @@ def task(request):
     return request.param()
 
 
-@pytest.fixture(params=PHYSICS)
+@pytest.fixture(params=installed_physics())
 def physics(request):
     return request.param
 

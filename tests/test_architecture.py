@@ -88,9 +88,13 @@ def test_every_room_is_looked_at():
     assert {room_of(path) for path in FILES} == set(ROOMS)
 
 
-def test_only_simulator_and_scene_know_pybullet():
-    knowing = [path for path in FILES if imports(path) & {"pybullet", "pybullet_data"}]
-    assert relative(knowing) == ["ballbot_gym/scene.py", "ballbot_gym/simulator.py"]
+def test_only_the_engines_and_the_window_know_physics_engines():
+    knowing = [path for path in FILES if imports(path) & {"pybullet", "pybullet_data", "mujoco"}]
+    assert relative(knowing) == [
+        "ballbot_gym/engines/bullet_client.py",
+        "ballbot_gym/engines/mujoco.py",
+        "ballbot_gym/scene.py",
+    ]
 
 
 def test_only_the_viewer_knows_viser():
@@ -99,7 +103,7 @@ def test_only_the_viewer_knows_viser():
 
 
 def test_environments_import_no_solver_and_no_learner_at_their_top():
-    heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "scipy", "matplotlib", "viser"}
+    heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "mujoco", "scipy", "matplotlib", "viser"}
     # these are written in torch and CasADi, and imported when first used
     batched = {"batch.py", "codegen.py", "counter_rng.py", "vector.py"}
     gym = [path for path in FILES if package(path) == "ballbot_gym" and path.name not in batched]

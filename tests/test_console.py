@@ -98,7 +98,7 @@ def test_times_of_a_busy_machine_are_marked():
     assert busy[-1] == f"~{quiet[-1]}"
 
 
-IMPORTED = "from ballbot_gym.simulator import import_pybullet; import_pybullet(); print('imported')"
+IMPORTED = "from ballbot_gym.engines.bullet_client import import_pybullet; import_pybullet(); print('imported')"
 
 
 @pytest.mark.parametrize("closed", ["", "1>&-", "2>&-", "1>&- 2>&-"])

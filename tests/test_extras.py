@@ -55,7 +55,7 @@ def test_missing_library_names_its_extra(code, library, extra):
 
 EXTRAS = (
     *("casadi", "scipy", "matplotlib", "torch", "stable_baselines3", "rsl_rl", "minari", "tyro", "rich", "filelock"),
-    *("tensorboard", "safetensors", "jinja2", "plotly", "imageio", "PIL", "h5py", "tensordict"),
+    *("tensorboard", "safetensors", "jinja2", "plotly", "imageio", "h5py", "tensordict"),
 )
 """What the extras bring."""
 
@@ -84,17 +84,19 @@ for package in ("ballbot_gym", "ballbot_baselines", "ballbot_train"):
         assert f"light {name}" in lines
 
 
-def test_without_pybullet_the_default_is_rk4_with_one_notice_and_bullet_says_how_to_get_it():
+def test_without_an_engine_the_default_is_rk4_with_one_notice_and_others_say_how_to_get_them():
     code = (
         "import ballbot_gym, gymnasium\n"
         "names = {gymnasium.make(task.id).unwrapped.physics for task in ballbot_gym.TASKS.values()}\n"
         "print('physics', names)\n"
-        "try:\n    gymnasium.make('BallbotTurn-v0', physics='bullet')\n"
-        "except ImportError as error:\n    print('refused', error)\n"
+        "for physics in ('bullet', 'mujoco'):\n"
+        "    try:\n        gymnasium.make('BallbotTurn-v0', physics=physics)\n"
+        "    except ImportError as error:\n        print('refused', error)\n"
     )
-    wrote = run(code, "pybullet")
+    wrote = run(code, "pybullet", "mujoco")
     assert "physics {'rk4'}" in wrote
-    assert wrote.count('PyBullet is not installed: physics="rk4" is used') == 1
+    assert wrote.count('Neither PyBullet nor MuJoCo is installed: physics="rk4" is used') == 1
+    assert 'refused physics="mujoco" needs mujoco, which is not installed: pip install "ballbot-gym[mujoco]"' in wrote
     assert 'refused PyBullet is not installed. Get it with "pip install pybullet"' in wrote
 
 
@@ -108,9 +110,28 @@ def test_commands_run_without_pybullet_and_say_once_which_physics_they_use(tmp_p
     wrote = run(
         "import os\nos.environ['BALLBOT_IN_PROCESS'] = '1'\n"
         f"from ballbot_train.cli import main\nsys.argv = ['ballbot', *{typed.split()!r}]\nmain()\n",
-        "pybullet",
+        *("pybullet", "mujoco"),
     )
     assert "physics=rk4" in wrote
-    assert wrote.count('PyBullet is not installed: physics="rk4" is used') == 1
+    assert wrote.count('Neither PyBullet nor MuJoCo is installed: physics="rk4" is used') == 1
     assert "Warning" not in wrote
     assert json.loads((tmp_path / "robustness.json").read_text())["about"]["physics"] == "rk4"
+
+
+def test_without_pybullet_mujoco_is_the_default_and_everything_works_without_a_warning():
+    pytest.importorskip("mujoco")
+    code = """
+import warnings
+warnings.simplefilter("error")
+import gymnasium, numpy as np, ballbot_gym
+from gymnasium.utils.env_checker import check_env
+for task in ballbot_gym.TASKS.values():
+    env = gymnasium.make(task.id, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(np.zeros(2, np.float32))
+    print(env.unwrapped.physics, env.render().shape)
+    check_env(env.unwrapped)
+    env.close()
+"""
+    wrote = run(code, "pybullet", "pybullet_data", "viser")
+    assert wrote.splitlines() == 4 * ["mujoco (480, 640, 3)"]

@@ -16,7 +16,6 @@ from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
 from ballbot_train.report.film import film_frames, film_times, write_film
-from ballbot_train.report.perspective import Camera
 from ballbot_train.report.replay import (
     LEAST_SLIP,
     Replay,
@@ -65,18 +64,6 @@ def test_a_rolling_robot_slips_on_a_smoother_floor_than_it_expects():
 def test_a_ball_that_does_not_roll_has_no_floors():
     with pytest.raises(ValueError, match="'paper' does not roll"):
         certified_replay("stabilize", ["lqr"], 0, physics="rk4", frictions=[0.8])
-
-
-def test_camera_looks_at_its_target_and_sees_up_as_up_and_far_as_small():
-    camera = Camera(np.array([3.0, -1.0, 0.5]))
-    (middle, above, farther), depth = camera.project(
-        np.array([[3.0, -1.0, 0.5], [3.0, -1.0, 1.5], 2 * np.array([3.0, -1.0, 0.5]) - camera.eye])
-    )
-    assert middle == pytest.approx([0, 0], abs=1e-12)
-    assert above[0] == pytest.approx(0, abs=1e-12)
-    assert above[1] > 0.2
-    assert farther == pytest.approx([0, 0], abs=1e-12)
-    assert depth[2] == pytest.approx(2 * depth[0])
 
 
 def test_a_film_moves_and_ends_when_the_longest_take_does(two_takes):

@@ -20,11 +20,12 @@ from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_baselines.paper_problems import between_states
 from ballbot_gym import certified, dynamics
+from ballbot_gym.engines.bullet import BulletContactSimulator
+from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.env import BallbotEnv, limit_names, make_task
 from ballbot_gym.params import BallbotParams, UrdfError, default_params
 from ballbot_gym.robots import ROBOTS, checked_robot, named_robot, robot_name
 from ballbot_gym.rollout import PlanError, rollout
-from ballbot_gym.simulator import BulletContactSimulator, Rk4Simulator
 from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
 from ballbot_gym.trajectory import Trajectory
@@ -427,7 +428,7 @@ def test_a_certified_set_is_of_one_robot(tmp_path):
 
 
 def test_transfer_tells_who_was_made_for_what(tmp_path):
-    arguments = {"tasks": ("stabilize",), "controllers": ("lqr",), "robot": "paper", "physics": "rk4", "workers": 1}
+    arguments = {"tasks": ("stabilize",), "controllers": ("lqr",), "robot": "paper", "physics": ("rk4",), "workers": 1}
     transfer(episodes=2, made_for=("paper", "kugle"), out=tmp_path, **arguments)
     rows = list(csv.DictReader((tmp_path / "transfer.csv").open()))
     assert [(row["made_for"], row["robot"], row["episodes"]) for row in rows] == [

@@ -17,10 +17,10 @@ import torch
 from ballbot_gym import BallbotEnv, BallbotParams, counter_rng, dynamics
 from ballbot_gym import batch as batch_module
 from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.engines.bullet import BulletSimulator
 from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import ActionController, rollout
-from ballbot_gym.simulator import BulletSimulator
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
@@ -360,7 +360,7 @@ def test_bad_arguments_are_refused():
         ({"num_envs": 2, "render_mode": "human"}, ValueError, "render_mode"),
         ({"num_envs": 2, "task": "juggle"}, ValueError, "unknown task"),
         ({"num_envs": 2, "physics": "bullet"}, ValueError, 'num_envs=2, vectorization_mode="sync", physics="bullet"'),
-        ({"num_envs": 2, "physics": "mujoco"}, ValueError, "unknown physics 'mujoco'"),
+        ({"num_envs": 2, "physics": "dart"}, ValueError, "unknown physics 'dart'"),
         ({"num_envs": 2, "autoreset_mode": "never"}, ValueError, "unknown autoreset_mode 'never'; known: 'NextStep'"),
         (
             {"num_envs": 2, "engine": "numpy"},

@@ -6,11 +6,11 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
+from ballbot_gym.engines import default_physics
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import ROBOTS
-from ballbot_gym.simulator import default_physics
 
 try:
     from rich.progress import (
@@ -30,7 +30,7 @@ try:
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
-Physics = Literal["bullet", "rk4"]
+Physics = Literal["bullet", "mujoco", "rk4"]
 """What options called --physics take."""
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class LineProgress(Progress):
 
 
 def physics_or_default(physics: Physics | None) -> Physics:
-    """The physics that was typed; else "bullet" where PyBullet is installed, or "rk4" with a line that says so."""
+    """The physics that was typed; else the default where nothing is typed, with a line if it needs one."""
     if physics is not None:
         return physics
     with warnings.catch_warnings(record=True) as caught:
@@ -97,7 +97,7 @@ def physics_or_default(physics: Physics | None) -> Physics:
         chosen = default_physics()
     for warning in caught:
         console.print(str(warning.message), soft_wrap=True)
-    return "bullet" if chosen == "bullet" else "rk4"
+    return cast(Physics, chosen)
 
 
 def progress_bar() -> Progress:

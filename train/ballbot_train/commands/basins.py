@@ -27,7 +27,7 @@ def basins(
         controllers: as of `ballbot benchmark`.
         points: along each axis of a map; odd.
         quick: only 9 points.
-        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
         workers: who does the work.
         robot: whose limits and controllers.

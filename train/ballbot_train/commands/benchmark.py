@@ -43,7 +43,7 @@ def benchmark(
             with the package. A policy is run on the task it was made for.
         episodes: how many of each task's certified episodes.
         quick: only 8 episodes of each task.
-        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of the bootstrap intervals, and of whatever an episode draws.
         runs: folder where other commands left their results: the recovered share of `basins` joins the leaderboard, and
             basins, robustness, transfer, training and the paper's figures join the report.

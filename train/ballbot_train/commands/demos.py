@@ -37,7 +37,7 @@ def demos(
         expert: name of a controller, such as trajopt (a plan, tracked by TVLQR), nmpc or lqr, or of a policy that comes with
             the package.
         episodes: number of episodes, each with a seed of its own.
-        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         noise: each episode draws the standard deviation of its noise from [0, this], in units of the force limit.
         pushes: mean number per second of control steps in which a random force replaces the expert's.
         backoff: what the expert's plans keep from their limits: margins in their units, shares of the goal's tolerance

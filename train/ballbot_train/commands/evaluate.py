@@ -62,7 +62,7 @@ def evaluate(
         optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
             folder `optima` beside --out, for later calls and other policies.
         episodes: how many of the certified episodes to run in PyBullet.
-        physics: of the certified episodes, "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        physics: of the certified episodes, "bullet", "mujoco" or "rk4"; default, the first that is installed.
         out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper. An
             interrupted run continues here.
         workers: who does the work, for optima and certified episodes.

@@ -8,8 +8,8 @@ import numpy as np
 from ballbot_baselines.collocation import Plan
 from ballbot_baselines.paper_experiments import TRACKING_DT, compare_stabilization, track_plan
 from ballbot_baselines.paper_problems import PAPER_PROBLEMS, PaperProblem
+from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.params import default_params
-from ballbot_gym.simulator import PHYSICS_NAMES
 from ballbot_train.console import check_names, console, physics_or_default, print_table
 from ballbot_train.report import figures
 

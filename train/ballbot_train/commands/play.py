@@ -19,7 +19,7 @@ def play(
     ghosts: tuple[str, ...] = ("lqr",),
     policies: tuple[str, ...] = (),
     episode: int | None = 0,
-    physics: Literal["bullet", "rk4"] | None = None,
+    physics: Literal["bullet", "mujoco", "rk4"] | None = None,
     robot: RobotName = PAPER,
     seed: int = 0,
     host: str = HOST,
@@ -35,7 +35,7 @@ def play(
         ghosts: controllers that get the same start and the same pushes beside it.
         policies: more policy files and saved models, which the page offers in the tasks that they are made for.
         episode: index of the certified episode it starts with; None for a random start.
-        physics: "bullet" or "rk4"; default, bullet where PyBullet is installed.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         robot: name of a robot.
         seed: of random starts, noise and pushes.
         host: address to bind. Everybody but this machine needs the token that is printed.

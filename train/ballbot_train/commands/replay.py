@@ -39,7 +39,7 @@ def replay(
         source: name of a task, or trajectory files (.npz).
         controllers: names of controllers or policy files; several are shown side by side.
         episode: index of the certified episode.
-        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         format: png, a strip of pictures; mp4, gif or webp, a film with tilts, forces and paths.
         seconds: time of the last picture, s; default the end of the episode.
         frames: number of pictures in a strip, at equal times.

@@ -51,7 +51,7 @@ def robustness(
         stresses: names of disturbances.
         episodes: how many of each task's certified episodes.
         quick: only 3 episodes of each task.
-        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of pushes, noise and the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
         workers: who does the work.

@@ -124,8 +124,8 @@ def train(
 
     import torch
 
+    from ballbot_gym.engines import PHYSICS_NAMES
     from ballbot_gym.env import make_task
-    from ballbot_gym.simulator import PHYSICS_NAMES
     from ballbot_train.learning import training
     from ballbot_train.learning.demonstrations import command_of
     from ballbot_train.policy import load_network, read_description

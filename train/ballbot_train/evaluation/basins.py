@@ -151,7 +151,7 @@ def run(
         bounds: as `boundaries` gives.
         controllers: names.
         points: along each axis of a map; odd.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         on_progress: called with a controller and a number of finished states.

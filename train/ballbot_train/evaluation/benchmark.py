@@ -96,7 +96,7 @@ def open_run(
         out: the folder.
         controllers: names by task.
         workers: a number of processes, or `Workers`; they change no result.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         seed: of whatever is drawn, if anything is.
         robot: by name.
         settings: whatever else decides the results.
@@ -145,7 +145,7 @@ def benchmark(
     Args:
         controllers: names by task, as `controllers_of` gives.
         episodes: how many of each task's certified ones.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         on_progress: called with a task and a number of finished episodes.

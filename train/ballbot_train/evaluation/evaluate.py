@@ -99,7 +99,7 @@ def evaluate(
             controller ("lqr", "trajopt", "nmpc") or a policy file.
         task: a name in `TASKS`, or a Task that has a certified set.
         episodes: how many of the certified episodes, from the first, or their indices, each once.
-        physics: "bullet" or "rk4"; default, "bullet" where PyBullet is installed, else "rk4" with a warning.
+        physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         name: of the row; default, the policy's own.
         randomization: what disturbs it; default, nothing. The regret is over the optimum of the undisturbed robot.
         robot: a name in `ROBOTS`, or a BallbotParams that is one of them.

@@ -120,7 +120,7 @@ def run(
         controllers: names by task.
         stresses: names in `STRESSES`.
         episodes: certified episodes of each task, from the first.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         on_progress: called with a stress and a number of finished episodes.

@@ -1,10 +1,11 @@
-"""Sim-to-sim transfer: controllers that were made for one robot, run on another.
+"""Sim-to-sim transfer: controllers that were made for one robot, run on another, in one physics engine or in several.
 
 The controller plans and observes as for its own robot. It meets the certified episodes of the robot that it runs on, and its
-cost is compared with that robot's optimum on its own floor, on other floors too. In PyBullet a rolling robot's contact is
-simulated, and its friction may differ from what the controller was made for.
+cost is compared with that robot's optimum on its own floor, on other floors too. PyBullet and MuJoCo simulate a rolling
+robot's contact, and its friction may differ from what the controller was made for.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -39,6 +40,7 @@ class TransferRow(Row):
     robot: str = ""
     friction: float = math.nan
     """Of the floor that it ran on; infinite for the paper's."""
+    physics: str = ""
 
 
 def floor(robot: str, friction: float | None) -> BallbotParams:
@@ -88,7 +90,7 @@ def run(
     robot: str,
     frictions: Sequence[float | None],
     episodes: int,
-    physics: str,
+    physics: Sequence[str],
     out: Path,
     workers: int | Workers,
     on_progress: Callable[[str, int], None],
@@ -101,7 +103,7 @@ def run(
         robot: what they run on, by name.
         frictions: of the floors; None is the robot's own.
         episodes: certified episodes of each task, from the first.
-        physics: "bullet" or "rk4".
+        physics: some of "bullet", "mujoco" and "rk4".
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         on_progress: called with a task and a number of finished episodes.
@@ -112,13 +114,14 @@ def run(
         for task, names in by_task.items():
             count = episodes_of(task, robot, episodes)
             for name in names:
-                for params in (floor(robot, friction) for friction in frictions):
+                for friction, engine in itertools.product(frictions, physics):
+                    params = floor(robot, friction)
                     of = {"made_for": made_for, "robot": robot, "friction": params.friction}
                     label = f"{made_for}-{robot}-{params.friction:g}"
                     for start in range(0, count, _CHUNK):
                         part = range(start, min(start + _CHUNK, count))
                         job = benchmark.episode_job(
-                            task, name, physics, part, seed, None, label, "", robot, made_for, params
+                            task, name, engine, part, seed, None, label, "", robot, made_for, params
                         )
                         work.append((job, of))
     done = jobs.run([job for job, _ in work], out, workers, on_progress)
@@ -126,14 +129,16 @@ def run(
 
 
 def rows_of(results: Sequence[TransferResult], seed: int = 0) -> list[TransferRow]:
-    """One row per task, controller, robot that it was made for, and floor; seed is of the bootstrap."""
-    groups: dict[tuple[str, str, str, str, float], list[TransferResult]] = {}
+    """One row per task, controller, robot that it was made for, floor and physics; seed is of the bootstrap."""
+    groups: dict[tuple[str, str, str, str, float, str], list[TransferResult]] = {}
     for result in results:
-        key = (result.task, result.made_for, result.controller, result.robot, result.friction)
+        key = (result.task, result.made_for, result.controller, result.robot, result.friction, result.physics)
         groups.setdefault(key, []).append(result)
     return [
-        TransferRow(**asdict(summarize(group, seed)), made_for=made_for, robot=robot, friction=friction)
-        for (_, made_for, _, robot, friction), group in groups.items()
+        TransferRow(
+            **asdict(summarize(group, seed)), made_for=made_for, robot=robot, friction=friction, physics=physics
+        )
+        for (_, made_for, _, robot, friction, physics), group in groups.items()
     ]
 
 
@@ -147,7 +152,7 @@ def write(rows: Sequence[TransferRow], results: Sequence[TransferResult], facts:
 
 REGRET = "regret over the optimum on the robot's own floor"
 """What tables and figures call it."""
-HEADER = ["task", "made for", "controller", "runs on", "friction", "success", "falls", REGRET, "peak tilt"]
+HEADER = ["task", "made for", "controller", "runs on", "friction", "physics", "success", "falls", REGRET, "peak tilt"]
 _NAMED = {
     name: f"{name}_on_own_floor" for name in ("regret_mean", "regret_low", "regret_high", "regret_median", "optimum")
 }
@@ -166,6 +171,7 @@ def cells(row: TransferRow) -> list[str]:
         row.controller,
         row.robot,
         shown(row.friction, "g"),
+        row.physics,
         f"{100 * row.success:.1f} %",
         f"{row.falls}/{row.episodes}",
         shown(row.regret_mean, ".2%"),

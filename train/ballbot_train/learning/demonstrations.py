@@ -82,7 +82,7 @@ class DemoConfig:
     """Name of a controller in `CONTROLLERS`, or of a policy that comes with the package."""
     episodes: int = 200
     """Number of episodes."""
-    physics: Literal["bullet", "rk4"] = "bullet"
+    physics: Literal["bullet", "mujoco", "rk4"] = "bullet"
     """Simulator."""
     noise: float = 0.05
     """Exploration: each episode draws the standard deviation of its noise from [0, this], in units of the force limit."""

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ballbot_baselines import CONTROLLERS
+from ballbot_gym.engines import State
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import Controller
-from ballbot_gym.simulator import State
 from ballbot_train.evaluation.controllers import is_expert, is_file, make_controller
 from ballbot_train.play.background import Background
 from ballbot_train.play.driving import DRIVERS, DriveController, Stick

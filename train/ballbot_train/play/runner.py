@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ballbot_gym import dynamics
+from ballbot_gym.engines import State, make_simulator
 from ballbot_gym.env import GRIP
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.rollout import Controller
-from ballbot_gym.simulator import State, make_simulator
 from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.tunable import Tunable

@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from ballbot_gym.engines import default_physics
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER
-from ballbot_gym.simulator import default_physics
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.crew import Crew
 from ballbot_train.play.driving import DRIVERS, Stick
@@ -84,7 +84,7 @@ class Playground:
             controller: of the main robot: an expert, a policy that comes with the package, the path of a policy file or of a
                 model that Stable-Baselines3 or rsl_rl saved, or one of `DRIVERS`.
             ghosts: controllers of the ghosts.
-            physics: "bullet" or "rk4"; default, as for environments.
+            physics: "bullet", "mujoco" or "rk4"; default, as for environments.
             episode: index of a certified episode; None for a random start.
             seed: of random starts, sensor noise and random pushes.
             robot: name in `robots.ROBOTS`.

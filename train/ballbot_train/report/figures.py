@@ -182,7 +182,8 @@ def transfer_figure(rows: Sequence[TransferRow]) -> Figure:
     The regret is over that robot's optimum on its own floor.
     """
     tasks = list(dict.fromkeys(row.task for row in rows))
-    floors = sorted({row.friction for row in rows}, reverse=True)
+    floors = sorted({(row.friction, row.physics) for row in rows}, key=lambda floor: (-floor[0], floor[1]))
+    engines = len({row.physics for row in rows}) > 1
     made = {task: list(dict.fromkeys((r.made_for, r.controller) for r in rows if r.task == task)) for task in tasks}
     most = max(map(len, made.values()))
     figure = Figure(figsize=((1.7 + 0.9 * len(floors)) * len(tasks) + 0.6, 1.6 + 0.45 * most), layout="constrained")
@@ -191,12 +192,13 @@ def transfer_figure(rows: Sequence[TransferRow]) -> Figure:
         shares = np.full((len(made[task]), len(floors)), np.nan)
         for row in rows:
             if row.task == task:
-                i, k = made[task].index((row.made_for, row.controller)), floors.index(row.friction)
+                i, k = made[task].index((row.made_for, row.controller)), floors.index((row.friction, row.physics))
                 shares[i, k] = 100 * row.success
                 regret = f"{100 * row.regret_mean:+.3g} %" if math.isfinite(row.regret_mean) else "–"
                 axis.text(k, i, f"{100 * row.success:.0f} %\n{regret}", ha="center", va="center", fontsize=7)
         axis.imshow(shares, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.6)
-        axis.set_xticks(range(len(floors)), [f"{floor:g}" if math.isfinite(floor) else "∞" for floor in floors])
+        names = [f"{floor:g}".replace("inf", "∞") + engines * f"\n{physics}" for floor, physics in floors]
+        axis.set_xticks(range(len(floors)), names)
         axis.set_yticks(range(len(made[task])), [f"{label(name)}, {robot}" for robot, name in made[task]], fontsize=8)
         axis.set_title(task, fontsize=10)
         axis.set_xlabel("friction of the floor", fontsize=9)

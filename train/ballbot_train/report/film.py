@@ -1,4 +1,4 @@
-"""Replays as a strip of pictures or as a film, drawn with matplotlib."""
+"""Replays as a strip of pictures or as a film, with plots by matplotlib."""
 
 import io
 import math
@@ -10,16 +10,17 @@ from typing import Any, Literal, NamedTuple
 import imageio.v2 as imageio
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
 from ballbot_gym import dynamics, files
-from ballbot_gym.drawing import GHOST
+from ballbot_gym.drawing import GHOST, Drawing
+from ballbot_gym.picture import picture
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
-from ballbot_train.report.perspective import PerspectiveView
 from ballbot_train.report.replay import LEAST_SLIP, Ghost, Replay
 
 Format = Literal["png", "mp4", "gif", "webp"]
@@ -30,6 +31,7 @@ _INCHES = (
     9.0,
     12.8,
 )  # of a film's figure: the narrowest and the widest, between which text has the same size in pixels
+_STRIP_SIZE = (520, 390)  # pixels of a strip's picture
 _FALLEN = 45.0  # deg: a failure at a smaller tilt is the touch of an obstacle
 _PAUSE = 1.5  # s, for which a film that loops shows its last picture
 
@@ -41,7 +43,7 @@ def write_strip(replay: Replay, path: Path, frames: int, seconds: float) -> Path
     axes = figure.subplots(rows, frames, squeeze=False)
     for row, take in zip(axes, replay.takes, strict=True):
         for axis, t in zip(row, np.linspace(0, seconds, frames), strict=True):
-            PerspectiveView(axis, aspect=4 / 3).draw(replay.drawing(take, t))
+            _View(axis, *_STRIP_SIZE).draw(replay.drawing(take, t))
             axis.set_aspect("equal")
             held = min(t, take.end)
             axis.set_title(f"{held:.2f} s, {_tilt(take.trajectory.state(held)):.0f}°", fontsize=9)
@@ -80,8 +82,8 @@ def write_film(
 
 
 def _reported(pictures: Iterator[np.ndarray], on_frame: Callable[[], None]) -> Iterator[np.ndarray]:
-    for picture in pictures:
-        yield picture
+    for frame in pictures:
+        yield frame
         on_frame()
 
 
@@ -91,8 +93,8 @@ def _mp4(pictures: Iterator[np.ndarray], fps: int, path: Path) -> bytes:
         options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
         try:
             with imageio.get_writer(unfinished, **options) as writer:
-                for picture in pictures:
-                    writer.append_data(picture)  # pyright: ignore[reportAttributeAccessIssue]
+                for frame in pictures:
+                    writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
         except RuntimeError as error:  # imageio-ffmpeg raises it if its wheel brought no ffmpeg
             raise OSError(f"{path}: cannot encode: {error}") from error
         return unfinished.read_bytes()
@@ -100,7 +102,7 @@ def _mp4(pictures: Iterator[np.ndarray], fps: int, path: Path) -> bytes:
 
 def _animation(pictures: Iterator[np.ndarray], fps: int, ending: str) -> bytes:
     """A GIF or a WebP that repeats forever."""
-    images = [Image.fromarray(picture) for picture in pictures]
+    images = [Image.fromarray(frame) for frame in pictures]
     frame_ms = round(1000 / fps)
     durations = [frame_ms] * (len(images) - 1) + [frame_ms + round(1000 * _PAUSE)]
     if ending == ".gif":
@@ -127,10 +129,28 @@ def film_frames(replay: Replay, times: Sequence[float] | np.ndarray, width: int 
         yield film.frame(float(t))
 
 
+class _View:
+    """A picture of a drawing that fills an axes."""
+
+    def __init__(self, axis: Axes, width: int, height: int):
+        """Args: width and height in pixels."""
+        self._size = width, height
+        axis.set_xticks([])
+        axis.set_yticks([])
+        for spine in axis.spines.values():
+            spine.set_color("0.85")
+        blank = np.full((height, width, 3), 255, np.uint8)
+        self.image = axis.imshow(blank, aspect="auto", interpolation="antialiased")
+
+    def draw(self, drawing: Drawing) -> None:
+        """Shows a moment in place of the one before."""
+        self.image.set_data(picture(drawing, *self._size))
+
+
 class _Stage(NamedTuple):
     """The changing parts of one take: the robot, its tilt, how the take ends, and a word that appears when it fails."""
 
-    view: PerspectiveView
+    view: _View
     tilt: Text
     note: Text
     end: Text
@@ -172,8 +192,8 @@ class _Film:
         self._canvas.restore_region(self._fixed)
         for artist in self._moving:
             self._figure.draw_artist(artist)
-        picture = np.asarray(self._canvas.buffer_rgba())[:, :, :3]
-        return picture[: len(picture) // 2 * 2, : picture.shape[1] // 2 * 2].copy()  # H.264 wants even sizes
+        pixels = np.asarray(self._canvas.buffer_rgba())[:, :, :3]
+        return pixels[: len(pixels) // 2 * 2, : pixels.shape[1] // 2 * 2].copy()  # H.264 wants even sizes
 
     def _add_stages(self) -> None:
         count = len(self._replay.takes)
@@ -184,8 +204,8 @@ class _Film:
         for i, take in enumerate(self._replay.takes):
             left, bottom = 0.005 + i % columns * width, 0.95 - (i // columns + 1) * height
             axis = self._figure.add_axes((left + 0.003, bottom, width - 0.006, height - 0.055))
-            aspect = (width - 0.006) * 16 / ((height - 0.055) * 9)
-            view = PerspectiveView(axis, aspect)
+            box = axis.get_window_extent()
+            view = _View(axis, round(box.width), round(box.height))
             axis.set_title(take.label, fontsize=11, color=take.color, loc="left", pad=4)
             corner = {"transform": axis.transAxes, "va": "top"}
             tilt = axis.text(0.03, 0.97, "", fontsize=16, color=take.color, **corner)
@@ -202,7 +222,7 @@ class _Film:
                 transform=axis.transAxes,
             )
             self._stages.append(_Stage(view, tilt, note, end))
-            self._moving += [*view.artists, tilt, note, end]
+            self._moving += [view.image, tilt, note, end]
 
     def _ghosts(self) -> list[tuple[str, Ghost]]:
         """Every ghost once, with its colour in the traces: its own, or that of the take it goes on from."""

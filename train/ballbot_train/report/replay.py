@@ -10,6 +10,7 @@ import numpy as np
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
 from ballbot_gym.drawing import GHOST, GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.robots import PAPER, named_robot
@@ -131,7 +132,7 @@ def certified_replay(
         task: name of a task.
         controllers: names of controllers, or paths of policy files.
         episode: index of the episode.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         skip_planless: leave out controllers that find no plan.
         robot: by name.
         frictions: coefficients of friction of the floors, for a robot whose ball rolls; default, its own. Controllers
@@ -165,6 +166,16 @@ def certified_replay(
         takes.append(take)
     markers = tuple(problem.markers(episode_set.constants[episode]))
     return Replay(f"{task}, certified episode {episode}", tuple(takes), markers, params)
+
+
+def engines_replay(task: str, controller: str, episode: int, physics: Sequence[str], robot: str = PAPER) -> Replay:
+    """A certified episode under one controller in several physics, side by side. Args: as of `certified_replay`."""
+    shown = [certified_replay(task, [controller], episode, engine, robot=robot) for engine in physics]
+    takes = [
+        replace(replay.takes[0], label=f"{replay.takes[0].label} in {PHYSICS_NAMES[engine]}", color=labels.color("", i))
+        for i, (engine, replay) in enumerate(zip(physics, shown, strict=True))
+    ]
+    return replace(shown[0], takes=tuple(takes))
 
 
 def _take(

@@ -45,7 +45,7 @@ def leaderboard_sections(
         results: its episodes.
         controllers: by task.
         pictures: of certified episodes.
-        physics: "bullet" or "rk4".
+        physics: "bullet", "mujoco" or "rk4".
         runs: folder in which other commands have left theirs: basins, robustness, transfer, paper, and any training.
         note: about the leaderboard.
         robot: by name; what other commands have left of other robots is left out.

@@ -1,0 +1,55 @@
+"""The engines: one simulator a file behind the `Simulator` protocol."""
+
+import warnings
+from collections.abc import Callable
+
+from ballbot_gym.engines.bullet import BulletContactSimulator, BulletSimulator
+from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, has_pybullet
+from ballbot_gym.engines.closed_form import Rk4Simulator
+from ballbot_gym.engines.mujoco import MujocoContactSimulator, MujocoSimulator, has_mujoco
+from ballbot_gym.engines.simulator import Simulator, State
+from ballbot_gym.lazy import install
+from ballbot_gym.params import BallbotParams
+
+__all__ = ["PHYSICS", "PHYSICS_NAMES", "Simulator", "State", "default_physics", "installed_physics", "make_simulator"]
+
+PHYSICS: dict[str, tuple[Callable[..., Simulator], Callable[..., Simulator]]] = {
+    "bullet": (BulletSimulator, BulletContactSimulator),
+    "mujoco": (MujocoSimulator, MujocoContactSimulator),
+    "rk4": (Rk4Simulator, Rk4Simulator),
+}
+"""Simulators by the name that `gymnasium.make(..., physics=name)` takes: of a ball that translates, and of one that rolls.
+
+The first that is installed is the default.
+"""
+
+PHYSICS_NAMES = {"bullet": "PyBullet", "mujoco": "MuJoCo", "rk4": "the closed-form model"}
+"""What people call each physics."""
+
+_noticed: list[bool] = []
+
+
+def installed_physics() -> list[str]:
+    """The physics that this machine can run, in the order of `PHYSICS`."""
+    there = {"bullet": has_pybullet(), "mujoco": has_mujoco(), "rk4": True}
+    return [name for name in PHYSICS if there[name]]
+
+
+def default_physics() -> str:
+    """What `physics` is by default: the first that is installed. "rk4" comes with one warning per process."""
+    best = installed_physics()[0]
+    if best == "rk4" and not _noticed:
+        _noticed.append(True)
+        warnings.warn(
+            f'Neither PyBullet nor MuJoCo is installed: physics="rk4" is used. For MuJoCo: {install("mujoco")}. '
+            f"PyBullet: {HOW_TO_GET_IT}",
+            stacklevel=3,
+        )
+    return best
+
+
+def make_simulator(
+    physics: str, params: BallbotParams, control_dt: float, physics_dt: float | None = None
+) -> Simulator:
+    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`."""
+    return PHYSICS[physics][params.rolls](params, control_dt, physics_dt)

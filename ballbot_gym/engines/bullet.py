@@ -1,0 +1,150 @@
+"""The robot's URDF in PyBullet, as a chain of joints, and with contact where the ball rolls."""
+
+import weakref
+
+from ballbot_gym.engines.bullet_client import connect, import_pybullet, joint_indices, load_robot, set_surface
+from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_rolling, whole_substeps
+from ballbot_gym.params import BallbotParams
+
+_0 = (0.0, 0.0)
+_PRESSED = -1e-5  # m: height of the ball at reset, about where its weight presses it
+
+
+class BulletSimulator(Simulator):
+    """The URDF of a robot whose ball translates in PyBullet, in a physics client that this object owns."""
+
+    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+        """Loads the robot.
+
+        Args:
+            params: the robot.
+            control_dt: s, how long each force is held.
+            physics_dt: s, Bullet's step, a whole fraction of control_dt; default 1 ms. Bullet is of first order: its
+                error halves with this step.
+
+        Raises:
+            ImportError: PyBullet is missing or was built without NumPy.
+            RuntimeError: PyBullet has no client left, or holds another robot than that of params.
+        """
+        substeps = whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
+        bullet = import_pybullet()
+        self._client = connect(bullet, bullet.DIRECT)
+        self._release = weakref.finalize(self, bullet.disconnect, self._client)
+        self._robot, self._joints = load_robot(bullet, self._client, params)
+        self._params = params
+        # Substeps run in C++ with the force held. Results are bit-identical to single steps, a third faster.
+        bullet.setPhysicsEngineParameter(fixedTimeStep=control_dt, numSubSteps=substeps, physicsClientId=self._client)
+        self._bullet = bullet
+
+    def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
+        # Joints are reset in place: reloading the URDF takes a hundred times longer.
+        for i, joint in enumerate(self._joints):
+            self._bullet.resetJointState(self._robot, joint, x[i], x[i + 4], self._client)
+
+    def set_params(self, params: BallbotParams) -> None:
+        bullet, client, old = self._bullet, self._client, self._params
+        if (params.com_height, params.gravity, params.rolls) != (old.com_height, old.gravity, old.rolls):
+            self._reload(params)  # changeDynamics cannot move a link's centre of mass
+            return
+        self._params = params
+        ball, body = self._joints[1], self._joints[3]  # a link has the index of the joint that carries it
+        inertia = (params.inertia, params.inertia, params.axial_inertia)
+        bullet.changeDynamics(self._robot, ball, mass=params.ball_mass, physicsClientId=client)
+        bullet.changeDynamics(
+            self._robot, body, mass=params.body_mass, localInertiaDiagonal=inertia, physicsClientId=client
+        )
+
+    def step(self, u: tuple[float, float]) -> State:
+        bullet, client, robot, joints = self._bullet, self._client, self._robot, self._joints
+        # PyBullet takes twice as long for keywords. No targets and gains matter to a torque.
+        bullet.setJointMotorControlArray(robot, joints[:2], bullet.TORQUE_CONTROL, _0, _0, u, _0, _0, client)
+        bullet.stepSimulation(client)
+        a, b, c, d = bullet.getJointStates(robot, joints, client)
+        return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1])
+
+    def close(self) -> None:
+        self._release()
+
+    def _reload(self, params: BallbotParams) -> None:
+        check_rolling(params, self._params.rolls)
+        self._bullet.removeBody(self._robot, physicsClientId=self._client)
+        self._robot, self._joints = load_robot(self._bullet, self._client, params)
+        self._params = params
+
+
+class BulletContactSimulator(BulletSimulator):
+    """The URDF of a robot whose ball rolls in PyBullet, on a floor: the ball may slip, and leave the floor.
+
+    The force u stands for the torque r e_z × u from the body on the ball, which is held over the control step.
+    """
+
+    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+        """Args: as for `BulletSimulator`. It is of first order too: 5 mm after 0.5 s at 1 ms."""
+        super().__init__(params, control_dt, physics_dt)
+        bullet, client = self._bullet, self._client
+        self._substeps = whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
+        self._floor = bullet.createMultiBody(
+            0, bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client), physicsClientId=client
+        )
+        # Bullet multiplies the friction of both bodies. Rolling without slipping is friction's work alone.
+        set_surface(bullet, client, self._floor, -1, 1.0)
+        self._set_ball()
+
+    def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
+        """Puts the robot into state x, with a ball that rolls without slipping."""
+        super().reset(x)
+        bullet, client, radius = self._bullet, self._client, self._params.ball_radius
+        bullet.resetJointState(self._robot, self._height, _PRESSED, 0.0, physicsClientId=client)
+        spin = (-x[5] / radius, x[4] / radius, 0.0)
+        bullet.resetJointStateMultiDof(self._robot, self._ball, (0, 0, 0, 1), spin, physicsClientId=client)
+
+    def set_params(self, params: BallbotParams) -> None:
+        self._reload(params)  # in any case, so that nothing of the contact's settings is lost; see `set_surface`
+        self._set_ball()
+
+    def step(self, u: tuple[float, float]) -> State:
+        bullet, client, robot, radius = self._bullet, self._client, self._robot, self._params.ball_radius
+        torque = (-radius * u[1], radius * u[0], 0.0)
+        bullet.applyExternalTorque(robot, self._ball, torque, bullet.WORLD_FRAME, physicsClientId=client)
+        opposite = (-torque[0], -torque[1], 0.0)
+        bullet.applyExternalTorque(robot, self._joints[3], opposite, bullet.WORLD_FRAME, physicsClientId=client)
+        bullet.stepSimulation(physicsClientId=client)
+        a, b, c, d = bullet.getJointStates(robot, self._joints, physicsClientId=client)
+        return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1])
+
+    def floor_force(self) -> tuple[float, float, float]:
+        """Of the last step of Bullet; 0 where the ball is in the air."""
+        points = self._bullet.getContactPoints(self._robot, self._floor, physicsClientId=self._client)
+        total = [0.0, 0.0, 0.0]
+        for point in points:
+            for force, direction in ((point[9], point[7]), (point[10], point[11]), (point[12], point[13])):
+                for i in range(3):
+                    # Bullet divides a substep's impulse by the whole step
+                    total[i] += self._substeps * force * direction[i]
+        return total[0], total[1], total[2]
+
+    def height(self) -> float:
+        return self._bullet.getJointState(self._robot, self._height, physicsClientId=self._client)[0]
+
+    def slip(self) -> tuple[float, float]:
+        bullet, client = self._bullet, self._client
+        vx, vy = (s[1] for s in bullet.getJointStates(self._robot, self._joints[:2], physicsClientId=client))
+        wx, wy, _ = bullet.getLinkState(self._robot, self._ball, computeLinkVelocity=1, physicsClientId=client)[7]
+        return vx - wy * self._params.ball_radius, vy + wx * self._params.ball_radius
+
+    def _set_ball(self) -> None:
+        bullet, client, robot = self._bullet, self._client, self._robot
+        index = joint_indices(bullet, client, robot)
+        self._ball, self._height = index["roll"], index["z"]
+        set_surface(bullet, client, robot, self._ball, min(self._params.friction, MOST_FRICTION))
+        bullet.setJointMotorControl2(robot, self._height, bullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
+        bullet.setJointMotorControlMultiDof(
+            robot,
+            self._ball,
+            bullet.POSITION_CONTROL,
+            targetPosition=(0, 0, 0, 1),
+            positionGain=0,
+            velocityGain=0,
+            force=(0, 0, 0),
+            physicsClientId=client,
+        )

@@ -1,0 +1,212 @@
+"""The robot in MuJoCo, as a chain of joints, and with contact where the ball rolls."""
+
+import importlib.util
+import math
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_rolling, whole_substeps
+from ballbot_gym.lazy import missing
+from ballbot_gym.params import BallbotParams
+
+_PRESSED = -1e-9  # m: height of the ball at reset; at 0 the first step would find no contact
+_ALMOST_NOTHING = 1e-9  # kg and kg·m²: MuJoCo wants a mass of whatever moves
+_LEANS = (((0, 1, 0), "gamma"), ((-1, 0, 0), "theta"))
+
+
+class MujocoSimulator(Simulator):
+    """A robot whose ball translates in MuJoCo, integrated by RK4."""
+
+    _places = np.arange(4)  # of x, y, γ and θ among the joints
+    _longest = 0.005  # s, of a step by default
+
+    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+        """Makes the robot.
+
+        Args:
+            params: the robot.
+            control_dt: s, how long each force is held.
+            physics_dt: s, MuJoCo's step, a whole fraction of control_dt; default 5 ms, and 2 ms with contact, or less
+                where control_dt is no multiple of it.
+
+        Raises:
+            ImportError: MuJoCo is not installed.
+            RuntimeError: MuJoCo refuses the robot.
+        """
+        if physics_dt is None:
+            physics_dt = control_dt / max(1, np.ceil(control_dt / self._longest - 1e-9))
+        self._substeps = whole_substeps(control_dt, physics_dt)
+        self._dt = physics_dt
+        self._mujoco = import_mujoco()
+        self._make(params)
+
+    def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
+        self._mujoco.mj_resetData(self._model, self._data)
+        if memory:
+            self._mujoco.mj_setState(self._model, self._data, np.array(memory), self._kept)
+            return
+        self._positions[self._places] = x[:4]
+        self._velocities[self._places] = x[4:]
+
+    def set_params(self, params: BallbotParams) -> None:
+        check_rolling(params, self._params.rolls)
+        self._make(params)
+
+    def step(self, u: tuple[float, float]) -> State:
+        self._push(u)
+        self._advance()
+        return (*self._positions[self._places].tolist(), *self._velocities[self._places].tolist())
+
+    def close(self) -> None:
+        pass
+
+    def _make(self, params: BallbotParams) -> None:
+        self._params = params
+        mujoco, spec = self._mujoco, self._mujoco.MjSpec()
+        spec.option.timestep, spec.option.gravity = self._dt, (0, 0, -params.gravity)
+        spec.option.integrator, spec.option.tolerance = mujoco.mjtIntegrator.mjINT_RK4, 1e-12
+        self._describe(spec)
+        try:
+            self._model = spec.compile()
+        except ValueError as error:
+            raise RuntimeError(f"MuJoCo refuses this robot: {error}; {params}") from error
+        self._data = mujoco.MjData(self._model)
+        self._positions, self._velocities = self._data.qpos, self._data.qvel  # views of it
+
+    def _describe(self, spec: Any) -> None:
+        """Adds the robot to an empty world."""
+        self._add_body(self._add_ball(spec.worldbody, self._params.ball_mass, (1, 0, 0), (0, 1, 0)))
+
+    def _add_ball(self, parent: Any, mass: float, *slides: tuple[int, int, int]) -> Any:
+        """A body at the ball's centre that only translates."""
+        body = parent.add_body(pos=(0, 0, self._params.ball_radius), **_inertial(mass, mass))
+        for axis in slides:
+            body.add_joint(type=self._mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        return body
+
+    def _add_body(self, ball: Any) -> None:
+        robot = self._params
+        body = ball.add_body(
+            name="body",
+            ipos=(0, 0, robot.com_height),
+            **_inertial(robot.body_mass, robot.inertia, robot.inertia, robot.axial_inertia),
+        )
+        for axis, name in _LEANS:
+            body.add_joint(name=name, type=self._mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
+
+    def _push(self, u: tuple[float, float]) -> None:
+        """Makes force u act until the next one does."""
+        self._data.qfrc_applied[:2] = u
+
+    def _advance(self) -> None:
+        self._mujoco.mj_step(self._model, self._data, self._substeps)
+
+    @property
+    def _kept(self) -> int:
+        return int(self._mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class MujocoContactSimulator(MujocoSimulator):
+    """A robot whose ball rolls in MuJoCo, on a floor: the ball may slip, and leave the floor.
+
+    The force u stands for the torque r e_z × u from the body on the ball, which is held over the control step.
+    """
+
+    _places = np.array([0, 1, 3, 4])  # z is third, the ball's turn last
+    _longest = 0.002
+
+    def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
+        """Puts the robot into state x, with a ball that rolls without slipping, unless memory says otherwise."""
+        super().reset(x, memory)
+        if not memory:
+            radius = self._params.ball_radius
+            self._positions[2] = _PRESSED
+            self._velocities[5:] = (-x[5] / radius, x[4] / radius, 0.0)
+
+    def memory(self) -> tuple[float, ...]:
+        """MuJoCo's whole state: how the ball turns and slips, and where its solver starts."""
+        kept = np.empty(self._mujoco.mj_stateSize(self._model, self._kept))
+        self._mujoco.mj_getState(self._model, self._data, kept, self._kept)
+        return tuple(kept.tolist())
+
+    def floor_force(self) -> tuple[float, float, float]:
+        """Of the last stage of MuJoCo's last step; 0 where the ball is in the air."""
+        total, force = np.zeros(3), np.empty(6)
+        for i in range(self._data.ncon):
+            self._mujoco.mj_contactForce(self._model, self._data, i, force)
+            total += force[:3] @ self._data.contact[i].frame.reshape(3, 3)
+        fx, fy, normal = total.tolist()
+        return fx, fy, normal
+
+    def height(self) -> float:
+        return float(self._positions[2])
+
+    def slip(self) -> tuple[float, float]:
+        vx, vy, *_, a, b, c = self._velocities.tolist()  # a, b, c: the ball's spin in its own axes
+        *_, w, x, y, z = self._positions.tolist()
+        # its first two components in the world's
+        wx = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c
+        wy = 2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c
+        radius = self._params.ball_radius
+        return vx - wy * radius, vy + wx * radius
+
+    def _describe(self, spec: Any) -> None:
+        mujoco, robot = self._mujoco, self._params
+        spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100
+        hub = self._add_ball(spec.worldbody, _ALMOST_NOTHING, (1, 0, 0), (0, 1, 0), (0, 0, 1))
+        self._add_body(hub)  # before the ball, so that its joints come before the ball's
+        ball = hub.add_body(name="ball", **_inertial(robot.ball_mass, *[robot.ball_inertia] * 3))
+        ball.add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
+        nothing = {"contype": 0, "conaffinity": 0}  # they touch as the pair below alone
+        ball.add_geom(name="sphere", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(robot.ball_radius, 0, 0), **nothing)
+        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **nothing)
+        friction = min(robot.friction, MOST_FRICTION)
+        # As hard as MuJoCo can be. With its softer defaults the ball creeps and sinks in, thousands of times as far.
+        spec.add_pair(
+            geomname1="floor",
+            geomname2="sphere",
+            condim=3,
+            friction=(friction, friction, 0, 0, 0),
+            solref=(2 * self._dt, 1),
+            solimp=(0.9999, 0.9999, 0.0001, 0.5, 2),
+        )
+
+    def _advance(self) -> None:
+        """Takes the steps one by one.
+
+        MuJoCo's friction wants to stop a slip within solreffriction, and its convex cone lifts the ball off the floor where
+        friction is too weak for that. So friction is given the time that it needs under the robot's weight.
+        """
+        robot, least, softness = self._params, 2 * self._dt, self._model.pair_solreffriction[0]
+        strength = min(robot.friction, MOST_FRICTION) * robot.weight * robot.ball_radius**2 / robot.ball_inertia
+        softness[1] = 1
+        for _ in range(self._substeps):
+            softness[0] = max(least, 2 * math.hypot(*self.slip()) / strength)
+            self._mujoco.mj_step(self._model, self._data)
+
+    def _push(self, u: tuple[float, float]) -> None:
+        radius = self._params.ball_radius
+        torque = np.array((-radius * u[1], radius * u[0], 0.0))
+        self._data.body("ball").xfrc_applied[3:] = torque
+        self._data.body("body").xfrc_applied[3:] = -torque
+
+
+def has_mujoco() -> bool:
+    """Whether MuJoCo is installed."""
+    return importlib.util.find_spec("mujoco") is not None
+
+
+def import_mujoco() -> ModuleType:
+    """MuJoCo, or an ImportError that says how to get it."""
+    try:
+        import mujoco
+    except ModuleNotFoundError as error:
+        raise missing('physics="mujoco"', error.name, "mujoco") from error
+    return mujoco
+
+
+def _inertial(mass: float, *inertia: float) -> dict[str, Any]:
+    """A body's mass, kg, and inertia about its axes, kg·m², all as the one given."""
+    return {"mass": mass, "inertia": inertia if len(inertia) == 3 else inertia * 3, "explicitinertial": True}

@@ -1,0 +1,67 @@
+"""The interface of every simulator, and what they share."""
+
+import math
+from typing import Protocol
+
+from ballbot_gym.ops import is_number
+from ballbot_gym.params import BallbotParams
+
+State = tuple[float, ...]
+"""(8,) state as a tuple of floats; order and units in `dynamics.STATE`."""
+
+MOST_FRICTION = 1e3
+"""What engines of contact take for unlimited friction."""
+_MOST_SUBSTEPS = 10_000
+
+
+class Simulator(Protocol):
+    """One ballbot whose force is held over control steps."""
+
+    def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
+        """Puts the robot into state x, and whatever else an engine remembers into what `memory` gave."""
+
+    def set_params(self, params: BallbotParams) -> None:
+        """Replaces the robot by one whose ball rolls as well, or as little; call `reset` after it."""
+
+    def step(self, u: tuple[float, float]) -> State:
+        """Holds force u, N, for one control step and returns the state after it."""
+        ...
+
+    def memory(self) -> tuple[float, ...]:
+        """What decides how it goes on besides the state; () if nothing does, or if that cannot be restored."""
+        return ()
+
+    def floor_force(self) -> tuple[float, float, float] | None:
+        """The floor's force on the ball, (f_x, f_y, N) in N, at the end of the last step; None where it is not simulated."""
+        return None
+
+    def height(self) -> float:
+        """How far the ball is above the floor, m; negative where it presses into it. 0 where it cannot leave the floor."""
+        return 0.0
+
+    def slip(self) -> tuple[float, float]:
+        """Velocity of the ball's lowest point over the floor, m/s; 0 where the ball cannot slip."""
+        return 0.0, 0.0
+
+    def close(self) -> None:
+        """Releases what the simulator holds; may be called again."""
+
+
+def check_rolling(params: BallbotParams, rolls: bool) -> None:
+    """Raises a ValueError if a robot is of another kind than that of a simulator."""
+    if params.rolls != rolls:
+        raise ValueError(f"this simulator is of a ball with rolls={rolls}; make another with make_simulator()")
+
+
+def whole_substeps(control_dt: float, physics_dt: float) -> int:
+    """How many steps of an engine a control step is. Raises a ValueError if that is no whole number of them."""
+    if not is_number(physics_dt):
+        raise ValueError(f"physics_dt must be a number of seconds, not {physics_dt!r}")
+    in_range = control_dt / (_MOST_SUBSTEPS + 0.5) < physics_dt <= 2 * control_dt
+    substeps = round(control_dt / physics_dt) if in_range else 0
+    if substeps < 1 or not math.isclose(substeps * physics_dt, control_dt, rel_tol=1e-9):
+        raise ValueError(
+            f"physics_dt = {physics_dt} s must be a whole fraction of control_dt = {control_dt} s, and at least "
+            f"1/{_MOST_SUBSTEPS} of it"
+        )
+    return substeps
