@@ -6,10 +6,9 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from ballbot_gym.lazy import missing
-from ballbot_gym.robots import ROBOTS
 from ballbot_gym.simulator import default_physics
 
 try:
@@ -33,11 +32,8 @@ except ModuleNotFoundError as error:
 Physics = Literal["bullet", "rk4"]
 """What options called --physics take."""
 
-if TYPE_CHECKING:
-    RobotName = str
-else:
-    RobotName = Literal[tuple(ROBOTS)]
-"""What options called --robot take: the names in `ROBOTS`."""
+RobotName = str
+"""What options called --robot take: names in `ROBOTS`, among them those that the command line registers first."""
 
 # A file or pipe has no width of its own: give it one that holds the widest table.
 console = PlainConsole(width=None if sys.stdout.isatty() else 160)
