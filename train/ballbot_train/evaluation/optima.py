@@ -1,12 +1,13 @@
-"""Optima on demand: certified sets where there are some; else the optima that are needed, computed into the user's cache."""
+"""Optima on demand: certified sets where there are some; else the optima that are needed, computed into the user's cache.
 
-from collections.abc import Iterable, Iterator
+Importing this module is light: CasADi is imported when an optimum is computed.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
 import filelock
 
-from ballbot_baselines import certification
-from ballbot_baselines.optimum import ALL_GUESSES
 from ballbot_gym import certified
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
@@ -55,7 +56,7 @@ def compute(
     params: BallbotParams,
     episodes: Iterable[int],
     workers: int | Workers | None = None,
-    guesses: int = ALL_GUESSES,
+    guesses: int | None = None,
     enough: int = 1,
 ) -> None:
     """Computes the optima of episodes that the user's cache lacks. Each is kept as soon as it is found.
@@ -66,7 +67,7 @@ def compute(
         task: and params: the problem.
         episodes: their indices.
         workers: processes that compute, or `Workers`; default, this process alone.
-        guesses: most guessed paths per episode.
+        guesses: most guessed paths per episode; default, all.
         enough: an optimum that is there is not computed again if it was the best of so many guesses.
 
     Raises:
@@ -116,18 +117,23 @@ def _missing(task: Task, params: BallbotParams, episodes: list[int], enough: int
     return [index for index in episodes if index not in found or found[index]["found"]["guesses"] < enough]
 
 
-def _here(task: Task, params: BallbotParams, missing: list[int], guesses: int) -> Iterator[certification.Entry]:
-    return certification.entries(task, missing, params, guesses)
+def _here(task: Task, params: BallbotParams, missing: list[int], guesses: int | None) -> Iterator[jobs.Entry]:
+    return _solver(params, guesses)(task, missing)
 
 
 def _elsewhere(
-    task: Task, params: BallbotParams, missing: list[int], guesses: int, workers: int | Workers
-) -> Iterator[certification.Entry]:
+    task: Task, params: BallbotParams, missing: list[int], guesses: int | None, workers: int | Workers
+) -> Iterator[jobs.Entry]:
     """In other processes, in the order in which they finish. A job an episode, because any may be missing."""
-    folder = cache.folder(task, params)
-    solve = partial(certification.entries, robot=params, guesses=guesses)
-    work = [jobs.Job(f"{index:06d}-{guesses}", solve, (task,), (index,)) for index in missing]
+    folder, solve = cache.folder(task, params), _solver(params, guesses)
+    work = [jobs.Job(f"{index:06d}-{guesses or 'all'}", solve, (task,), (index,)) for index in missing]
     for number, (entry,) in jobs.stream(work, folder, workers, lambda *_: None):
         yield entry
         jobs.forget(folder, work[number].name)
     jobs.release(folder)
+
+
+def _solver(params: BallbotParams, guesses: int | None) -> Callable[[Task, Sequence[int]], Iterator[jobs.Entry]]:
+    from ballbot_baselines.certification import ALL_GUESSES, entries
+
+    return partial(entries, robot=params, guesses=guesses or ALL_GUESSES)
