@@ -2,26 +2,29 @@
 
 import importlib.metadata
 
-import gymnasium
-
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.registry import load_plugins, register_task
+from ballbot_gym.robots import named_robot, register_robot
+from ballbot_gym.tasks import SHIPPED, TASKS, Task
 
-__all__ = ["TASKS", "BallbotEnv", "BallbotParams", "Randomization", "Task"]
+__all__ = [
+    "TASKS",
+    "BallbotEnv",
+    "BallbotParams",
+    "Randomization",
+    "Task",
+    "named_robot",
+    "register_robot",
+    "register_task",
+]
 
 try:
     __version__ = importlib.metadata.version("ballbot-gym")
 except importlib.metadata.PackageNotFoundError:  # run from a checkout that is not installed
     __version__ = "unknown"
 
-for _name, _task in TASKS.items():
-    gymnasium.register(
-        id=_task.id,
-        entry_point="ballbot_gym.env:BallbotEnv",
-        # imported, with torch, when first used
-        vector_entry_point="ballbot_gym.vector:BallbotVectorEnv",
-        kwargs={"task": _name},
-        reward_threshold=_task.reward_threshold,
-    )
+for _task in SHIPPED:
+    register_task(_task)
+load_plugins()

@@ -20,6 +20,7 @@ from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import YAW, PictureScene
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
+from ballbot_gym.registry import name_of, named_task
 from ballbot_gym.robots import PAPER, checked_robot, named_robot, own_fields
 from ballbot_gym.scene import Window, check_render_mode, usable_render_modes, window_trouble
 from ballbot_gym.step_code import Judge
@@ -566,7 +567,7 @@ def spec_of(
     usual = usual and params == named_robot(PAPER) and not randomization.active
     keywords = {name: _plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
     if isinstance(keywords.get("task"), Task):
-        name = next((name for name, known in TASKS.items() if known is type(task)), None)
+        name = name_of(task)
         keywords |= {} if name is None else {"task": name, **dataclasses.asdict(task)}
     return dataclasses.replace(
         spec,
@@ -595,7 +596,7 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
     """The task named, with some fields replaced.
 
     Args:
-        task: a name in `TASKS`, or a Task.
+        task: a name in `TASKS`, MODULE:NAME of one that a module registers, or a Task.
         robot: whose defaults the fields have: a name in `ROBOTS`, or a BallbotParams.
         **task_fields: fields that replace the defaults.
 
@@ -607,8 +608,7 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
         if task_fields:
             raise ValueError(f"fields {sorted(task_fields)} cannot be given together with a Task; use replace()")
         return task
-    if not isinstance(task, str) or task not in TASKS:
-        raise ValueError(f"unknown task {task!r}; known: {', '.join(map(repr, TASKS))}")
+    task = named_task(task)
     known = sorted(field.name for field in dataclasses.fields(TASKS[task]))
     for name in sorted(task_fields.keys() - set(known)):
         # Python's own words, because clients such as torchrl look for them.

@@ -1,8 +1,11 @@
 """The robots by name: their URDFs, and the episodes that each is given."""
 
+import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,47 +22,100 @@ class Robot:
     """
 
     about: str
-    urdf: Path
+    urdf: Path | BallbotParams
+    """Its file, if it comes with the package; else what was read from its file."""
     fields: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
-ROBOTS: dict[str, Robot] = {
-    "paper": Robot("the paper's: a ball that translates, on a floor that gives whatever force is asked", URDF_PATH),
-    "rolling": Robot(
-        "the paper's with a ball that rolls, driven by a torque, on a floor with friction 0.8",
-        ROLLING_URDF_PATH,
-        {
-            "stabilize": {"start_lean": 0.3, "start_lean_rate": 0.5},
-            "orbit": {"max_steady_tilt": 0.56},
-        },
-    ),
-    "kugle": Robot(
-        "Kugle V1 of Aalborg University, by its published numbers",
-        URDF_FOLDER / "kugle.urdf",
-        {
-            "stabilize": {"start_position": 1.0, "start_speed": 1.0, "start_lean": 0.1, "start_lean_rate": 0.2},
-            "turn": {"min_speed": 0.5, "max_speed": 1.5},
-            "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15},
-            "weave": {"ball_radius": 0.129},
-        },
-    ),
-}
-"""Every robot by its name on the command line. A new robot is one URDF and one entry here."""
+ROBOTS: dict[str, Robot] = {}
+"""Every robot by its name on the command line. `ballbot_gym.register_robot` fills it."""
 
 PAPER = "paper"
 """The default."""
 
 
-@cache
+def register_robot(
+    name: str,
+    urdf: str | Path | BallbotParams,
+    fields: Mapping[str, Mapping[str, float]] | None = None,
+    about: str = "",
+) -> None:
+    """Gives a robot a name, under which environments, experts and commands know it.
+
+    Args:
+        name: small letters, digits and underscores.
+        urdf: its file, with the chain of joints that `BallbotParams.from_urdf` describes; or its parameters.
+        fields: fields of tasks, by the task's name, that differ from the defaults, where the usual episodes are beyond it:
+            `{"stabilize": {"start_lean": 0.3}}`.
+        about: what it is, in a line.
+
+    Raises:
+        ValueError: the name is no such word, or another robot has it.
+        UrdfError: the URDF is missing or has another chain.
+        TypeError: urdf or fields are something else.
+    """
+    check_name(name, "robot")
+    if not isinstance(urdf, str | Path | BallbotParams):
+        raise TypeError(f"register_robot: urdf must be a path or a BallbotParams, not {urdf!r}")
+    fields = {} if fields is None else fields
+    if not isinstance(fields, Mapping) or not all(isinstance(each, Mapping) for each in fields.values()):
+        raise TypeError(
+            'register_robot: fields must be fields by task, such as {"stabilize": {"start_lean": 0.3}}, '
+            f"not {fields!r}"
+        )
+    if not isinstance(urdf, BallbotParams):
+        urdf = Path(urdf)
+        # those that come with the package are read when they are first used, because most programs need one of them
+        urdf = urdf if urdf.parent == URDF_FOLDER else BallbotParams.from_urdf(urdf)
+    robot = Robot(about, urdf, dict(fields))
+    known = ROBOTS.get(name, robot)
+    if known != robot and (_params_of(known), known.fields) != (_params_of(robot), robot.fields):
+        raise ValueError(f"register_robot: the name {name!r} is taken by another robot; give yours another name")
+    ROBOTS[name] = robot
+
+
+def check_name(name: Any, what: str) -> None:
+    """Raises a ValueError for a name that cannot be part of a file's name or an option."""
+    if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name):
+        raise ValueError(f"the name of a {what} must be small letters, digits and underscores, not {name!r}")
+
+
+def short_name(name: str) -> str:
+    """The name of a task or robot, from MODULE:NAME as Gymnasium's ids have it: the module, which registers it, is imported.
+
+    Raises:
+        ValueError: there is no such module.
+    """
+    module, colon, short = name.rpartition(":")
+    if colon:
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            if not f"{module}.".startswith(f"{error.name}."):
+                raise
+            raise ValueError(f"{name}: no module {error.name!r} is installed or in {os.getcwd()}") from None
+    return short
+
+
 def named_robot(name: str) -> BallbotParams:
-    """The robot of a name in `ROBOTS`, read once from its URDF.
+    """The robot of a name in `ROBOTS`, or of MODULE:NAME, read once from its URDF.
 
     Raises:
         ValueError: no robot of that name.
     """
-    if name not in ROBOTS:
+    short = short_name(name) if isinstance(name, str) else name
+    if short not in ROBOTS:
         raise ValueError(f"unknown robot {name!r}; known: {', '.join(map(repr, ROBOTS))}")
-    return BallbotParams.from_urdf(ROBOTS[name].urdf)
+    return _params_of(ROBOTS[short])
+
+
+def _params_of(robot: Robot) -> BallbotParams:
+    return robot.urdf if isinstance(robot.urdf, BallbotParams) else _read(robot.urdf)
+
+
+@cache
+def _read(urdf: Path) -> BallbotParams:
+    return BallbotParams.from_urdf(urdf)
 
 
 def file_name(name: str, robot: str) -> str:
@@ -111,6 +167,29 @@ def checked_robot(robot: Any, params: Any = None) -> BallbotParams:
 
 def own_fields(robot: str | BallbotParams, task: str) -> dict[str, float]:
     """The fields of a task, by name, that a robot has other defaults of."""
-    name = robot if isinstance(robot, str) else robot_name(robot)
-    named_robot(name)  # raises if there is none
+    if isinstance(robot, str):
+        named_robot(robot)  # raises if there is none
+    name = robot.rpartition(":")[2] if isinstance(robot, str) else robot_name(robot)
     return dict(ROBOTS[name].fields.get(task, {}))
+
+
+register_robot(
+    "paper", URDF_PATH, about="the paper's: a ball that translates, on a floor that gives whatever force is asked"
+)
+register_robot(
+    "rolling",
+    ROLLING_URDF_PATH,
+    {"stabilize": {"start_lean": 0.3, "start_lean_rate": 0.5}, "orbit": {"max_steady_tilt": 0.56}},
+    about="the paper's with a ball that rolls, driven by a torque, on a floor with friction 0.8",
+)
+register_robot(
+    "kugle",
+    URDF_FOLDER / "kugle.urdf",
+    {
+        "stabilize": {"start_position": 1.0, "start_speed": 1.0, "start_lean": 0.1, "start_lean_rate": 0.2},
+        "turn": {"min_speed": 0.5, "max_speed": 1.5},
+        "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15},
+        "weave": {"ball_radius": 0.129},
+    },
+    about="Kugle V1 of Aalborg University, by its published numbers",
+)

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import sys
 
 # Before torch is imported, here and in the processes that tests start: nothing in them is big enough for a second thread,
 # and on busy cores threads wait for each other.
@@ -9,12 +10,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # One worker is this process, so that tests can replace what it calls, and need not wait for another one to start.
 os.environ.setdefault("BALLBOT_IN_PROCESS", "1")
 
+import gymnasium
 import numpy as np
 import pytest
 
 import ballbot_gym
 from ballbot_gym.engines import installed_physics
 from ballbot_gym.params import default_params
+from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train import cli
 
@@ -37,6 +40,26 @@ def physics(request):
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def registries():
+    """Forgets the tasks and robots that the test registered, and their modules."""
+    before = dict(TASKS), dict(ROBOTS), dict(gymnasium.registry)
+    yield
+    for kind in TASKS.values():
+        if kind not in before[0].values():
+            sys.modules.pop(kind.__module__, None) if kind.__module__.startswith("ballbot_") else None
+    for registry, kept in zip((TASKS, ROBOTS, gymnasium.registry), before, strict=True):
+        if dict(registry) != kept:
+            registry.clear()
+            registry.update(kept)
+
+
+@pytest.fixture(autouse=True)
+def own_optima(tmp_path_factory, monkeypatch):
+    """Optima that a test computes are its own, here and in the processes that it starts: an empty cache for each."""
+    monkeypatch.setenv("BALLBOT_OPTIMA", str(tmp_path_factory.mktemp("optima")))
 
 
 @pytest.fixture

@@ -197,29 +197,36 @@ OTHERS = {
     "a weight": (make_task("turn", effort_weight=1e-3), PAPER, "--tasks turn --robot NAME"),
     "draws": (make_task("stabilize", start_position=1.0), PAPER, "--tasks stabilize --robot NAME"),
     "draws of another robot": (make_task("orbit", "rolling"), PAPER, "--tasks orbit --robot NAME"),
-    "a subclass": (Nearer(), PAPER, "--tasks sprint"),
-    "a subclass of the same name": (Dearer(), PAPER, "--tasks sprint"),
+    "a subclass": (Nearer(), PAPER, "--tasks NAME"),
+    "a subclass of the same name": (Dearer(), PAPER, "--tasks NAME"),
 }
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_set_is_of_one_problem_and_one_robot(name):
     task, robot, options = OTHERS[name]
-    with pytest.raises(certified.CertificateError, match=f'"ballbot certify {options} --install"'):
+    with pytest.raises(certified.CertificateError, match=f'"ballbot certify {options}"'):
         certified.load(task, robot)
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_no_evaluation_divides_by_the_optimum_of_something_else(name):
-    """Certified episodes one by one, as `evaluate` and training measure them."""
+def test_evaluation_asks_for_the_optimum_of_the_very_problem(name, monkeypatch):
+    """One by one, as `evaluate` and training measure certified episodes."""
     task, robot, _ = OTHERS[name]
     evaluate = pytest.importorskip("ballbot_train.evaluation.evaluate")
-    with pytest.raises(certified.CertificateError):
-        evaluate.evaluate(lambda observation: np.zeros(2), task, 1, "rk4", robot=robot)
+    asked = []
+
+    def find(*problem, **options):
+        asked.append(problem[:2])
+        raise PlanError("no plan")
+
+    monkeypatch.setattr("ballbot_baselines.certification.find_optimum", find)
     env = BallbotEnv(task, physics="rk4", robot=robot)
-    idle = FunctionController(lambda t, x: np.zeros(2))
-    with pytest.raises(certified.CertificateError):
-        evaluate.run_episodes(env, idle, "idle", "stabilize", [0])
+    with pytest.raises(PlanError, match=r"no optimum of .*\nepisode 0: no plan"):
+        evaluate.evaluate(lambda observation: np.zeros(2), task, 1, "rk4", robot=robot)
+    with pytest.raises(PlanError):
+        evaluate.run_episodes(env, FunctionController(lambda t, x: np.zeros(2)), "idle", "stabilize", [0])
+    assert set(asked) == {(env.task, env.params)}
 
 
 def test_a_set_of_another_cost_is_refused_whatever_it_is_called(monkeypatch):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ballbot_gym import BallbotEnv
+from ballbot_gym import BallbotEnv, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.executors import Workers
 from ballbot_train.policy import SHIPPED
@@ -47,9 +47,9 @@ def test_the_task_that_is_added_can_be_certified(interpreted):
     from ballbot_baselines.optimum import find_optimum
 
     names = {"__name__": "sprint"}
-    code = blocks(next(page for page in PAGES if page.name == "extending.md"), "python")[0]
-    exec(code.partition("env = ")[0], names)
-    task, robot = names["Sprint"](), names["default_params"]()
+    code = blocks(next(page for page in PAGES if page.name == "own.md"), "python")[0]
+    exec(code, names)
+    task, robot = names["Sprint"](), named_robot("paper")
     # from a guess that stops at the line this one had no optimum
     assert find_optimum(task, robot, *episode(task, robot, 14)).is_optimal
 

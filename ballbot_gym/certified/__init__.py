@@ -1,22 +1,28 @@
 """Certified evaluation sets: for every robot and task 200 fixed episodes with their optima.
 
-`load(task, robot)` reads what `ballbot certify` computed: initial states, constants, optimal costs and the solver's status of
-each episode, and the optimal trajectories of the first 20. Costs hold for the env's discretization with physics="rk4".
-A set says what it was made for, and `load` refuses it for any other task or robot: a cost divided by the optimum of something
-else is no regret.
+`load(task, robot)` reads what comes with the package, or what `ballbot certify` and evaluation computed into the user's
+cache: initial states, constants, optimal costs and the solver's status of each episode, and optimal trajectories. Costs hold
+for the env's discretization with physics="rk4". A set says what it was made for, and `load` refuses it for any other task or
+robot: a cost divided by the optimum of something else is no regret.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ballbot_gym import dynamics, files
+from ballbot_gym.certified import cache
+from ballbot_gym.checks import shown
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, checked_robot, file_name, named_robot, robot_name
-from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.registry import name_of
+from ballbot_gym.robots import PAPER, checked_robot, file_name, named_robot, robot_name, short_name
+from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 EPISODES = 200
@@ -44,6 +50,8 @@ class EvaluationSet:
     | violations | (n,) | largest constraint violation of the optimum, SI units |
     | statuses | (n,) | how the solver ended, e.g. "fatrop: Solve_Succeeded" |
     | trajectories | ≤ n | the first optimal trajectories, forces held over control steps |
+
+    Episodes whose optima were not asked for, of a set in the user's cache, are NaN.
     """
 
     states: np.ndarray
@@ -60,6 +68,11 @@ class EvaluationSet:
     def options(self, i: int) -> dict[str, np.ndarray]:
         """What to give `env.reset(options=...)` to start episode i."""
         return {"state": self.states[i], "constants": self.constants[i]}
+
+    def first(self, episodes: int) -> "EvaluationSet":
+        """A set of the first episodes alone."""
+        chosen = {name: getattr(self, name)[:episodes] for name in _PER_EPISODE}
+        return EvaluationSet(**chosen, trajectories=self.trajectories[:episodes])
 
     def improved_by(self, other: "EvaluationSet") -> "EvaluationSet":
         """A set with the cheaper optimum of each episode of two sets; the other's where the episodes differ."""
@@ -94,26 +107,78 @@ def path_of(task: Task, robot: str = PAPER) -> Path:
     return Path(__file__).parent / f"{file_name(task.id, robot)}.npz"
 
 
-def load(task: str | Task, robot: str | BallbotParams, path: str | Path | None = None) -> EvaluationSet:
+def load(
+    task: str | Task,
+    robot: str | BallbotParams,
+    path: str | Path | None = None,
+    episodes: Iterable[int] | None = None,
+) -> EvaluationSet:
     """The evaluation set of a task and a robot.
 
     Args:
         task: a name in `TASKS`, or a Task that is the very problem of the set; its pay and its arena may differ.
         robot: whose optima: the params of the robot that runs, or a name in `ROBOTS`. Another friction is another robot.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
+        episodes: indices whose optima are needed; default, the first 200.
 
     Raises:
         CertificateError: there is none, it belongs to another robot, task or other fields of the task, or it is damaged.
         ValueError: no task or robot of that name.
     """
-    params, name = checked_robot(robot), robot if isinstance(robot, str) else robot_name(robot)
+    params, name = checked_robot(robot), short_name(robot) if isinstance(robot, str) else robot_name(robot)
     task = make_task(task, name)
-    again = _command(task, params, name) + (' --install"' if path is None else '"')
-    if path is None and type(task) not in TASKS.values():  # a subclass may have its parent's id and name
-        raise CertificateError(f"no evaluation set of {type(task).__name__}, which is none of TASKS; {again}")
-    path = path_of(task, name) if path is None else Path(path)
-    if not path.exists():
-        raise CertificateError(f"{path}: no evaluation set of {task.id}; {again}")
+    needed = range(EPISODES) if episodes is None else list(episodes)
+    try:
+        if path is None and name_of(task) is None:  # a subclass may have its parent's id and name
+            raise CertificateError(f"no evaluation set of {type(task).__name__}, which is none of TASKS")
+        given = path_of(task, name) if path is None else Path(path)
+        if not given.exists():
+            raise CertificateError(f"{given}: no evaluation set of {task.id}")
+        status = given.stat()
+        found = _read(given, (status.st_mtime_ns, status.st_size), type(task), task, params)
+        if path is None and not all(0 <= index < len(found) for index in needed):
+            raise CertificateError(f"{given} has {len(found)} episodes, and not all of {shown(needed)}")
+        return found
+    except CertificateError as error:
+        cached = None if path is not None else from_cache(task, params, needed)
+        if cached is not None:
+            return cached
+        again = _command(task, params, name, path is not None)
+        raise CertificateError(f"{error}; {again}") from error.__cause__
+
+
+def from_cache(task: Task, params: BallbotParams, episodes: Iterable[int]) -> EvaluationSet | None:
+    """What the user's cache has of some episodes; None where one is missing, or does not move or cost as it did.
+
+    `statuses` say how each optimum was found.
+    """
+    needed = list(episodes)
+    found = cache.read(task, params, needed)
+    if len(found) < len(set(needed)) or not found:
+        return None
+    rows = max(EPISODES, max(found) + 1)
+    arrays: dict[str, Any] = {name: np.full(rows, np.nan) for name in ("costs", "durations", "violations")}
+    arrays |= {"states": np.full((rows, 8), np.nan), "constants": np.full((rows, len(task.constant_names)), np.nan)}
+    statuses = [""] * rows
+    moves = {}
+    for index, optimum in found.items():
+        t = task.control_dt * np.arange(len(optimum["x"]))
+        moves[index] = Trajectory(t, optimum["x"], optimum["u"])
+        values = (optimum["cost"], t[-1], optimum["violation"], optimum["state"], optimum["constants"])
+        for name, value in zip(arrays, values, strict=True):
+            arrays[name][index] = value
+        statuses[index] = f"{optimum['status']}; {json.dumps(optimum['found'])}"
+    chosen = list(moves)
+    if not _holds(tuple(moves.values()), arrays["constants"][chosen], arrays["costs"][chosen], task, params):
+        return None
+    first = range(next(i for i in range(rows + 1) if i not in moves))
+    trajectories = tuple(moves[i] for i in first[:TRAJECTORIES])
+    return EvaluationSet(**arrays, statuses=np.array(statuses), trajectories=trajectories)
+
+
+@lru_cache(maxsize=16)
+def _read(path: Path, version: tuple[int, int], kind: type[Task], task: Task, params: BallbotParams) -> EvaluationSet:
+    """The set of a file in its present version, whose trajectories hold. Steps them once, however often it is asked for."""
     try:
         arrays = files.read_npz(path)
         missing = [name for name in ("task", "lengths", "x", "u", *_PER_EPISODE) if name not in arrays]
@@ -122,7 +187,7 @@ def load(task: str | Task, robot: str | BallbotParams, path: str | Path | None =
         made_for = str(arrays["task"]), str(arrays.get("robot", repr(named_robot(PAPER))))
         for made, wanted in zip(made_for, (task.problem(), repr(params)), strict=True):
             if made != wanted:
-                raise CertificateError(f"{path} was computed for {made}, not for {wanted}; {again}")
+                raise CertificateError(f"{path} was computed for {made}, not for {wanted}")
         arrays |= _checked(task, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])
@@ -132,39 +197,49 @@ def load(task: str | Task, robot: str | BallbotParams, path: str | Path | None =
     except CertificateError:
         raise
     except ValueError as error:
-        raise CertificateError(f"{path} is no evaluation set: {error}; {again}") from error
-    evaluation_set = EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
-    if not _holds(evaluation_set, task, params):
+        raise CertificateError(f"{path} is no evaluation set: {error}") from error
+    for array in arrays.values():
+        array.setflags(write=False)  # everybody who loads the set gets it
+    if not _holds(trajectories, arrays["constants"][: len(trajectories)], arrays["costs"], task, params):
         raise CertificateError(
             f"{path}: its optimal trajectories do not move or cost in {task.problem()} as they did when they were computed, "
-            f"because cost, limits or equations have changed since; {again}"
+            "because cost, limits or equations have changed since"
         )
-    return evaluation_set
+    return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
 
 
-def _command(task: Task, params: BallbotParams, robot: str) -> str:
+def _command(task: Task, params: BallbotParams, robot: str, file: bool) -> str:
     """How the set of a task and a robot is computed, in words."""
-    name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
-    first = [] if name else [f'give the task a name: TASKS["sprint"] = {type(task).__name__}']
-    if params != named_robot(robot) or (name and task.problem() != make_task(name, robot).problem()):
-        first.append("give this robot, with the fields of its tasks, a name in ballbot_gym/robots.py")
+    name = name_of(task)
+    first = [] if name else [f"ballbot_gym.register_task({type(task).__name__}) gives the task a name"]
+    own = params == named_robot(robot) and (name is None or task.problem() == make_task(name, robot).problem())
+    if not own:
+        first.append("ballbot_gym.register_robot gives this robot, with the fields of its tasks, a name")
         robot = "NAME"
-    given = f" --tasks {name or 'sprint'}" + ("" if robot == PAPER else f" --robot {robot}")
-    return "; ".join([*first, f'compute it with "ballbot certify{given}'])
+    given = f" --tasks {name or 'NAME'}" + ("" if robot == PAPER else f" --robot {robot}")
+    return "; ".join(
+        [
+            *([] if file else ["ballbot_train.evaluate and `ballbot benchmark` compute what they need of it"]),
+            *first,
+            f'compute all of it with "ballbot certify{given}"',
+        ]
+    )
 
 
-def _holds(evaluation_set: EvaluationSet, task: Task, params: BallbotParams) -> bool:
-    """Whether the stored trajectories move, cost and keep the limits here as they did where they were computed."""
-    trajectories, dt = evaluation_set.trajectories, task.control_dt
+def _holds(
+    trajectories: Sequence[Trajectory], constants: np.ndarray, costs: np.ndarray, task: Task, params: BallbotParams
+) -> bool:
+    """Whether trajectories of episodes with these constants move, cost and keep the limits as when they were found."""
+    dt = task.control_dt
     number = np.repeat(np.arange(len(trajectories)), [len(trajectory.u) for trajectory in trajectories])
     before, after = (np.concatenate([trajectory.x[part] for trajectory in trajectories]) for part in _ENDS)
-    u, c = np.concatenate([trajectory.u for trajectory in trajectories]), evaluation_set.constants[number]
-    known = evaluation_set.costs[: len(trajectories)]
+    u, c = np.concatenate([trajectory.u for trajectory in trajectories]), constants[number]
+    known = costs[: len(trajectories)]
     with np.errstate(all="ignore"):  # of damaged files
         moved = np.abs(dynamics.step(params, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
-        costs = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, c), len(u)), len(known))
+        found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, c), len(u)), len(known))
         kept = all(np.min(margin) >= -_SAME for margin in task.margins(after, c))
-        return bool(moved.all() and (np.abs(costs - known) <= _SAME * known).all() and kept)
+        return bool(moved.all() and (np.abs(found - known) <= _SAME * known).all() and kept)
 
 
 def _checked(task: Task, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -6,12 +6,10 @@ from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave
 
-TASKS: dict[str, type[Task]] = {
-    "stabilize": Stabilize,
-    "turn": Turn,
-    "orbit": Orbit,
-    "weave": Weave,
-}
-"""Every task by its name on the command line. A new task is one file and one line here."""
+TASKS: dict[str, type[Task]] = {}
+"""Every task by its name on the command line. `ballbot_gym.register_task` fills it."""
 
-__all__ = ["TASKS", "Reference", "Task"]
+SHIPPED: tuple[type[Task], ...] = (Stabilize, Turn, Orbit, Weave)
+"""The tasks that come with the package."""
+
+__all__ = ["SHIPPED", "TASKS", "Reference", "Task"]

@@ -43,7 +43,7 @@ class Task(ABC):
     x is a state (..., 8), u a force (..., 2) in N, c the episode's constants (..., nc). Cost, margins, goal and observation
     are written with `ops`, so that NumPy, CasADi and torch evaluate the same lines; they are smooth in x and u.
 
-    A task is one file: it fills in the abstract methods, and `TASKS` names it.
+    A task is one file: it fills in the abstract methods, and `register_task` names it.
     """
 
     duration: float = 8.0

@@ -14,6 +14,7 @@ from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
     from ballbot_baselines.lqr import LqrController
+    from ballbot_baselines.measured import Regret, regret
     from ballbot_baselines.nmpc import NmpcController, offset_free_nmpc
     from ballbot_baselines.optimum import Optimum, find_optimum, plan_to_track
     from ballbot_baselines.shooting import Backoff
@@ -36,6 +37,7 @@ VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 
 _MODULES = {
     "lqr": ("LqrController",),
+    "measured": ("Regret", "regret"),
     "nmpc": ("NmpcController", "offset_free_nmpc"),
     "optimum": ("Optimum", "find_optimum", "plan_to_track"),
     "shooting": ("Backoff",),
@@ -52,11 +54,13 @@ __all__ = [
     "LqrController",
     "NmpcController",
     "Optimum",
+    "Regret",
     "TrajoptController",
     "TvlqrController",
     "find_optimum",
     "offset_free_nmpc",
     "plan_to_track",
+    "regret",
 ]
 
 

@@ -4,7 +4,7 @@
 `evaluation_set` makes the set of all entries.
 """
 
-import zlib
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -12,46 +12,41 @@ import numpy as np
 
 from ballbot_baselines.optimum import ALL_GUESSES, find_optimum
 from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
+from ballbot_gym.certified.cache import episode
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
 Entry = dict[str, Any]
 """The optimum of one episode as JSON holds it: "episode" (its index), "cost", "violation", "solver", "status", and the
-optimal trajectory's "t", "x" and "u" as lists; and "draw", which draw of the episode it is, where it is not the first. JSON
-keeps every bit of a float. Where no optimum was found: "episode" and "error", the message."""
+optimal trajectory's "t", "x" and "u" as lists; "draw", which draw of the episode it is, where it is not the first; and
+"found", how it was found: "guesses" allowed and "tried", and "next_basin", by which share the next best local optimum
+costs more. JSON keeps every bit of a float. Where no optimum was found: "episode" and "error", the message."""
 
 _MOST_DRAWS = 20
 
 
-def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Initial state and constants of episode `index` of the task's evaluation set, the same on every machine.
-
-    A later draw takes the place of one from which a robot with limited friction cannot reach the goal.
-    """
-    seed = [zlib.crc32(task.id.encode()), index, *([draw] if draw else [])]
-    return task.sample(np.random.default_rng(seed), params)
-
-
-def entries(task_name: str, indices: Iterable[int], robot: str = PAPER, guesses: int = ALL_GUESSES) -> Iterator[Entry]:
-    """Solves episodes of a task with default settings for a robot by name, and yields one entry for each, in order.
+def entries(
+    task: str | Task, indices: Iterable[int], robot: str | BallbotParams = PAPER, guesses: int = ALL_GUESSES
+) -> Iterator[Entry]:
+    """Solves episodes of a task for a robot, and yields one entry for each, in order.
 
     If the robot's friction is limited, an episode without an optimum is drawn again: some starts make the robot slip whatever
     it does, and only the search tells which.
 
     Args:
-        task_name: in `TASKS`.
+        task: the problem, or its name in `TASKS`.
         indices: of the episodes.
-        robot: in `ROBOTS`.
+        robot: whose optima, or its name in `ROBOTS`.
         guesses: see `find_optimum`.
 
     Raises:
         ValueError: no task or robot of that name.
     """
-    task, params = make_task(task_name, robot), named_robot(robot)
+    task, params = make_task(task, robot), checked_robot(robot)
     for index in indices:
         for draw in range(_MOST_DRAWS if params.grips else 1):
             entry = _solved(task, params, index, draw, guesses)
@@ -75,6 +70,11 @@ def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: i
         "violation": optimum.violation,
         "solver": optimum.solver,
         "status": optimum.solver_status,
+        "found": {
+            "guesses": guesses,
+            "tried": optimum.tried,
+            "next_basin": None if math.isnan(optimum.next_basin) else optimum.next_basin,
+        },
         "t": trajectory.t.tolist(),
         "x": trajectory.x.tolist(),
         "u": trajectory.u.tolist(),

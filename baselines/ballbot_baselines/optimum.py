@@ -5,6 +5,7 @@ shooting from each of the task's guessed paths, and from simulated recoveries wh
 The best solution is kept. It is feasible and locally optimal. It is the global optimum if one of the guesses leads there.
 """
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -14,7 +15,10 @@ import numpy as np
 from ballbot_baselines.ocp import spent
 from ballbot_baselines.search import ALL_GUESSES, FROM_RIGHTING, Found, search
 from ballbot_baselines.shooting import Backoff, Shooting
+from ballbot_gym.checks import finite_array
+from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import checked_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -22,6 +26,7 @@ from ballbot_gym.trajectory import Trajectory
 __all__ = ["ALL_GUESSES", "FROM_RIGHTING", "Backoff", "Optimum", "find_optimum", "plan_to_track"]
 
 _CONSIDERED = 5  # guesses tried at most by default; tasks name the likeliest first
+_SAME_BASIN = 1e-4  # solutions whose costs differ by less are one local optimum
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
 
@@ -37,6 +42,8 @@ class Optimum:
     | `guess` | index of the guessed path that led to it, or `FROM_RIGHTING` |
     | `seconds` | wall time of the whole search |
     | `solver_seconds`, `setup_seconds` | the parts of it in solvers, and on differentiating and compiling |
+    | `tried` | how many of the guesses were tried |
+    | `next_basin` | by which share the next best local optimum costs more, on the grid that compared them, or NaN |
     | `costates` | (n, 8) slopes of the remaining cost with respect to x_1 … x_n; 0 for a simulated episode |
     """
 
@@ -52,6 +59,8 @@ class Optimum:
     solver_seconds: float
     setup_seconds: float
     costates: np.ndarray
+    tried: int = 1
+    next_basin: float = math.nan
 
     @property
     def is_optimal(self) -> bool:
@@ -60,8 +69,8 @@ class Optimum:
 
 
 def find_optimum(
-    task: Task,
-    params: BallbotParams,
+    task: str | Task,
+    params: str | BallbotParams,
     x0: np.ndarray,
     c: np.ndarray,
     backoff: Backoff = Backoff(),
@@ -71,10 +80,10 @@ def find_optimum(
     """The cheapest episode from state x0 with constants c.
 
     Args:
-        task: the problem.
-        params: the robot.
-        x0: (8,) initial state.
-        c: (nc,) constants of the episode.
+        task: the problem, or its name in `TASKS`.
+        params: the robot, or its name in `ROBOTS`.
+        x0: (8,) initial state, m, rad, m/s, rad/s; order in `dynamics.STATE`.
+        c: (nc,) constants of the episode, named in the task's `constant_names`; (0,) where it has none.
         backoff: distance kept from limits; none for the true optimum.
         guesses: how many of the task's guessed paths to solve at most. For a slalom all choices of sides are considered, and
             those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
@@ -85,8 +94,11 @@ def find_optimum(
 
     Raises:
         PlanError: no try came to a feasible episode.
+        ValueError: no task or robot of that name, or x0 or c has another shape or is not finite.
     """
-    episode = Shooting(task, params, np.asarray(x0, np.float64), np.asarray(c, np.float64), backoff)
+    task, params = make_task(task, params), checked_robot(params)
+    x0, c = finite_array(x0, (8,), "x0"), finite_array(c, (len(task.constant_names),), "c")
+    episode = Shooting(task, params, x0, c, backoff)
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     tried = search(episode, guesses, paths)
     best = min((t for t in tried if t[1].is_within_limits), key=_rank, default=None)
@@ -111,7 +123,17 @@ def find_optimum(
         solver_seconds=spent.solving - before[0],
         setup_seconds=spent.setup - before[1],
         costates=solution.costates,
+        tried=len({i for i, _ in tried} | set(episode.compared)),
+        next_basin=_next_basin(best, tried, episode.compared),
     )
+
+
+def _next_basin(best: Found, tried: list[Found], compared: dict[int, float]) -> float:
+    """By which share the next best local optimum costs more than the best; NaN where no other was found."""
+    costs = compared if best[0] in compared else {}
+    costs = costs or {i: solution.cost for i, solution in reversed(tried) if solution.is_optimal}
+    own = costs.get(best[0], math.nan)
+    return min((cost / own - 1 for cost in costs.values() if cost > own * (1 + _SAME_BASIN)), default=math.nan)
 
 
 def _rank(tried: Found) -> tuple[bool, float]:

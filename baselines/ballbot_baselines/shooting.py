@@ -8,7 +8,7 @@ Solvers see actions, which are forces divided by their limit.
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 
 import casadi
@@ -160,6 +160,8 @@ class Shooting:
     x0: np.ndarray
     c: np.ndarray
     backoff: Backoff
+    compared: dict[int, float] = field(default_factory=dict)
+    """What guesses cost, by their index, that were solved on a coarser grid, or with free time, to choose among them."""
 
     def along(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A guess that roughly follows a ground path (n+1, 2), m, one point for each control step."""

@@ -5,6 +5,7 @@
 
 import difflib
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -24,6 +25,7 @@ from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
 
 _DESCRIPTION = "Ballbot control, measured by its regret against the best that physics allows."
 _LEAST_WIDTH = 60
+_MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[a-z][a-z0-9_]*")
 
 
 def main() -> None:
@@ -78,11 +80,33 @@ def _call(command: str, options: list[str]) -> Any:
     # Before torch, NumPy or CasADi are imported, here and in the processes of this one: these nets and batches are too small
     # for a second thread, and beside other work threads wait for each other at every operation.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    options = _registered(options)
     function = load(COMMANDS[command])
     # the options of some commands depend on what is typed, so these commands parse it themselves
     if parse := getattr(sys.modules[function.__module__], "command_line", None):
         return parse(options)
     return tyro.cli(function, args=options, prog=f"ballbot {command}")
+
+
+def _registered(options: list[str]) -> list[str]:
+    """The options with the names of tasks and robots that they bring: of MODULE:NAME the module is imported, from this folder
+    too, and a path after --robot is registered under its file's name.
+    """
+    from ballbot_gym.robots import register_robot, short_name
+
+    named = []
+    for option in options:
+        flag, equals, word = option.partition("=") if option.startswith("--") else ("", "", option)
+        if _MODULE_AND_NAME.fullmatch(word):
+            if os.getcwd() not in sys.path:
+                sys.path.append(os.getcwd())  # last, so that no file here takes the place of a library
+            word = short_name(word)
+        elif word.endswith(".urdf") and "--robot" in (flag, *named[-1:]):
+            path = Path(word)
+            word = re.sub(r"\W", "_", path.stem.lower())
+            register_robot(word, path, about=str(path))
+        named.append(f"{flag}{equals}{word}")
+    return named
 
 
 def _again(command: str, options: list[str]) -> str:

@@ -6,11 +6,10 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import Any, Literal, cast
 
 from ballbot_gym.engines import default_physics
 from ballbot_gym.lazy import missing
-from ballbot_gym.robots import ROBOTS
 
 try:
     from rich.progress import (
@@ -33,11 +32,8 @@ except ModuleNotFoundError as error:
 Physics = Literal["bullet", "mujoco", "rk4"]
 """What options called --physics take."""
 
-if TYPE_CHECKING:
-    RobotName = str
-else:
-    RobotName = Literal[tuple(ROBOTS)]
-"""What options called --robot take: the names in `ROBOTS`."""
+RobotName = str
+"""What options called --robot take: names in `ROBOTS`, among them those that the command line registers first."""
 
 # A file or pipe has no width of its own: give it one that holds the widest table.
 console = PlainConsole(width=None if sys.stdout.isatty() else 160)

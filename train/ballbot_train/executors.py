@@ -23,7 +23,9 @@ from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import Any, Literal, Protocol
 
+from ballbot_gym import registry
 from ballbot_gym.lazy import missing
+from ballbot_gym.robots import Robot
 from ballbot_train.console import console
 
 _NODE_SECONDS = 5.0  # how often the nodes of a cluster are counted
@@ -163,7 +165,7 @@ class _Processes:
                 break
         else:
             ours, theirs = self._context.Pipe()
-            process = self._context.Process(target=_serve, args=(theirs,))
+            process = self._context.Process(target=_serve, args=(theirs, *registry.registered()))
             process.start()
             theirs.close()  # so that the pipe ends with the process
         assert isinstance(ours, Connection)
@@ -205,10 +207,11 @@ class _Processes:
             ours.close()
 
 
-def _serve(connection: Connection) -> None:
-    """Does the tasks that come through a pipe until it ends."""
+def _serve(connection: Connection, modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
+    """Does the tasks that come through a pipe until it ends. Modules and robots are those that users registered."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which then ends its workers
     Thread(target=_end_with_the_run, daemon=True).start()
+    registry.restore(modules, robots)
     try:
         while True:
             for message in _messages(*connection.recv()):
@@ -284,16 +287,23 @@ def _cluster(workers: Workers, per_core: int) -> Iterator[Pool]:
 
 
 def _code(folder: Path) -> list[str]:
-    """Copies our packages, as a wheel holds them, for the nodes; says where. Their dependencies are not among them."""
+    """Copies our packages, as a wheel holds them, and modules with users' tasks, for the nodes; says where. Their
+    dependencies are not among them.
+    """
     from ballbot_gym.params import URDF_FOLDER
 
     found = []
-    for name in ("ballbot_gym", "ballbot_baselines", "ballbot_train"):
+    modules = (name.partition(".")[0] for name in registry.registered()[0])
+    for name in dict.fromkeys(("ballbot_gym", "ballbot_baselines", "ballbot_train", *modules)):
         spec = find_spec(name)
         assert spec is not None
         assert spec.origin is not None
-        found.append(str(folder / name))
-        shutil.copytree(Path(spec.origin).parent, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        path = Path(spec.origin)
+        found.append(str(folder / (name if path.stem == "__init__" else path.name)))
+        if path.stem == "__init__":
+            shutil.copytree(path.parent, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(path, folder)
     shutil.copytree(URDF_FOLDER, folder / "ballbot_gym" / "urdf", dirs_exist_ok=True)
     return found
 
@@ -319,7 +329,7 @@ class _Ray:
         return len(self._running) < most
 
     def start(self, key: Hashable, function: Callable[..., Iterator[Any]], *arguments: Any) -> None:
-        self._running[self._task.remote(function, arguments)] = key
+        self._running[self._task.remote(function, arguments, *registry.registered())] = key
 
     def events(self) -> list[Event]:
         ready = []
@@ -369,6 +379,12 @@ class _Ray:
             console.print(f"Ray: {self._nodes} nodes with {self._cores} cores")
 
 
-def _stream(function: Callable[..., Iterator[Any]], arguments: tuple[Any, ...]) -> Iterator[Any]:
+def _stream(
+    function: Callable[..., Iterator[Any]],
+    arguments: tuple[Any, ...],
+    modules: tuple[str, ...],
+    robots: dict[str, Robot],
+) -> Iterator[Any]:
+    registry.restore(modules, robots)
     for value in function(*arguments):  # noqa: UP028  # `yield from` hands on what Ray sends, which few iterators take
         yield value

@@ -25,6 +25,7 @@ COMMANDS: dict[str, str] = {
     "train": "ballbot_train.commands.train:train",
     "curves": "ballbot_train.commands.curves:curves",
     "tune": "ballbot_train.commands.tune:tune",
+    "new": "ballbot_train.commands.new:new",
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 

@@ -90,7 +90,7 @@ def benchmark(
 def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path, robot: str) -> Path:
     """The first certified episode of a task under every controller, with its optimum."""
     replay = certified_replay(task, controllers, 0, physics, skip_planless=True, robot=robot)
-    optimum = certified.load(task, robot).trajectories[0]
+    optimum = certified.load(task, robot, episodes=[0]).trajectories[0]
     curves = [figures.Curve("optimum", optimum, "0.35", "--")]
     curves += [figures.Curve(f"{take.label}, {take.note}", take.trajectory, take.color) for take in replay.takes]
     figure = figures.trajectory_figure(replay.title, curves, figures.marker_circles(replay.markers))

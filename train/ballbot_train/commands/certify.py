@@ -13,12 +13,12 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import RobotName, check_least, check_some, console, progress_bars
+from ballbot_train.evaluation import optima
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
 _MOST_EPISODES = 100_000
 _MOST_IN_SHARDS = 100_000_000
-_CHUNK = 5  # episodes of a job
 
 
 def certify(
@@ -33,14 +33,16 @@ def certify(
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
 
+    Optima are kept in the user's cache folder as they are found, where all evaluation looks for those that the package lacks.
+
     Args:
         tasks: names of tasks.
         episodes: how many, from the first.
-        install: puts the finished sets into the package too, which all evaluation reads. Where an episode's optimum there is
-            cheaper, it stays.
+        install: puts the finished sets into the package, for robots and tasks that come with it. Where an episode's optimum
+            there is cheaper, it stays.
         shards: URL or folder for a set of shards, SHARDS/TASK, in place of the .npz files; for more episodes than fit into
             memory. See `ballbot_train.shards`.
-        out: folder of the .npz files; an interrupted run continues here.
+        out: folder of the .npz files.
         workers: who does the work.
         robot: whose sets.
         guesses: most guessed paths per episode; default all. With fewer, those of a slalom that are predicted to be the best.
@@ -60,37 +62,28 @@ def certify(
             raise ValueError("the package holds no shards; give --install without --shards")
         _certify_shards(tasks, episodes, shards, out, workers, robot, guesses)
         return
-    facts = provenance()
-    settings = {"tasks": tasks, "episodes": episodes, "robot": robot, "guesses": guesses}
-    jobs.claim(out, {"version": facts["version"], "commit": facts["commit"], **settings})
-    solve = partial(certification.entries, robot=robot, guesses=guesses)
-    work = [
-        jobs.Job(f"{task}-{start:04d}", solve, (task,), items, task)
-        for task in tasks
-        for start in range(0, episodes, _CHUNK)
-        for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
-    ]
-    with progress_bars(dict.fromkeys(tasks, episodes)) as bars:
-        done = jobs.run(work, out, workers, bars.advance)
-    failures, sets = [], {}
+    jobs.make_folder(out)
+    params, failures, sets = named_robot(robot), [], {}
     for name in tasks:
-        found = [entry for job, entries in zip(work, done, strict=True) if job.group == name for entry in entries]
-        errors = [f"{name} episode {i}: {entry['error']}" for i, entry in enumerate(found) if "error" in entry]
-        failures += errors
-        if not errors:
-            task = make_task(name, robot)
-            sets[name] = certification.evaluation_set(task, named_robot(robot), found)
-            path = sets[name].save(task, out / certified.path_of(task, robot).name, robot)
-            console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
-    jobs.release(out)
+        task = make_task(name, robot)
+        try:
+            optima.compute(task, params, range(episodes), workers, guesses, enough=guesses)
+        except PlanError as error:
+            failures.append(str(error))
+            continue
+        found = certified.from_cache(task, params, range(episodes))
+        assert found is not None
+        sets[name] = found.first(episodes)
+        path = sets[name].save(task, out / certified.path_of(task, robot).name, robot)
+        console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     if failures:
-        raise PlanError("no optimum for\n" + "\n".join(failures))
+        raise PlanError("\n".join(failures))
     if install:
         for name, evaluation_set in sets.items():
             task = make_task(name, robot)
             path = certified.path_of(task, robot)
             try:
-                old = certified.load(task, robot)
+                old = certified.load(task, robot, path)
             except certified.CertificateError:  # none, or of another problem
                 kept = evaluation_set
             else:

@@ -126,6 +126,7 @@ def train(
 
     from ballbot_gym.engines import PHYSICS_NAMES
     from ballbot_gym.env import make_task
+    from ballbot_train.evaluation import optima
     from ballbot_train.learning import training
     from ballbot_train.learning.demonstrations import command_of
     from ballbot_train.policy import load_network, read_description
@@ -155,6 +156,7 @@ def train(
         **robot_setting(robot),
         **({} if validation_episodes == VALIDATION_EPISODES else {"validation_episodes": validation_episodes}),
     }
+    optima.known(problem, robot, workers=workers)  # by which it is scored while it learns
     made = algorithm.make(problem, named_robot(robot), settings, seed, demos)
     if start is not None:
         if not isinstance(made, training.Finetunable):

@@ -20,7 +20,7 @@ from ballbot_train.console import (
     print_table,
     progress_bars,
 )
-from ballbot_train.evaluation import agreement
+from ballbot_train.evaluation import agreement, optima
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import checked_episodes, policy_digests
 from ballbot_train.executors import Workers
@@ -82,6 +82,8 @@ def transfer(
     }
     facts = provenance() | settings | {"workers": Workers.of(workers).named}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
+    for task in tasks:
+        optima.known(task, robot, range(episodes), workers)
     totals = dict.fromkeys(tasks, 0)
     for group in chosen.values():
         for task, names in group.items():

@@ -2,9 +2,11 @@
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ballbot_baselines import VARIANTS
 from ballbot_gym import certified
@@ -16,6 +18,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, check_some
 from ballbot_train.evaluation import controllers as registry
+from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.evaluate import iterate_episodes
 from ballbot_train.evaluation.results import Result
 from ballbot_train.executors import Workers
@@ -92,6 +95,8 @@ def open_run(
 ) -> dict[str, Any]:
     """Claims a folder for a run of controllers by task with some settings; `jobs.release` ends the run.
 
+    The optima of the episodes of a run with `episodes` are computed, where the package has none.
+
     Args:
         out: the folder.
         controllers: names by task.
@@ -116,6 +121,8 @@ def open_run(
     settings["policies"] = policy_digests(controllers, robot)
     facts = provenance() | settings | {"workers": Workers.of(workers).named}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
+    for task in controllers if "episodes" in settings else ():
+        optima.known(task, robot, range(settings["episodes"]), workers)
     return facts
 
 
@@ -181,11 +188,13 @@ def episode_job(
     counts for the group, or else the task.
     """
     what, packed = f"{task}-{controller}-{physics}-{label}", registry.packed(controller)
+    # the optima go along, because workers on other machines do not have this user's cache
+    known = replace(certified.load(task, robot, episodes=episodes), trajectories=(), statuses=np.zeros(0, str))
     slug = "".join(sign if sign.isalnum() else "-" for sign in what)
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(task, controller, packed, physics, seed, randomization, robot, made_for, variant),
+        arguments=(task, controller, packed, physics, seed, randomization, robot, made_for, variant, known),
         items=tuple(episodes),
         group=group or task,
     )
@@ -201,12 +210,12 @@ def _episode_entries(
     robot: str,
     made_for: str | None,
     variant: BallbotParams | None,
+    known: certified.EvaluationSet,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=variant or robot)
     believed = (env.task, env.params) if made_for is None else (make_task(task, made_for), named_robot(made_for))
     made = registry.make_packed(controller, packed, *believed)
-    known = certified.load(task, robot)
     for result in iterate_episodes(env, made, controller, task, episodes, seed, known):
         yield asdict(result)
     env.close()

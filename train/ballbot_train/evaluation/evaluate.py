@@ -16,11 +16,14 @@ from ballbot_gym import certified, seeding
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
-from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks import Task
+from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.results import Result, Row, summarize
+from ballbot_train.executors import Workers
 from ballbot_train.policy_files import PolicyError
 
 
@@ -91,27 +94,33 @@ def evaluate(
     name: str | None = None,
     randomization: Randomization | None = None,
     robot: str | BallbotParams = PAPER,
+    workers: int | Workers | None = None,
 ) -> Row:
     """The leaderboard row of anything that acts.
+
+    Where the package has no optima of the task and the robot, they are computed, and kept in the user's cache.
 
     Args:
         policy: see `as_controller`: a Stable-Baselines3 model, a function of the observation, a Controller, the name of a
             controller ("lqr", "trajopt", "nmpc") or a policy file.
-        task: a name in `TASKS`, or a Task that has a certified set.
+        task: a name in `TASKS`, or any Task.
         episodes: how many of the certified episodes, from the first, or their indices, each once.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         name: of the row; default, the policy's own.
         randomization: what disturbs it; default, nothing. The regret is over the optimum of the undisturbed robot.
-        robot: a name in `ROBOTS`, or a BallbotParams that is one of them.
+        robot: a name in `ROBOTS`, or any BallbotParams.
+        workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
+            does: what it does must be under `if __name__ == "__main__"`.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes.
-        CertificateError: there is no certified set of this task and this robot; it says how to compute one.
+        PlanError: an episode has no optimum that can be found.
     """
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
-        indices = episode_indices(episodes, len(certified.load(env.task, env.params)))
+        indices = episode_indices(episodes, certified.EPISODES)
         controller = as_controller(policy, env.task, env.params)
+        optima.known(env.task, env.params, indices, workers)
         results = run_episodes(env, controller, name or _name(policy), task_name(env.task), indices)
         return summarize(results)
     finally:
@@ -158,8 +167,8 @@ def _name(policy: Any) -> str:
 
 
 def task_name(task: Task) -> str:
-    """The task's name in `TASKS`; a task that has a certified set is in it."""
-    return next(name for name, kind in TASKS.items() if type(task) is kind)
+    """The task's name in `TASKS`, or its class's."""
+    return name_of(task) or type(task).__name__.lower()
 
 
 def run_episodes(
@@ -176,10 +185,11 @@ def run_episodes(
         seed: of what the env's randomization draws; no two seeds share what an episode draws.
 
     Raises:
-        CertificateError: there is no certified set of the env's task and robot.
+        PlanError: an episode has no optimum that can be found.
     """
-    known = certified.load(env.task, env.params)
-    return list(iterate_episodes(env, controller, name, task, episodes, seed, known))
+    indices = list(episodes)
+    known = optima.known(env.task, env.params, indices)
+    return list(iterate_episodes(env, controller, name, task, indices, seed, known))
 
 
 def iterate_episodes(

@@ -10,6 +10,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any
 
+from ballbot_gym import registry
+from ballbot_gym.robots import Robot
+
 _ONE_JOB = threading.Lock()  # solvers are kept for reuse, and none may be used by two threads at once
 
 
@@ -23,7 +26,9 @@ class OtherProcess:
         """Starts it. It is spawned: forking a process with threads is not safe."""
         context = multiprocessing.get_context("spawn")
         self._here, there = context.Pipe()
-        self._process = context.Process(target=_serve, args=(there,), daemon=True, name="ballbot-play")
+        self._process = context.Process(
+            target=_serve, args=(there, *registry.registered()), daemon=True, name="ballbot-play"
+        )
         self._process.start()
         there.close()
 
@@ -54,8 +59,9 @@ class OtherProcess:
         self._process.join()
 
 
-def _serve(there: Connection) -> None:
-    """What the other process does."""
+def _serve(there: Connection, modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
+    """What the other process does. Modules and robots are those that users registered."""
+    registry.restore(modules, robots)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the process that started this one
     with contextlib.suppress(EOFError, OSError):
         while True:

@@ -65,8 +65,9 @@ class World:
         self.policies: list[str] = []
         self.controllers: list[str] = []
         """What can be chosen, experts first."""
-        known = certified.path_of(self.base, robot).exists()
-        self.certified = certified.load(self.base, robot) if known else None
+        self.certified: certified.EvaluationSet | None = None
+        with contextlib.suppress(certified.CertificateError):
+            self.certified = certified.load(self.base, robot)
         for policy in policies:
             made_for(policy)  # whether it can be read
         self.offer(*policies)

@@ -17,6 +17,7 @@ from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import Controller, PlanError, rollout
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.transfer import floor
 from ballbot_train.report import labels
@@ -143,9 +144,9 @@ def certified_replay(
         PlanError: a controller finds no plan, unless `skip_planless`.
     """
     problem, params = make_task(task, robot), named_robot(robot)
-    episode_set = certified.load(problem, robot)
-    if not 0 <= episode < len(episode_set):
-        raise ValueError(f"episode must be 0 to {len(episode_set) - 1}, not {episode}")
+    if not 0 <= episode < certified.EPISODES:
+        raise ValueError(f"episode must be 0 to {certified.EPISODES - 1}, not {episode}")
+    episode_set = optima.known(problem, robot, [episode])
     takes = []
     for name, friction in itertools.product(controllers, frictions or (None,)):
         env = BallbotEnv(problem, physics=physics, robot=floor(robot, friction))
@@ -241,7 +242,7 @@ def with_ghosts(
     """
     env = BallbotEnv(task, physics=physics, robot=robot)
     try:
-        c = certified.load(env.task, robot).constants[episode]
+        c = optima.known(env.task, robot, [episode]).constants[episode]
         controller = CONTROLLERS[expert](env.task, env.params)
         takes = []
         for take in replay.takes:

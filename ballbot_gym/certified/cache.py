@@ -1,0 +1,141 @@
+"""Optima of any problem in the user's cache folder: a folder per problem, a file per episode.
+
+The folder's name holds a digest of all that an optimum depends on: the task's formulas, fields, draws and guesses, the
+robot, and the solver's version. Formulas are traced operation by operation. So a change anywhere behind `cost` makes another
+problem, and a comment does not. Where they cannot be traced, the source of the class is taken.
+"""
+
+import hashlib
+import inspect
+import json
+import os
+import uuid
+import zlib
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import files, machine_code, traced
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.tasks import Task
+
+_NUMBERS = ("state", "constants", "cost", "violation", "x", "u")
+
+
+def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Initial state (8,) and constants (nc,) of episode `index` of a task's evaluation set, the same on every machine.
+
+    A later draw takes the place of one from which a robot with limited friction cannot reach the goal.
+    """
+    seed = [zlib.crc32(task.id.encode()), index, *([draw] if draw else [])]
+    return task.sample(np.random.default_rng(seed), params)
+
+
+def folder(task: Task, params: BallbotParams) -> Path:
+    """Where the optima of a problem are kept: in $BALLBOT_OPTIMA, or the folder `optima` of the user's cache.
+
+    Raises:
+        ValueError: $BALLBOT_OPTIMA or $BALLBOT_CACHE is no absolute path.
+    """
+    base = Path(os.environ.get("BALLBOT_OPTIMA") or machine_code.cache_folder() / "optima")
+    if not base.is_absolute():
+        raise ValueError(
+            f"BALLBOT_OPTIMA must be an absolute path, not {str(base)!r}; unset it for the user's cache folder"
+        )
+    return base / f"{type(task).__name__}-{_digest(task, params)}"
+
+
+def write(task: Task, params: BallbotParams, index: int, optimum: Mapping[str, Any]) -> None:
+    """Keeps the optimum of an episode, unless a cheaper one is there.
+
+    Args:
+        task: and params: the problem.
+        index: of the episode.
+        optimum: "cost", "violation", "status", "x" (n+1, 8), "u" (n, 2), and "found", which says in JSON how it was found;
+            "draw", if it is not the first.
+    """
+    path = _path(task, params, index)
+    known = read(task, params, [index]).get(index)
+    if known is not None and float(known["cost"]) <= optimum["cost"]:
+        optimum = {**known, "found": {**known["found"], "guesses": optimum["found"]["guesses"]}}
+    draw = int(optimum.get("draw", 0))
+    state, constants = episode(task, params, index, draw)
+    arrays = {"state": state, "constants": constants, "draw": np.array(draw)}
+    arrays |= {name: np.asarray(optimum[name]) for name in ("cost", "violation", "status", "x", "u")}
+    files.write_npz(path, arrays | {"found": np.array(json.dumps(optimum["found"]))})
+
+
+def read(task: Task, params: BallbotParams, indices: Iterable[int]) -> dict[int, dict[str, Any]]:
+    """Optima of those episodes that are there, as `write` took them, with "state" and "constants". A damaged one is none."""
+    found = {}
+    for index in indices:
+        path = _path(task, params, index)
+        if not path.exists():
+            continue
+        try:
+            arrays: dict[str, Any] = dict(files.read_npz(path))
+            arrays |= {name: files.numbers(arrays[name], name) for name in _NUMBERS}
+            arrays |= {
+                "found": json.loads(str(arrays["found"])),
+                "status": str(arrays["status"]),
+                "draw": int(arrays["draw"]),
+            }
+            own = episode(task, params, index, arrays["draw"])
+            n = len(arrays["u"])
+            shapes = (arrays["x"].shape, arrays["u"].shape, arrays["cost"].shape)
+            if shapes == ((n + 1, 8), (n, 2), ()) and np.array_equal(
+                np.concatenate(own), np.concatenate([arrays["state"], arrays["constants"]])
+            ):
+                found[index] = arrays
+        except (ValueError, KeyError, TypeError):
+            continue
+    return found
+
+
+def forget(task: Task, params: BallbotParams, index: int) -> None:
+    """Deletes the optimum of an episode, if there is one."""
+    _path(task, params, index).unlink(missing_ok=True)
+
+
+def _path(task: Task, params: BallbotParams, index: int) -> Path:
+    return folder(task, params) / f"{index:06d}.npz"
+
+
+@lru_cache(maxsize=64)
+def _digest(task: Task, params: BallbotParams) -> str:
+    """Of all that an optimum depends on, as 24 hexadecimal digits."""
+    parts = [task.id, task.problem(), repr(params), *map(_version, ("ballbot-gym", "casadi")), _formulas(task, params)]
+    for index in range(2):
+        x, c = episode(task, params, index)
+        paths = [np.round(path, 9).tolist() for path in task.guess_paths(x, c, params)]
+        parts.append(json.dumps([x.tolist(), c.tolist(), paths]))
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _formulas(task: Task, params: BallbotParams) -> str:
+    """What the task computes, as text."""
+
+    def compute(x: tuple, u: tuple, c: tuple, z_constants: tuple, z_state: tuple) -> tuple[Any, ...]:
+        drawn = (*task.draw_constants(z_constants, params), *task.draw_state(z_state, c, params))
+        return (task.cost(x, u, c), *task.margins(x, c), *task.goal(x, c), *drawn)
+
+    counts = (8, 2, len(task.constant_names), task.constant_draws, task.state_draws)
+    try:
+        return traced.function("problem", compute, counts)
+    except Exception:  # whatever code of users raises that meets a traced number
+        kinds = [kind for kind in type(task).__mro__ if issubclass(kind, Task) and kind is not Task]
+        try:
+            return "".join(map(inspect.getsource, kinds))
+        except (OSError, TypeError):  # nobody can tell, so its optima are kept for this process alone
+            return uuid.uuid4().hex

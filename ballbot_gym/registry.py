@@ -1,0 +1,150 @@
+"""Registration of tasks: by a call in the module that defines one, or by an entry point of its package.
+
+`register_robot` does the same for robots. Names reach other processes in two ways. Gymnasium's spec of a registered task
+names its module, `MODULE:NAME`, which whoever makes the environment imports. Processes that we start get `registered()`.
+"""
+
+import inspect
+import re
+import sys
+import warnings
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from importlib import import_module, metadata
+from typing import Any
+
+import gymnasium
+
+from ballbot_gym.robots import ROBOTS, Robot, check_name, register_robot, short_name
+from ballbot_gym.tasks import SHIPPED, TASKS, Task
+
+TASKS_GROUP, ROBOTS_GROUP = "ballbot_gym.tasks", "ballbot_gym.robots"
+"""Groups of entry points. One of a task names its class; one of a robot names a function that calls `register_robot`."""
+
+_MAIN = ("__main__", "__mp_main__")  # the same script, here and in the processes that multiprocessing starts
+_SHIPPED_ROBOTS = tuple(ROBOTS)
+
+
+def register_task(kind: type[Task], name: str | None = None) -> type[Task]:
+    """Gives a class of tasks a name and its Gymnasium id, under which everything knows it. May decorate the class.
+
+    To register a class again, as a notebook does whose cell runs twice, replaces it.
+
+    Args:
+        kind: a dataclass that derives from `Task`, with all of its methods.
+        name: small letters, digits and underscores; default, the class's name: `FigureEight` is "figure_eight".
+
+    Raises:
+        TypeError: it is no such class, or a method or an attribute is missing; the message names it.
+        ValueError: the name or the id is taken or malformed.
+    """
+    _check_class(kind)
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower() if name is None else name
+    check_name(name, "task")
+    for known, other in TASKS.items():
+        if known == name and not _is_same(kind, other):
+            raise ValueError(
+                f"register_task: the name {name!r} is taken by {other.__module__}.{other.__qualname__}; "
+                f'give another: register_task({kind.__name__}, "my_{name}")'
+            )
+        if known != name and other.id == kind.id:
+            raise ValueError(
+                f"register_task: the id {kind.id} of {kind.__name__} is taken by {other.__qualname__}; give it its own id"
+            )
+    if name not in TASKS and kind.id in gymnasium.registry:
+        raise ValueError(
+            f"register_task: the id {kind.id} of {kind.__name__} is taken in Gymnasium; give it another id"
+        )
+    module = "" if kind in SHIPPED or kind.__module__ in _MAIN else f"{kind.__module__}:"
+    gymnasium.registry.pop(kind.id, None)
+    gymnasium.register(
+        id=kind.id,
+        entry_point="ballbot_gym.env:BallbotEnv",
+        # imported, with torch, when first used
+        vector_entry_point="ballbot_gym.vector:BallbotVectorEnv",
+        kwargs={"task": f"{module}{name}"},
+        reward_threshold=kind.reward_threshold,
+    )
+    TASKS[name] = kind
+    return kind
+
+
+def named_task(name: Any) -> str:
+    """The name in `TASKS` of a task that is given by it, or by MODULE:NAME.
+
+    Raises:
+        ValueError: no task of that name.
+    """
+    known = {f"{kind.__module__}:{short}": short for short, kind in TASKS.items()}
+    short = (known.get(name) or short_name(name)) if isinstance(name, str) else None
+    if short not in TASKS:
+        raise ValueError(
+            f"unknown task {name!r}; known: {', '.join(map(repr, TASKS))}, or MODULE:NAME where your module calls "
+            "register_task"
+        )
+    return short
+
+
+def name_of(task: Task) -> str | None:
+    """The name in `TASKS` of a task's class; None where it has none."""
+    return next((name for name, kind in TASKS.items() if type(task) is kind), None)
+
+
+def _is_same(kind: type, other: type) -> bool:
+    """Whether two classes are one definition, that ran twice perhaps."""
+    module, known = ("__main__" if each.__module__ in _MAIN else each.__module__ for each in (kind, other))
+    return (module, kind.__qualname__) == (known, other.__qualname__)
+
+
+def _check_class(kind: Any) -> None:
+    """Raises a TypeError that names what a class lacks to be a task, or a ValueError for a malformed id."""
+    if not (isinstance(kind, type) and issubclass(kind, Task)):
+        raise TypeError(f"register_task takes a class that derives from ballbot_gym.Task, not {kind!r}")
+    if missing := sorted(getattr(kind, "__abstractmethods__", ())):
+        raise TypeError(f"{kind.__name__} has no {', '.join(missing)}: define what ballbot_gym.Task declares")
+    for name in ("id", "observation_scale"):
+        if not hasattr(kind, name):
+            raise TypeError(f"{kind.__name__} has no {name}: set the class attribute that ballbot_gym.Task declares")
+    if not isinstance(kind.id, str) or not re.fullmatch(r"([\w-]+/)?[\w:.-]+-v\d+", kind.id):
+        raise ValueError(f'{kind.__name__}.id must be an id of Gymnasium, such as "BallbotEight-v0", not {kind.id!r}')
+    known = {field.name for field in fields(kind)}
+    own = inspect.get_annotations(kind)
+    unknown = [name for name in own if name not in known and "ClassVar" not in str(own[name])]
+    if unknown:
+        raise TypeError(
+            f"{kind.__name__}.{unknown[0]} is no field: decorate {kind.__name__} with @dataclass(frozen=True), or annotate "
+            "it as a ClassVar"
+        )
+    for field in fields(kind):
+        if field.default is MISSING and field.default_factory is MISSING:
+            raise TypeError(f"{kind.__name__}.{field.name} has no default: every field of a task needs one")
+
+
+def load_plugins() -> None:
+    """Registers what installed packages announce. One that fails is left out with a warning that names it."""
+    for group in (TASKS_GROUP, ROBOTS_GROUP):
+        for entry in metadata.entry_points(group=group):
+            spec = getattr(sys.modules.get(entry.module), "__spec__", None)
+            if getattr(spec, "_initializing", False):
+                continue  # it imports us, and registers what it has itself
+            try:
+                found = entry.load()
+                register_task(found, entry.name) if group == TASKS_GROUP else found()
+            except Exception as error:
+                package = entry.dist.name if entry.dist else "a package"
+                warnings.warn(f"{package}: {group} {entry.name!r} ({entry.value}) fails: {error}", stacklevel=2)
+
+
+def registered() -> tuple[tuple[str, ...], dict[str, Robot]]:
+    """What `restore` needs in another process: modules that registered tasks, and the robots that do not come with us."""
+    modules = {kind.__module__: None for kind in TASKS.values() if kind not in SHIPPED}
+    robots = {name: robot for name, robot in ROBOTS.items() if name not in _SHIPPED_ROBOTS}
+    return tuple(name for name in modules if name not in _MAIN and name in sys.modules), robots
+
+
+def restore(modules: tuple[str, ...], robots: Mapping[str, Robot]) -> None:
+    """Registers here what `registered` gave in another process."""
+    for module in modules:
+        import_module(module)
+    for name, robot in robots.items():
+        register_robot(name, robot.urdf, robot.fields, robot.about)

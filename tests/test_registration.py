@@ -1,0 +1,335 @@
+"""Tasks and robots of users: registered by a call or by an entry point, and known by name in every process."""
+
+import math
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import gymnasium
+import numpy as np
+import pytest
+import tomllib
+
+from ballbot_gym import TASKS, Task, certified, named_robot, register_robot, register_task
+from ballbot_gym.certified import cache
+from ballbot_gym.env import make_task
+from ballbot_gym.params import URDF_PATH, UrdfError
+from ballbot_gym.robots import ROBOTS
+from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_train.commands.new import files_of
+from ballbot_train.evaluation import evaluate, optima
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """The name of a user's module, `ballbot_reach.py` in the folder of the test, which registers the task "reach"."""
+    for name, text in files_of("reach").items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    return "ballbot_reach"
+
+
+@pytest.fixture
+def light(tmp_path):
+    """The path of the URDF of a lighter robot."""
+    path = tmp_path / "light.urdf"
+    path.write_text(replace(named_robot("paper"), body_mass=10.0).to_urdf())
+    return path
+
+
+def test_ours_are_registered_like_everybody_s():
+    assert list(TASKS) == ["stabilize", "turn", "orbit", "weave"]
+    assert list(ROBOTS) == ["paper", "rolling", "kugle"]
+    for name, kind in TASKS.items():
+        assert gymnasium.spec(kind.id).kwargs == {"task": name}
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+def test_a_user_s_task_is_made_in_worker_processes_of_every_start_method(module, method, tmp_path):
+    # in a process of its own: this one has threads, which no fork copies
+    code = (
+        f"import gymnasium, numpy as np\n"
+        f"from gymnasium.vector import AsyncVectorEnv\n"
+        f"import {module}\n"
+        f"if __name__ == '__main__':\n"
+        f"    envs = gymnasium.make_vec('BallbotReach-v0', 2, vectorization_mode='async', physics='rk4',\n"
+        f"                              vector_kwargs=dict(context={method!r}, shared_memory=False))\n"
+        f"    seen, _ = envs.reset(seed=0)\n"
+        f"    print(envs.step(np.zeros((2, 2), np.float32))[0].shape)\n"
+        f"    envs.close()\n"
+    )
+    (tmp_path / "script.py").write_text(code)
+    ran = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert ran.stdout.strip() == "(2, 8)", ran.stderr
+
+
+def test_gymnasium_imports_the_module_of_an_id(module):
+    env = gymnasium.make(f"{module}:BallbotReach-v0", physics="rk4")
+    assert env.unwrapped.task == TASKS["reach"]()
+    assert (
+        gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json())).unwrapped.task
+        == TASKS["reach"]()
+    )
+    batch = gymnasium.make_vec(f"{module}:BallbotReach-v0", 3, vectorization_mode="vector_entry_point")
+    assert batch.reset(seed=0)[0].shape == (3, 8)
+
+
+def test_entry_points_are_found_where_the_package_is_installed(module, light, tmp_path):
+    announced = tmp_path / "reach-0.1.dist-info"
+    announced.mkdir()
+    (announced / "METADATA").write_text("Metadata-Version: 2.1\nName: reach\nVersion: 0.1\n")
+    (tmp_path / "light_robot.py").write_text(
+        f"import ballbot_gym\ndef register():\n    ballbot_gym.register_robot('light', {str(light)!r})\n"
+    )
+    (announced / "entry_points.txt").write_text(
+        "[ballbot_gym.tasks]\nreach = ballbot_reach:Reach\nbroken = no_such_module:Task\n"
+        "[ballbot_gym.robots]\nlight = light_robot:register\n"
+    )
+    for first in ("ballbot_gym", module):  # whichever is imported first
+        code = (
+            f"import {first}, ballbot_gym; env = ballbot_gym.BallbotEnv('reach', 'rk4', robot='light'); print(env.task)"
+        )
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        ran = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+        assert ran.stdout.startswith("Reach("), ran.stderr
+        assert "reach: ballbot_gym.tasks 'broken' (no_such_module:Task) fails" in ran.stderr
+
+
+def test_commands_take_a_module_and_a_urdf_and_compute_optima_in_workers(
+    typed, module, light, interpreted, monkeypatch
+):
+    monkeypatch.delenv("BALLBOT_IN_PROCESS")
+    options = ("--controllers", "lqr", "--episodes", 2, "--physics", "rk4", "--workers", 2, "--out", "out")
+    ended, printed = typed("benchmark", "--tasks", f"{module}:reach", "--robot", light, *options)
+    assert ended == 0, printed
+    known = certified.load("reach", "light", episodes=[0, 1])
+    assert np.isfinite(known.costs[:2]).all()
+    assert np.isnan(known.costs[2:]).all()
+
+
+WRONG = {
+    "no class": (lambda: register_task("eight"), TypeError, "takes a class that derives from ballbot_gym.Task"),
+    "no task": (lambda: register_task(dict), TypeError, "takes a class that derives from ballbot_gym.Task"),
+    "no methods": (lambda: register_task(type("Empty", (Task,), {})), TypeError, "Empty has no cost, draw_state, goal"),
+    "a taken name": (
+        lambda: register_task(type("Other", (Stabilize,), {"id": "Other-v0"}), "stabilize"),
+        ValueError,
+        "'stabilize' is taken by ballbot_gym.tasks.stabilize.Stabilize; give another",
+    ),
+    "a taken id": (
+        lambda: register_task(type("Mine", (Stabilize,), {})),
+        ValueError,
+        "BallbotStabilize-v0 of Mine is taken",
+    ),
+    "an id of Gymnasium": (
+        lambda: register_task(type("Mine", (Stabilize,), {"id": "CartPole-v1"})),
+        ValueError,
+        "CartPole-v1 of Mine is taken in Gymnasium",
+    ),
+    "no id": (
+        lambda: register_task(type("Mine", (Stabilize,), {"id": "my id"})),
+        ValueError,
+        "must be an id of Gymnasium",
+    ),
+    "a name with spaces": (
+        lambda: register_task(type("Mine", (Stabilize,), {"id": "Mine-v0"}), "my task"),
+        ValueError,
+        "must be small letters",
+    ),
+    "no dataclass": (
+        lambda: register_task(
+            type("Mine", (Stabilize,), {"id": "Mine-v0", "__annotations__": {"speed": float}, "speed": 1.0})
+        ),
+        TypeError,
+        r"Mine.speed is no field: decorate Mine with @dataclass\(frozen=True\)",
+    ),
+    "a taken robot": (lambda: register_robot("rolling", URDF_PATH), ValueError, "'rolling' is taken by another robot"),
+    "a robot's name": (lambda: register_robot("my-robot", URDF_PATH), ValueError, "must be small letters"),
+    "no file": (lambda: register_robot("mine", "none.urdf"), UrdfError, "none.urdf: no such file"),
+    "no path": (lambda: register_robot("mine", 3), TypeError, "urdf must be a path or a BallbotParams, not 3"),
+    "fields": (lambda: register_robot("mine", URDF_PATH, {"turn": 3}), TypeError, "fields must be fields by task"),
+    "an unknown module": (
+        lambda: make_task("nowhere.at_all:eight"),
+        ValueError,
+        "no module 'nowhere' is installed or in",
+    ),
+    "an unknown name": (lambda: make_task("math:eight"), ValueError, "unknown task 'math:eight'; known: 'stabilize'"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_cannot_be_registered_says_what_to_do(name):
+    call, kind, message = WRONG[name]
+    before = dict(TASKS), dict(ROBOTS)
+    with pytest.raises(kind, match=message):
+        call()
+    assert before == (TASKS, ROBOTS)
+
+
+def test_a_urdf_without_the_chain_is_refused_where_it_is_registered(tmp_path):
+    text = URDF_PATH.read_text().replace('joint name="gamma"', 'joint name="other"')
+    (tmp_path / "other.urdf").write_text(text)
+    with pytest.raises(UrdfError, match=r"other.urdf: joint 'gamma' is missing"):
+        register_robot("other", tmp_path / "other.urdf")
+    assert "other" not in ROBOTS
+
+
+def test_a_cell_of_a_notebook_may_run_twice():
+    def cell(weight):
+        @register_task
+        @dataclass(frozen=True)
+        class Sprint(Stabilize):
+            id: ClassVar[str] = "Sprint-v0"
+            sprint_weight: float = weight
+
+        return Sprint
+
+    cell(1.0)
+    again = cell(2.0)
+    assert TASKS["sprint"] is again
+    assert gymnasium.make("Sprint-v0", physics="rk4").unwrapped.task.sprint_weight == 2.0
+
+
+# --- optima on demand ---
+
+
+@dataclass(frozen=True)
+class Nearby(Stabilize):
+    """Stabilize from nearer, with a weight that its cost takes from elsewhere."""
+
+    id: ClassVar[str] = "Nearby-v0"
+    start_speed: float = 1.0
+    WEIGHT: ClassVar[list[float]] = [1.0]
+
+    def cost(self, x, u, c):
+        return self.WEIGHT[0] * super().cost(x, u, c)
+
+
+@pytest.fixture
+def counted(monkeypatch, interpreted):
+    """Counts the optima that are computed."""
+    from ballbot_baselines import certification
+
+    find, starts = certification.find_optimum, []
+
+    def counting(task, params, x, c, **options):
+        starts.append(x)
+        return find(task, params, x, c, **options)
+
+    monkeypatch.setattr(certification, "find_optimum", counting)
+    return starts
+
+
+def test_optima_are_computed_once_and_say_how_they_were_found(counted):
+    task = Nearby(duration=2.0)
+    known = optima.known(task, "paper", [1, 3])
+    again = optima.known(task, named_robot("paper"), [3, 1, 2])
+    assert len(counted) == 3
+    assert again.costs[[1, 3]].tolist() == known.costs[[1, 3]].tolist()
+    assert np.isnan(known.costs[2])
+    entry = cache.read(task, named_robot("paper"), [1])[1]
+    assert entry["found"]["tried"] == 1
+    assert entry["violation"] < 1e-6
+    assert known.statuses[1].startswith("fatrop: ")
+
+
+def test_an_optimum_of_something_else_is_never_taken(monkeypatch):
+    task, robot = Nearby(duration=2.0), named_robot("paper")
+    folder = cache.folder(task, robot)
+    others = [
+        (replace(task, effort_weight=1e-3), robot),
+        (task, replace(robot, friction=0.9)),
+        (Stabilize(duration=2.0), robot),
+    ]
+    assert len({folder, *(cache.folder(*other) for other in others)}) == 4
+    assert cache.folder(replace(task, survival_reward=50.0), robot) == folder
+    monkeypatch.setattr(Nearby, "WEIGHT", [2.0])  # the same class and fields, and another cost
+    cache._digest.cache_clear()
+    assert cache.folder(task, robot) != folder
+
+
+def test_a_stored_optimum_that_does_not_move_so_is_computed_again(counted, monkeypatch):
+    task, robot = Nearby(duration=2.0), named_robot("paper")
+    cost = optima.known(task, robot, [0]).costs[0]
+    (path,) = cache.folder(task, robot).glob("*.npz")
+    for content in (b"garbage", None):
+        if content is None:  # of another problem, under this one's name
+            entry = cache.read(task, robot, [0])[0]
+            path.unlink()
+            cache.write(task, robot, 0, {**entry, "cost": 0.5 * cost})
+        else:
+            path.write_bytes(content)
+        assert optima.known(task, robot, [0]).costs[0] == pytest.approx(cost, rel=1e-9)
+
+
+def test_a_killed_computation_loses_no_optimum(counted, monkeypatch):
+    task = Nearby(duration=2.0)
+    from ballbot_baselines import certification
+
+    find = certification.find_optimum
+
+    def killed(*problem, **options):
+        if len(counted) == 2:
+            raise KeyboardInterrupt
+        return find(*problem, **options)
+
+    monkeypatch.setattr(certification, "find_optimum", killed)
+    with pytest.raises(KeyboardInterrupt):
+        optima.known(task, "paper", range(4))
+    monkeypatch.setattr(certification, "find_optimum", find)
+    optima.known(task, "paper", range(4))
+    assert len(counted) == 4
+
+
+def test_any_task_and_robot_has_a_row(counted):
+    light = replace(named_robot("paper"), body_mass=12.0)
+    row = evaluate.evaluate("lqr", Nearby(duration=4.0), 2, "rk4", robot=light)
+    assert (row.task, row.falls) == ("nearby", 0)
+    assert 0 <= row.regret_mean < 1
+
+
+def test_two_processes_that_fill_one_cache_agree(module, tmp_path):
+    code = (
+        f"import {module}, ballbot_train.evaluation.optima as optima\n"
+        "print(*optima.known('reach', 'paper', range(3)).costs[:3].tolist())"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    both = [
+        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    printed = [process.communicate()[0].splitlines()[-1] for process in both]
+    assert printed[0] == printed[1]
+    assert len(printed[0].split()) == 3
+
+
+def test_an_episode_without_an_optimum_names_the_methods_to_look_at(counted, monkeypatch):
+    from ballbot_gym.rollout import PlanError
+
+    with pytest.raises(PlanError, match=r"episode 0: .*\n.*Nearby.goal can be reached .* guess_paths"):
+        optima.known(Nearby(duration=2.0, max_tilt=math.radians(1)), "paper", [0])
+
+
+def test_a_new_package_passes_its_own_tests(typed, tmp_path):
+    ended, printed = typed("new", "task", "figure_eight", "--episodes", 1)
+    assert ended == 0, printed
+    folder = tmp_path / "figure_eight"
+    assert "| figure_eight | trajopt | 100.0 % | 0/1 |" in (folder / "leaderboard.md").read_text()
+    entry = tomllib.loads((folder / "pyproject.toml").read_text())["project"]["entry-points"]["ballbot_gym.tasks"]
+    assert entry == {"figure_eight": "ballbot_figure_eight:FigureEight"}
+    ran = subprocess.run([sys.executable, "-m", "pytest", "-q"], cwd=folder, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stdout
+    for check in ("check", "format --check"):
+        ran = subprocess.run(
+            [sys.executable, "-m", "ruff", *check.split(), "."], cwd=folder, capture_output=True, text=True
+        )
+        assert ran.returncode == 0, ran.stdout
+    assert typed("new", "task", "figure_eight")[0] == 1
+
+
+@pytest.mark.parametrize("name", ["turn", "My Task", "../x"])
+def test_a_new_package_needs_a_name_of_its_own(name, typed, tmp_path):
+    assert typed("new", "task", name)[0] == 1
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,76 @@
+"""`ballbot new`: a package for a task of one's own."""
+
+import os
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Literal
+
+import jinja2
+
+from ballbot_gym import files
+from ballbot_gym.robots import check_name
+from ballbot_gym.tasks import TASKS
+from ballbot_train.console import check_least, console, markdown, physics_or_default
+from ballbot_train.evaluation.evaluate import evaluate
+from ballbot_train.evaluation.results import HEADER, cells
+
+_TEMPLATES = Path(__file__).parent.parent / "template"
+_FIRST = ("lqr", "trajopt")
+
+
+def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: int = 8) -> None:
+    """Makes a package for a task of your own: the task, its test, pyproject.toml, README and a first leaderboard.
+
+    Args:
+        kind: task.
+        name: of the task: small letters, digits and underscores.
+        out: its folder; default the name.
+        episodes: of the first leaderboard; 0 for none.
+    """
+    del kind  # there is one
+    check_name(name, "task")
+    check_least(0, episodes=episodes)
+    if name in TASKS:
+        raise ValueError(f"there is a task {name!r} already; give another name")
+    out = Path(name) if out is None else out
+    texts = files_of(name)
+    if there := [path for path in (*texts, "leaderboard.md") if (out / path).exists()]:
+        raise ValueError(f"{out / there[0]} exists; give another --out")
+    for path, text in texts.items():
+        files.write(out / path, text)
+    if episodes:
+        files.write(out / "leaderboard.md", _leaderboard(name, out, episodes))
+    console.print(f"made: {out}\nwhat to do next: {out / 'README.md'}")
+
+
+def files_of(name: str) -> dict[str, str]:
+    """The files of a task's package by their names, as text."""
+    kind = "".join(part.capitalize() for part in name.split("_"))
+    module = module_of(name)
+    values = {"name": name, "kind": kind, "module": module, "id": f"Ballbot{kind}-v0"}
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    templates = {
+        "pyproject.toml": "pyproject.toml",
+        f"{module}.py": "task.py",
+        f"test_{module}.py": "test_task.py",
+        "README.md": "README.md",
+    }
+    return {path: environment.get_template(f"{template}.j2").render(values) for path, template in templates.items()}
+
+
+def module_of(name: str) -> str:
+    """The module of a task's package."""
+    return f"ballbot_{name}"
+
+
+def _leaderboard(name: str, out: Path, episodes: int) -> str:
+    """What experts reach in the task, as Markdown."""
+    sys.path.append(os.path.abspath(out))
+    import_module(module_of(name))
+    physics = physics_or_default(None)
+    rows = [cells(evaluate(expert, name, episodes, physics), busy=False) for expert in _FIRST]
+    command = f"ballbot benchmark --tasks {name} --controllers {' '.join(_FIRST)} --episodes {episodes}"
+    return f"The first {episodes} episodes, physics={physics}: `{command}`\n\n{markdown(HEADER, rows)}"

@@ -1,0 +1,139 @@
+"""Optima on demand: certified sets where there are some; else the optima that are needed, computed into the user's cache.
+
+Importing this module is light: CasADi is imported when an optimum is computed.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+
+import filelock
+
+from ballbot_gym import certified
+from ballbot_gym.certified import cache
+from ballbot_gym.env import make_task
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.registry import name_of
+from ballbot_gym.robots import PAPER, checked_robot, file_name, robot_name
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import Task
+from ballbot_train import jobs
+from ballbot_train.console import console, progress_bars
+from ballbot_train.executors import Workers
+
+
+def known(
+    task: str | Task,
+    robot: str | BallbotParams = PAPER,
+    episodes: Iterable[int] | None = None,
+    workers: int | Workers | None = None,
+) -> certified.EvaluationSet:
+    """The evaluation set of a task and a robot, with the optima of some episodes at least. What is missing is computed.
+
+    Args:
+        task: a name in `TASKS`, or any Task.
+        robot: a name in `ROBOTS`, or any BallbotParams.
+        episodes: their indices; default, the first 200.
+        workers: processes that compute, or `Workers`; default, this process alone.
+
+    Raises:
+        PlanError: an episode has no optimum that can be found.
+        ValueError: no task or robot of that name.
+    """
+    task, params, needed = (
+        make_task(task, robot),
+        checked_robot(robot),
+        range(certified.EPISODES) if episodes is None else list(episodes),
+    )
+    try:
+        return certified.load(task, params, episodes=needed)
+    except certified.CertificateError:
+        compute(task, params, needed, workers)
+        return certified.load(task, params, episodes=needed)
+
+
+def compute(
+    task: Task,
+    params: BallbotParams,
+    episodes: Iterable[int],
+    workers: int | Workers | None = None,
+    guesses: int | None = None,
+    enough: int = 1,
+) -> None:
+    """Computes the optima of episodes that the user's cache lacks. Each is kept as soon as it is found.
+
+    Another process that computes optima of the same problem is waited for, and its optima are taken.
+
+    Args:
+        task: and params: the problem.
+        episodes: their indices.
+        workers: processes that compute, or `Workers`; default, this process alone.
+        guesses: most guessed paths per episode; default, all.
+        enough: an optimum that is there is not computed again if it was the best of so many guesses.
+
+    Raises:
+        PlanError: an episode has no optimum; all others are kept.
+    """
+    needed = list(dict.fromkeys(episodes))
+    folder = cache.folder(task, params)
+    jobs.make_folder(folder)
+    lock = filelock.FileLock(folder / "computing.lock")
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        console.print(f"another process computes optima of {task.id}; waiting for it")
+        lock.acquire()
+    failures = []
+    try:
+        missing = _missing(task, params, needed, enough)
+        if not missing:
+            return
+        name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
+        with progress_bars({name: len(missing)}) as bars:
+            found = _here if workers is None else partial(_elsewhere, workers=workers)
+            for entry in found(task, params, missing, guesses):
+                bars.advance(name, 1)
+                if "error" in entry:
+                    failures.append(f"episode {entry['episode']}: {entry['error']}")
+                    continue
+                entry["status"] = f"{entry['solver']}: {entry['status']}"
+                cache.write(task, params, entry["episode"], entry)
+    finally:
+        lock.release()
+    if failures:
+        raise PlanError(
+            f"no optimum of {task.id} for\n"
+            + "\n".join(failures)
+            + f"\nLook whether {type(task).__name__}.goal can be reached "
+            "from what draw_state draws within duration and margins, and whether guess_paths leads there"
+        )
+
+
+def _missing(task: Task, params: BallbotParams, episodes: list[int], enough: int) -> list[int]:
+    found = cache.read(task, params, episodes)
+    for index in list(found):
+        if certified.from_cache(task, params, [index]) is None:  # it does not move or cost so any more
+            cache.forget(task, params, index)
+            del found[index]
+    return [index for index in episodes if index not in found or found[index]["found"]["guesses"] < enough]
+
+
+def _here(task: Task, params: BallbotParams, missing: list[int], guesses: int | None) -> Iterator[jobs.Entry]:
+    return _solver(params, guesses)(task, missing)
+
+
+def _elsewhere(
+    task: Task, params: BallbotParams, missing: list[int], guesses: int | None, workers: int | Workers
+) -> Iterator[jobs.Entry]:
+    """In other processes, in the order in which they finish. A job an episode, because any may be missing."""
+    folder, solve = cache.folder(task, params), _solver(params, guesses)
+    work = [jobs.Job(f"{index:06d}-{guesses or 'all'}", solve, (task,), (index,)) for index in missing]
+    for number, (entry,) in jobs.stream(work, folder, workers, lambda *_: None):
+        yield entry
+        jobs.forget(folder, work[number].name)
+    jobs.release(folder)
+
+
+def _solver(params: BallbotParams, guesses: int | None) -> Callable[[Task, Sequence[int]], Iterator[jobs.Entry]]:
+    from ballbot_baselines.certification import ALL_GUESSES, entries
+
+    return partial(entries, robot=params, guesses=guesses or ALL_GUESSES)
