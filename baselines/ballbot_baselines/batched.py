@@ -83,7 +83,7 @@ def solves(task: Task, params: BallbotParams) -> bool:
     """Whether `find_optima` can solve this task here: C code can be compiled, and has all operations of the task."""
     try:
         ilqr(task, params)
-    except (machine_code.NoMachineCodeError, NotImplementedError):
+    except (machine_code.NoMachineCodeError, NotImplementedError, OSError):
         return False
     return True
 
