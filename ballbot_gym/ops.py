@@ -68,7 +68,7 @@ def clip(a: Any, low: Any, high: Any) -> Any:
 
 def where(condition: Any, a: Any, b: Any) -> Any:
     """a where the condition holds, else b, elementwise. Not for what optimizers differentiate: they need smooth functions."""
-    if isinstance(condition, bool):
+    if isinstance(condition, bool | np.bool_):
         return a if condition else b
     library = _library(condition)
     if library.__name__ == "casadi":
@@ -87,7 +87,7 @@ def where(condition: Any, a: Any, b: Any) -> Any:
 def full_like(a: Any, value: float) -> Any:
     """A number in the shape and of the kind of `a`."""
     library = _library(a)
-    return library.full_like(a, value) if library.__name__ in ("torch", "numpy") and hasattr(a, "shape") else value
+    return library.full_like(a, value) if library.__name__ in ("torch", "numpy") and getattr(a, "ndim", 0) else value
 
 
 def between(z: Any, low: Any, high: Any) -> Any:

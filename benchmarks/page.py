@@ -68,9 +68,9 @@ SECTIONS = (
     Section(
         "Optima at once",
         "batched_optima",
-        ("solver",),
+        ("task",),
         {"milliseconds": "ms", "speedup": "times"},
-        quick=("--episodes", "512", "--checked", "20"),
+        quick=("--episodes", "20"),
     ),
     Section(
         "Intervals",

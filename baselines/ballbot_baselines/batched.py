@@ -41,9 +41,12 @@ _ROUGH_PATH, _ROUGH_GOAL = (
 # Greater multipliers and narrow prices at first keep a motion on its side of the obstacles.
 _SIDES = tuple(
     Options(bends=bends, width=width, multiplier=multiplier, tolerance=1e-4, violation=1e-3)
-    for bends, width, multiplier in ((6, 0.02, 10.0), (3, 0.05, 1.0), (3, 0.2, 0.1))
+    for bends, width, multiplier in ((6, 0.02, 10.0), (3, 0.05, 1.0), (1, 0.02, 10.0), (6, 0.01, 30.0), (3, 0.2, 0.1))
 )
-_ROUGH_SOLUTION = tuple(Options(bends=bends, width=0.02, multiplier=1.0) for bends in (1, 0, 3))
+_ROUGH_SOLUTION = tuple(
+    Options(bends=bends, width=width, multiplier=multiplier, tolerance=3e-6)
+    for bends, width, multiplier in ((1, 0.01, 3.0), (0, 0.01, 3.0), (3, 0.01, 3.0), (1, 0.02, 1.0))
+)
 _SIDES_DOUBT = 0.005  # relative: how differently the coarse grid and rough solutions may order choices of sides
 _SAME = 0.02  # m: rough solutions that are nowhere farther apart are the same
 _AT_ONCE = 256  # episodes in memory
@@ -80,7 +83,7 @@ def solves(task: Task, params: BallbotParams) -> bool:
     """Whether `find_optima` can solve this task here: C code can be compiled, and has all operations of the task."""
     try:
         ilqr(task, params)
-    except (machine_code.NoMachineCodeError, NotImplementedError):
+    except (machine_code.NoMachineCodeError, NotImplementedError, OSError):
         return False
     return True
 

@@ -1,6 +1,6 @@
-/* iLQR with limits of the action, and with the other inequalities by augmented Lagrangians, of many episodes.
+/* iLQR with limits of the action, and with prices of the other inequalities, of many episodes.
 
-   `ilqr.py` writes the functions above of this file: `sweep`, `hold` and `end`. A block of LANES episodes is computed at once. A lane
+   `ilqr.py` writes the functions `sweep`, `end`, `hold`, `bend` and `steer` above. A block of LANES episodes is computed at once. A lane
    that has finished takes up the next episode. So an episode's result does not depend on the others. */
 
 #include <stdlib.h>
@@ -8,12 +8,11 @@
 
 #define AHEAD (STATES * (STATES + 1) / 2 + STATES + 1) /* second derivatives, slopes, and what a step promises */
 #define ROWS(name, count) real (*name)[count][LANES]
-#define MAKE(name, steps, count) ROWS(name, count) = calloc((size_t)(steps) + 1, sizeof *name)
 #define AT(rows) &(rows)[0][0], LANES
 #define EACH_LANE for (int k = 0; k < LANES; ++k)
 
 typedef struct {
-    double width, least_width, shrink, factor, tolerance, violation, iterations, bends;
+    double width, least_width, shrink, factor, tolerance, violation, iterations, bends, multiplier;
 } options;
 
 enum { OPTIMAL = 0, STUCK = 1, EXHAUSTED = 2, FELL = 3 };
@@ -46,154 +45,201 @@ static void violation(int count, const real *g, const real *multiplier, int k, r
     }
 }
 
-/* Solves `jobs` episodes of at most n steps; those with fewer begin with steps of no length. Arrays are C-contiguous; x (jobs,
-   n+1, STATES) and a (jobs, n, 2) are guesses, and then results; m (jobs, n, PATH) and e (jobs, END) multipliers, both ways.
-   The first steps bend a guess that is no motion toward one by Newton steps on the dynamics; then all are simulated. */
-void solve(int64_t jobs, int64_t n, const options *o, const int64_t *steps, const double *lengths,
-           const double *given, double *x_all, double *a_all, double *m_all, double *e_all, double *gains_all,
-           double *slopes_all, double *costs, double *missed_all, int64_t *status, int64_t *iterations) {
-    MAKE(x, n, STATES); MAKE(a, n, 2); MAKE(m, n, PATH + 1); MAKE(dt, n, 1);
-    MAKE(x_new, n, STATES); MAKE(a_new, n, 2); MAKE(g, n, PATH + 1); MAKE(g_new, n, PATH + 1); MAKE(rate, n, 1); MAKE(priced, n, 1);
-    MAKE(change, n, 2); MAKE(gain, n, 2 * STATES); MAKE(slope, n, STATES); MAKE(shift, n, STATES);
-    real e[END + 1][LANES] = {{0}}, ge[END + 1][LANES] = {{0}}, ge_new[END + 1][LANES] = {{0}};
-    real p[PARAMS + 1][LANES] = {{0}}, ahead[2][AHEAD][LANES], value[1][LANES], width[1][LANES], share[1][LANES];
-    real damping[1][LANES] = {{0}}, open[1][LANES], merit[LANES], cost[LANES] = {0};
-    int64_t job[LANES], tick[LANES] = {0}, next = 0, active = 0;
-    EACH_LANE job[k] = -1, width[0][k] = 1, share[0][k] = 0;
+/* Arrays of all episodes, C-contiguous: x (jobs, n+1, STATES) and a (jobs, n, 2) are guesses, and then results. Episodes of fewer
+   than n steps begin with steps of no length. */
+typedef struct {
+    const int64_t *steps;
+    const double *lengths, *given;
+    double *x_all, *a_all, *gains_all, *slopes_all, *costs, *missed_all;
+    int64_t *status, *iterations;
+} problems;
 
-    for (;;) {
-        EACH_LANE if (job[k] < 0 && next < jobs) { /* takes up the next episode */
-            const int64_t j = job[k] = next++, empty = n - steps[j];
-            ++active, tick[k] = 0, merit[k] = INFINITY;
-            width[0][k] = o->width, share[0][k] = 1, damping[0][k] = 0;
-            for (int64_t t = 0; t <= n; ++t) {
-                const int64_t s = t < empty ? 0 : t - empty;
-                for (int i = 0; i < STATES; ++i) x[t][i][k] = x_all[(j * (n + 1) + s) * STATES + i];
-                if (t == n) break;
-                dt[t][0][k] = t < empty ? 0 : lengths[j];
-                for (int i = 0; i < 2; ++i) a[t][i][k] = t < empty ? 0 : a_all[(j * n + s) * 2 + i];
-                for (int i = 0; i < PATH; ++i) m[t][i][k] = t < empty ? 0 : m_all[(j * n + s) * PATH + i];
-            }
-            for (int i = 0; i < END; ++i) e[i][k] = e_all[j * END + i];
-            for (int i = 0; i < PARAMS; ++i) p[i][k] = given[j * PARAMS + i];
-        }
-        if (!active) break;
+/* LANES episodes: row t of the arrays is step t. */
+typedef struct {
+    int64_t n, active, job[LANES], tick[LANES];
+    const options *o;
+    ROWS(x, STATES); ROWS(x_new, STATES); ROWS(shift, STATES); ROWS(slope, STATES); ROWS(gain, 2 * STATES);
+    ROWS(a, 2); ROWS(a_new, 2); ROWS(change, 2); ROWS(m, PATH + 1); ROWS(g, PATH + 1); ROWS(g_new, PATH + 1);
+    ROWS(dt, 1); ROWS(rate, 1); ROWS(priced, 1);
+    real e[END + 1][LANES], ge[END + 1][LANES], ge_new[END + 1][LANES], p[PARAMS + 1][LANES], ahead[2][AHEAD][LANES];
+    real value[1][LANES], width[1][LANES], share[1][LANES], damping[1][LANES], open[1][LANES];
+    real merit[LANES], merit_new[LANES], cost[LANES], cost_new[LANES], *promised;
+} block;
 
-        /* backwards */
-        int bending = 0, simulating = 0, bent[LANES] = {0};
-        EACH_LANE {
-            open[0][k] = tick[k] <= o->bends;
-            if (job[k] >= 0) *(tick[k] < o->bends ? &bending : &simulating) = 1;
-        }
-        end(AT(x[n]), AT(e), AT(p), AT(width), AT(ahead[n & 1]), AT(value), AT(ge_new));
-        for (int64_t t = n - 1; t >= 0; --t)
-            sweep(AT(ahead[(t + 1) & 1]), AT(x[t]), AT(a[t]), AT(dt[t]), AT(m[t]), AT(p), AT(width), AT(damping),
-                  AT(x[t + 1]), AT(open), AT(ahead[t & 1]), AT(change[t]), AT(gain[t]), AT(slope[t]));
-        real *promised = ahead[0][AHEAD - 1];
+/* Episode j takes up lane k. */
+static void load(block *b, const problems *q, int64_t j, int k) {
+    const int64_t empty = b->n - q->steps[j];
+    b->job[k] = j;
+    ++b->active, b->tick[k] = 0, b->merit[k] = INFINITY;
+    b->width[0][k] = b->o->width, b->share[0][k] = 1, b->damping[0][k] = 0;
+    for (int64_t t = 0; t <= b->n; ++t) {
+        const int64_t s = t < empty ? 0 : t - empty;
+        for (int i = 0; i < STATES; ++i) b->x[t][i][k] = q->x_all[(j * (b->n + 1) + s) * STATES + i];
+        if (t == b->n) break;
+        b->dt[t][0][k] = t < empty ? 0 : q->lengths[j];
+        for (int i = 0; i < 2; ++i) b->a[t][i][k] = t < empty ? 0 : q->a_all[(j * b->n + s) * 2 + i];
+        for (int i = 0; i < PATH; ++i) b->m[t][i][k] = t < empty ? 0 : b->o->multiplier;
+    }
+    for (int i = 0; i < END; ++i) b->e[i][k] = b->o->multiplier;
+    for (int i = 0; i < PARAMS; ++i) b->p[i][k] = q->given[j * PARAMS + i];
+}
 
-        /* forwards */
-        memcpy(x_new[0], x[0], sizeof *x_new);
+/* How far the constraints are missed, and complementarity is. */
+static void off(const block *b, int k, real *gap, real *missed) {
+    for (int64_t t = 0; t < b->n; ++t)
+        if (b->dt[t][0][k] > 0) violation(PATH, &b->g[t][0][0], &b->m[t][0][0], k, gap, missed);
+    violation(END, &b->ge[0][0], &b->e[0][0], k, gap, missed);
+}
+
+static void unload(block *b, const problems *q, int k, int over) {
+    const int64_t j = b->job[k], empty = b->n - q->steps[j];
+    real gap = 0, missed = 0;
+    for (int64_t t = empty; t <= b->n; ++t) {
+        const int64_t s = t - empty;
+        for (int i = 0; i < STATES; ++i) q->x_all[(j * (b->n + 1) + s) * STATES + i] = b->x[t][i][k];
+        if (t == b->n) break;
+        for (int i = 0; i < 2; ++i) q->a_all[(j * b->n + s) * 2 + i] = b->a[t][i][k];
+        for (int i = 0; i < 2 * STATES; ++i) q->gains_all[(j * b->n + s) * 2 * STATES + i] = b->gain[t][i][k];
+        for (int i = 0; i < STATES; ++i) q->slopes_all[(j * b->n + s) * STATES + i] = b->slope[t][i][k];
+    }
+    off(b, k, &gap, &missed);
+    q->costs[j] = b->cost[k], q->missed_all[j] = missed, q->status[j] = over, q->iterations[j] = b->tick[k];
+    b->job[k] = -1, --b->active;
+}
+
+static void backwards(block *b) {
+    end(AT(b->x[b->n]), AT(b->e), AT(b->p), AT(b->width), AT(b->ahead[b->n & 1]), AT(b->value), AT(b->ge_new));
+    for (int64_t t = b->n - 1; t >= 0; --t)
+        sweep(AT(b->ahead[(t + 1) & 1]), AT(b->x[t]), AT(b->a[t]), AT(b->dt[t]), AT(b->m[t]), AT(b->p), AT(b->width),
+              AT(b->damping), AT(b->x[t + 1]), AT(b->open), AT(b->ahead[t & 1]), AT(b->change[t]), AT(b->gain[t]), AT(b->slope[t]));
+    b->promised = b->ahead[0][AHEAD - 1];
+    memcpy(b->x_new[0], b->x[0], sizeof *b->x_new);
 #if STATES > 8
-        EACH_LANE { /* the length of the steps is free */
-            const real first = ahead[0][AHEAD - 2][k], second = ahead[0][AHEAD - STATES - 2][k], h = x[0][8][k];
-            const real most = 0.15 * h, wanted = second > 0 ? -first / second : -first * INFINITY;
-            real move = share[0][k] * (wanted > most ? most : wanted < -most ? -most : wanted);
-            if (!(move == move)) move = 0;
-            const real low = p[PARAMS - 2][k], high = p[PARAMS - 1][k];
-            x_new[0][8][k] = h + move < low ? low : h + move > high ? high : h + move;
-            promised[k] -= first * (x_new[0][8][k] - h) / 2;
-        }
+    EACH_LANE { /* the length of the steps is free */
+        const real first = b->ahead[0][AHEAD - 2][k], second = b->ahead[0][AHEAD - STATES - 2][k], h = b->x[0][8][k];
+        const real most = 0.15 * h, wanted = second > 0 ? -first / second : -first * INFINITY;
+        real move = b->share[0][k] * (wanted > most ? most : wanted < -most ? -most : wanted);
+        if (!(move == move)) move = 0;
+        const real low = b->p[PARAMS - 2][k], high = b->p[PARAMS - 1][k];
+        b->x_new[0][8][k] = h + move < low ? low : h + move > high ? high : h + move;
+        b->promised[k] -= first * (b->x_new[0][8][k] - h) / 2;
+    }
 #endif
-        real cost_new[LANES] = {0}, merit_new[LANES];
-        if (bending) {
-            memset(shift[0], 0, sizeof *shift);
-            EACH_LANE for (int i = 8; i < STATES; ++i) shift[0][i][k] = x_new[0][i][k] - x[0][i][k];
-            for (int64_t t = 0; t < n; ++t)
-                bend(AT(x[t]), AT(shift[t]), AT(x[t + 1]), AT(a[t]), AT(change[t]), AT(share), AT(gain[t]), AT(dt[t]), AT(p),
-                     AT(shift[t + 1]), AT(a_new[t]));
-            EACH_LANE if (job[k] >= 0 && tick[k] < o->bends) {
-                for (int64_t t = 0; t < n; ++t)
-                    for (int i = 0; i < 2; ++i) a[t][i][k] = a_new[t][i][k];
-                for (int64_t t = 0; t <= n; ++t)
-                    for (int i = 0; i < STATES; ++i) x[t][i][k] += shift[t][i][k];
-                ++tick[k], bent[k] = 1;
-            }
-            if (!simulating) continue;
-        }
-        for (int64_t t = 0; t < n; ++t)
-            hold(AT(x_new[t]), AT(a[t]), AT(change[t]), AT(share), AT(gain[t]), AT(x[t]), AT(dt[t]), AT(p), AT(m[t]),
-                 AT(width), AT(x_new[t + 1]), AT(a_new[t]), AT(rate[t]), AT(g_new[t]), AT(priced[t]));
-        end(AT(x_new[n]), AT(e), AT(p), AT(width), AT(ahead[1]), AT(value), AT(ge_new));
-        for (int64_t t = 0; t < n; ++t) EACH_LANE cost_new[k] += rate[t][0][k];
-        EACH_LANE {
-            cost_new[k] += value[0][k];
-            merit_new[k] = cost_new[k] + price(END, &ge_new[0][0], &e[0][0], width[0][k], k);
-        }
-        for (int64_t t = 0; t < n; ++t) EACH_LANE merit_new[k] += priced[t][0][k];
+}
 
-        /* decides for each episode */
-        EACH_LANE if (job[k] >= 0 && !bent[k]) {
-            const int64_t j = job[k];
-            const int tracked = tick[k] == o->bends, accepted = tracked ? isfinite(merit_new[k]) : merit_new[k] < merit[k];
-            int over = -1;
-            if (accepted) {
-                for (int64_t t = 0; t <= n; ++t) {
-                    for (int i = 0; i < STATES; ++i) x[t][i][k] = x_new[t][i][k];
-                    if (t == n) break;
-                    for (int i = 0; i < 2; ++i) a[t][i][k] = a_new[t][i][k];
-                    for (int i = 0; i < PATH; ++i) g[t][i][k] = g_new[t][i][k];
-                }
-                for (int i = 0; i < END; ++i) ge[i][k] = ge_new[i][k];
-                cost[k] = cost_new[k], merit[k] = merit_new[k];
-            } else if (tracked)
-                over = FELL;
-            const real used = share[0][k], scale = fabs(cost[k]) + 1e-12;
-            share[0][k] = accepted ? 1 : used * 0.35;
-            damping[0][k] = accepted ? (used < 1 ? damping[0][k] : damping[0][k] * 0.2) : fmin(damping[0][k] * 4 + 1e-3, 1e3);
-            if (damping[0][k] < 1e-6) damping[0][k] = 0;
-            const int settled = promised[k] < o->tolerance * scale;
-            const int stuck = !accepted && share[0][k] < 1e-3;
-            if (over < 0 && !tracked && (settled || stuck || (accepted && promised[k] < 1e-2 * scale))) {
-                real gap = 0, missed = 0;
-                for (int64_t t = 0; t < n; ++t)
-                    if (dt[t][0][k] > 0) violation(PATH, &g[t][0][0], &m[t][0][0], k, &gap, &missed);
-                violation(END, &ge[0][0], &e[0][0], k, &gap, &missed);
-                if ((settled || stuck) && missed <= o->violation && gap <= 10 * o->tolerance * scale)
-                    over = settled ? OPTIMAL : STUCK;
-                else if (stuck && width[0][k] <= o->least_width)
-                    over = STUCK;
-                else {
-                    for (int64_t t = 0; t < n; ++t)
-                        if (dt[t][0][k] > 0) update(PATH, &g[t][0][0], &m[t][0][0], width[0][k], o->factor, k);
-                    update(END, &ge[0][0], &e[0][0], width[0][k], o->factor, k);
-                    width[0][k] = fmax(width[0][k] * o->shrink, o->least_width);
-                    merit[k] = cost[k] + price(END, &ge[0][0], &e[0][0], width[0][k], k), share[0][k] = 1;
-                    for (int64_t t = 0; t < n; ++t)
-                        if (dt[t][0][k] > 0) merit[k] += price(PATH, &g[t][0][0], &m[t][0][0], width[0][k], k);
-                }
-            }
-            if (++tick[k] >= o->iterations && over < 0) over = EXHAUSTED;
-            if (over < 0) continue;
-            /* finished */
-            const int64_t empty = n - steps[j];
-            real gap = 0, missed = 0;
-            for (int64_t t = empty; t <= n; ++t) {
-                const int64_t s = t - empty;
-                for (int i = 0; i < STATES; ++i) x_all[(j * (n + 1) + s) * STATES + i] = x[t][i][k];
-                if (t == n) break;
-                for (int i = 0; i < 2; ++i) a_all[(j * n + s) * 2 + i] = a[t][i][k];
-                for (int i = 0; i < PATH; ++i) m_all[(j * n + s) * PATH + i] = m[t][i][k];
-                for (int i = 0; i < 2 * STATES; ++i) gains_all[(j * n + s) * 2 * STATES + i] = gain[t][i][k];
-                for (int i = 0; i < STATES; ++i) slopes_all[(j * n + s) * STATES + i] = slope[t][i][k];
-                violation(PATH, &g[t][0][0], &m[t][0][0], k, &gap, &missed);
-            }
-            violation(END, &ge[0][0], &e[0][0], k, &gap, &missed);
-            for (int i = 0; i < END; ++i) e_all[j * END + i] = e[i][k];
-            costs[j] = cost[k], missed_all[j] = missed, status[j] = over, iterations[j] = tick[k];
-            job[k] = -1, --active;
+/* Bends guesses that are no motions: a Newton step on the dynamics. */
+static void bend_guesses(block *b) {
+    memset(b->shift[0], 0, sizeof *b->shift);
+    EACH_LANE for (int i = 8; i < STATES; ++i) b->shift[0][i][k] = b->x_new[0][i][k] - b->x[0][i][k];
+    for (int64_t t = 0; t < b->n; ++t)
+        bend(AT(b->x[t]), AT(b->shift[t]), AT(b->x[t + 1]), AT(b->a[t]), AT(b->change[t]), AT(b->share), AT(b->gain[t]),
+             AT(b->dt[t]), AT(b->p), AT(b->shift[t + 1]), AT(b->a_new[t]));
+    EACH_LANE if (b->job[k] >= 0 && b->tick[k] < b->o->bends) {
+        for (int64_t t = 0; t < b->n; ++t)
+            for (int i = 0; i < 2; ++i) b->a[t][i][k] = b->a_new[t][i][k];
+        for (int64_t t = 0; t <= b->n; ++t)
+            for (int i = 0; i < STATES; ++i) b->x[t][i][k] += b->shift[t][i][k];
+        ++b->tick[k];
+    }
+}
+
+static void forwards(block *b) {
+    EACH_LANE b->cost_new[k] = 0;
+    for (int64_t t = 0; t < b->n; ++t)
+        hold(AT(b->x_new[t]), AT(b->a[t]), AT(b->change[t]), AT(b->share), AT(b->gain[t]), AT(b->x[t]), AT(b->dt[t]),
+             AT(b->p), AT(b->m[t]), AT(b->width), AT(b->x_new[t + 1]), AT(b->a_new[t]), AT(b->rate[t]), AT(b->g_new[t]), AT(b->priced[t]));
+    end(AT(b->x_new[b->n]), AT(b->e), AT(b->p), AT(b->width), AT(b->ahead[1]), AT(b->value), AT(b->ge_new));
+    for (int64_t t = 0; t < b->n; ++t) EACH_LANE b->cost_new[k] += b->rate[t][0][k];
+    EACH_LANE {
+        b->cost_new[k] += b->value[0][k];
+        b->merit_new[k] = b->cost_new[k] + price(END, &b->ge_new[0][0], &b->e[0][0], b->width[0][k], k);
+    }
+    for (int64_t t = 0; t < b->n; ++t) EACH_LANE b->merit_new[k] += b->priced[t][0][k];
+}
+
+static void accept(block *b, int k) {
+    for (int64_t t = 0; t <= b->n; ++t) {
+        for (int i = 0; i < STATES; ++i) b->x[t][i][k] = b->x_new[t][i][k];
+        if (t == b->n) break;
+        for (int i = 0; i < 2; ++i) b->a[t][i][k] = b->a_new[t][i][k];
+        for (int i = 0; i < PATH; ++i) b->g[t][i][k] = b->g_new[t][i][k];
+    }
+    for (int i = 0; i < END; ++i) b->ge[i][k] = b->ge_new[i][k];
+    b->cost[k] = b->cost_new[k], b->merit[k] = b->merit_new[k];
+}
+
+/* New multipliers, and a narrower price. */
+static void reprice(block *b, int k) {
+    for (int64_t t = 0; t < b->n; ++t)
+        if (b->dt[t][0][k] > 0) update(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], b->o->factor, k);
+    update(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], b->o->factor, k);
+    b->width[0][k] = fmax(b->width[0][k] * b->o->shrink, b->o->least_width);
+    b->merit[k] = b->cost[k] + price(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], k), b->share[0][k] = 1;
+    for (int64_t t = 0; t < b->n; ++t)
+        if (b->dt[t][0][k] > 0) b->merit[k] += price(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], k);
+}
+
+/* Takes or refuses the simulated step, and says how the episode ended, or -1. */
+static int decide(block *b, int k) {
+    const int tracked = b->tick[k] == b->o->bends;
+    const int accepted = tracked ? isfinite(b->merit_new[k]) : b->merit_new[k] < b->merit[k];
+    int over = -1;
+    if (accepted)
+        accept(b, k);
+    else if (tracked)
+        over = FELL;
+    const real used = b->share[0][k], scale = fabs(b->cost[k]) + 1e-12;
+    b->share[0][k] = accepted ? 1 : used * 0.35;
+    real *damping = &b->damping[0][k];
+    *damping = !accepted ? fmin(*damping * 4 + 1e-3, 1e3) : used < 1 ? *damping : *damping * 0.2;
+    if (*damping < 1e-6) *damping = 0;
+    const int settled = b->promised[k] < b->o->tolerance * scale;
+    const int stuck = !accepted && b->share[0][k] < 1e-3;
+    if (over < 0 && !tracked && (settled || stuck || (accepted && b->promised[k] < 1e-2 * scale))) {
+        real gap = 0, missed = 0;
+        off(b, k, &gap, &missed);
+        if ((settled || stuck) && missed <= b->o->violation && gap <= 10 * b->o->tolerance * scale)
+            over = settled ? OPTIMAL : STUCK;
+        else if (stuck && b->width[0][k] <= b->o->least_width)
+            over = STUCK;
+        else
+            reprice(b, k);
+    }
+    return ++b->tick[k] >= b->o->iterations && over < 0 ? EXHAUSTED : over;
+}
+
+/* Solves `jobs` episodes of at most n steps. */
+void solve(int64_t jobs, int64_t n, const options *o, const int64_t *steps, const double *lengths, const double *given,
+           double *x, double *a, double *gains, double *slopes, double *costs, double *missed, int64_t *status,
+           int64_t *iterations) {
+    const problems q = {steps, lengths, given, x, a, gains, slopes, costs, missed, status, iterations};
+    block *b = calloc(1, sizeof *b);
+    b->n = n, b->o = o;
+#define MAKE(name) b->name = calloc((size_t)n + 1, sizeof *b->name)
+    MAKE(x); MAKE(x_new); MAKE(shift); MAKE(slope); MAKE(gain); MAKE(a); MAKE(a_new); MAKE(change); MAKE(m); MAKE(g);
+    MAKE(g_new); MAKE(dt); MAKE(rate); MAKE(priced);
+    int64_t next = 0;
+    EACH_LANE b->job[k] = -1, b->width[0][k] = 1;
+    for (;;) {
+        int bending = 0, simulating = 0, bends[LANES];
+        EACH_LANE {
+            if (b->job[k] < 0 && next < jobs) load(b, &q, next++, k);
+            bends[k] = b->job[k] >= 0 && b->tick[k] < o->bends;
+            b->open[0][k] = b->tick[k] <= o->bends;
+            if (b->job[k] >= 0) *(bends[k] ? &bending : &simulating) = 1;
+        }
+        if (!b->active) break;
+        backwards(b);
+        if (bending) bend_guesses(b);
+        if (!simulating) continue;
+        forwards(b);
+        EACH_LANE if (b->job[k] >= 0 && !bends[k]) {
+            const int over = decide(b, k);
+            if (over >= 0) unload(b, &q, k, over);
         }
     }
-    void *made[] = {x, a, m, dt, x_new, a_new, g, g_new, rate, change, gain, slope, shift, priced};
+    void *made[] = {b->x, b->x_new, b->shift, b->slope, b->gain, b->a, b->a_new, b->change, b->m, b->g, b->g_new, b->dt,
+                    b->rate, b->priced, b};
     for (unsigned i = 0; i < sizeof made / sizeof *made; ++i) free(made[i]);
 }
 

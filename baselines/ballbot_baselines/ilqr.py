@@ -38,7 +38,17 @@ _LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
 _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
 
 
-_READ = ("width", "least_width", "shrink", "factor", "tolerance", "violation", "iterations", "bends")  # by ilqr.c
+_READ = (
+    "width",
+    "least_width",
+    "shrink",
+    "factor",
+    "tolerance",
+    "violation",
+    "iterations",
+    "bends",
+    "multiplier",
+)  # by ilqr.c
 
 
 @dataclass(frozen=True)
@@ -106,7 +116,7 @@ class Ilqr:
         self.states, self._sizes = stage.ns, stage.sizes
         self._solve, self._follow = library.solve, library.follow
         count, pointer = ctypes.c_int64, ctypes.c_void_p
-        self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 14], None
+        self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 12], None
         self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 8], None
 
     def solve(
@@ -123,10 +133,6 @@ class Ilqr:
             options: of the solver.
         """
         jobs, n = a.shape[:2]
-        path, end = (
-            np.full((jobs, *shape), float(options.multiplier))
-            for shape in ((n, self._sizes["PATH"]), (self._sizes["END"],))
-        )
         x, a = np.array(x, np.float64, order="C"), np.array(a, np.float64, order="C")
         gains, slopes = np.zeros((jobs, n, 2, self.states)), np.zeros((jobs, n, self.states))
         costs, missed = np.zeros(jobs), np.zeros(jobs)
@@ -137,8 +143,6 @@ class Ilqr:
             *each,
             x,
             a,
-            path,
-            end,
             gains,
             slopes,
             costs,

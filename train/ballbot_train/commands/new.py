@@ -6,8 +6,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
-import jinja2
-
 from ballbot_gym import files
 from ballbot_gym.robots import check_name
 from ballbot_gym.tasks import TASKS
@@ -46,6 +44,8 @@ def new(kind: Literal["task"], name: str, /, out: Path | None = None, episodes: 
 
 def files_of(name: str) -> dict[str, str]:
     """The files of a task's package by their names, as text."""
+    import jinja2  # no other command needs it
+
     kind = "".join(part.capitalize() for part in name.split("_"))
     module = module_of(name)
     values = {"name": name, "kind": kind, "module": module, "id": f"Ballbot{kind}-v0"}

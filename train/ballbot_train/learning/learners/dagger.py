@@ -12,9 +12,9 @@ because its gain is the derivative of the optimal force with respect to the stat
 around each state of an optimum, and the states of whole episodes under the learner as far as they lie within `max_distance`
 of the episode's plan. Errors are weighted by one over the cost of the episode's optimum, as regret is.
 
-Where `ballbot_baselines.batched` solves the task, thousands of optima are found at once (`batch_episodes`): half of them from
-the beginnings of episodes, half from states that the learner reaches from there. They bring the feedback about them, so
-states around them are labelled too.
+With a C compiler, thousands of optima can be found at once (`batch_episodes`): half of them from the beginnings of episodes,
+half from states that the learner reaches from there. They bring the feedback about them, so states around them are labelled
+too.
 """
 
 from collections.abc import Mapping, Sequence
