@@ -17,6 +17,7 @@ from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.params import URDF_PATH, UrdfError
 from ballbot_gym.robots import ROBOTS
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.commands.new import files_of
 from ballbot_train.evaluation import evaluate, optima
@@ -305,11 +306,13 @@ def test_two_processes_that_fill_one_cache_agree(module, tmp_path):
     assert len(printed[0].split()) == 3
 
 
-def test_an_episode_without_an_optimum_names_the_methods_to_look_at(counted, monkeypatch):
-    from ballbot_gym.rollout import PlanError
-
-    with pytest.raises(PlanError, match=r"episode 0: .*\n.*Nearby.goal can be reached .* guess_paths"):
-        optima.known(Nearby(duration=2.0, max_tilt=math.radians(1)), "paper", [0])
+def test_a_goal_that_cannot_be_reached_names_the_methods_to_look_at(counted):
+    """0.4 s to come to rest from 1 m away."""
+    far = {"draw_state": lambda self, z, c, params: (1.0, *(0.0,) * 7), "first_exit": True, "id": "Far-v0"}
+    with pytest.raises(
+        PlanError, match=r"no optimum of Far-v0 for\nepisode 0: .*\n.*Far.goal can be reached .* guess_paths"
+    ):
+        optima.known(type("Far", (Nearby,), far)(duration=0.4), "paper", [0])
 
 
 def test_a_new_package_passes_its_own_tests(typed, tmp_path):
@@ -333,3 +336,25 @@ def test_a_new_package_passes_its_own_tests(typed, tmp_path):
 def test_a_new_package_needs_a_name_of_its_own(name, typed, tmp_path):
     assert typed("new", "task", name)[0] == 1
     assert not any(tmp_path.iterdir())
+
+
+FAULTS = {
+    "NaN": ({"cost": lambda self, x, u, c: math.nan * x[..., 0]}, r"Wrong.cost gives nan without force"),
+    "negative": ({"cost": lambda self, x, u, c: -u[..., 0]}, r"Wrong.cost gives -0 without force and -35 with one"),
+    "start": (
+        {"draw_state": lambda self, z, c, params: (0.0, 0.0, 1.5, *(0.0,) * 5)},
+        "Wrong.draw_state .* the limit of tilt",
+    ),
+    "guess": (
+        {"guess_paths": lambda self, x, c, params: [np.zeros((5, 3))]},
+        r"Wrong.guess_paths gives the shape \(5, 3\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_task_that_no_optimizer_can_use_is_refused_by_the_name_of_its_method(name):
+    methods, message = FAULTS[name]
+    task = type("Wrong", (Stabilize,), {"id": "Wrong-v0", **methods})()
+    with pytest.raises(ValueError, match=message):
+        optima.known(task, "paper", [0])

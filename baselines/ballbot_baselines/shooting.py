@@ -229,7 +229,8 @@ class Shooting:
         for name in ("fatrop", "ipopt"):
             solver = free_time_solver(self.task, self.params, name)
             bounds = self._bounds(solver, x[0], n)
-            bounds.state_lower[:, 8], bounds.state_upper[:, 8] = self.task.control_dt / 4, self.task.duration / n
+            longest = self.task.duration / n
+            bounds.state_lower[:, 8], bounds.state_upper[:, 8] = min(self.task.control_dt / 4, longest), longest
             solution = solver.solve(np.column_stack([x, np.full(n + 1, h)]), a, bounds, self._parameters())
             if solution.is_optimal:
                 break

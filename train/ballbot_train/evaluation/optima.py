@@ -3,10 +3,12 @@
 Importing this module is light: CasADi is imported when an optimum is computed.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
 import filelock
+import numpy as np
 
 from ballbot_gym import certified
 from ballbot_gym.certified import cache
@@ -72,8 +74,11 @@ def compute(
 
     Raises:
         PlanError: an episode has no optimum; all others are kept.
+        ValueError: a method of the task gives what no optimizer can use; the message names it.
     """
     needed = list(dict.fromkeys(episodes))
+    for index in needed:
+        _check_start(task, params, index)
     folder = cache.folder(task, params)
     jobs.make_folder(folder)
     lock = filelock.FileLock(folder / "computing.lock")
@@ -106,6 +111,25 @@ def compute(
             + f"\nLook whether {type(task).__name__}.goal can be reached "
             "from what draw_state draws within duration and margins, and whether guess_paths leads there"
         )
+
+
+def _check_start(task: Task, params: BallbotParams, index: int) -> None:
+    """Raises a ValueError that names the method of a task with which an episode cannot even begin."""
+    kind, where = type(task).__name__, f"at the start of episode {index}"
+    x, c = cache.episode(task, params, index)
+    if violated := task.violated(x, c):  # as a state does that is not finite
+        raise ValueError(f"{kind}.draw_state draws {x.tolist()} {where}, which is beyond the limit of {violated}")
+    force = np.full(2, 0.1 * params.force_limit)
+    cost, more = (float(task.cost(x, u, c)) for u in (np.zeros(2), force))
+    if not (0 <= cost < math.inf and 0 <= more < math.inf):
+        raise ValueError(
+            f"{kind}.cost gives {cost:g} without force and {more:g} with one {where}; make it finite and ≥ 0"
+        )
+    for path in task.guess_paths(x, c, params):
+        if np.shape(path)[1:] != (2,) or len(path) < 2 or not np.isfinite(path).all():
+            raise ValueError(
+                f"{kind}.guess_paths gives the shape {np.shape(path)} {where}; give finite (n+1, 2) positions, m"
+            )
 
 
 def _missing(task: Task, params: BallbotParams, episodes: list[int], enough: int) -> list[int]:
