@@ -13,13 +13,14 @@ from ballbot_gym.params import BallbotParams
 
 _PRESSED = -1e-9  # m: height of the ball at reset; at 0 the first step would find no contact
 _ALMOST_NOTHING = 1e-9  # kg and kg·m²: MuJoCo wants a mass of whatever moves
+_BODY, _BALL = 2, 3  # after the world and the hub, in the order in which they are added
 _LEANS = (((0, 1, 0), "gamma"), ((-1, 0, 0), "theta"))
 
 
 class MujocoSimulator(Simulator):
     """A robot whose ball translates in MuJoCo, integrated by RK4."""
 
-    _places = np.arange(4)  # of x, y, γ and θ among the joints
+    _places = (0, 1, 2, 3)  # of x, y, γ and θ among the joints
     _longest = 0.005  # s, of a step by default
 
     def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
@@ -47,8 +48,8 @@ class MujocoSimulator(Simulator):
         if memory:
             self._mujoco.mj_setState(self._model, self._data, np.array(memory), self._kept)
             return
-        self._positions[self._places] = x[:4]
-        self._velocities[self._places] = x[4:]
+        for i, place in enumerate(self._places):
+            self._positions[place], self._velocities[place] = x[i], x[i + 4]
 
     def set_params(self, params: BallbotParams) -> None:
         check_rolling(params, self._params.rolls)
@@ -57,7 +58,9 @@ class MujocoSimulator(Simulator):
     def step(self, u: tuple[float, float]) -> State:
         self._push(u)
         self._advance()
-        return (*self._positions[self._places].tolist(), *self._velocities[self._places].tolist())
+        x, y, gamma, theta = self._places
+        p, v = self._positions.tolist(), self._velocities.tolist()
+        return p[x], p[y], p[gamma], p[theta], v[x], v[y], v[gamma], v[theta]
 
     def close(self) -> None:
         pass
@@ -73,7 +76,9 @@ class MujocoSimulator(Simulator):
         except ValueError as error:
             raise RuntimeError(f"MuJoCo refuses this robot: {error}; {params}") from error
         self._data = mujoco.MjData(self._model)
-        self._positions, self._velocities = self._data.qpos, self._data.qvel  # views of it
+        # views of it, each of which takes longer to get than to use
+        self._positions, self._velocities, self._pushed = self._data.qpos, self._data.qvel, self._data.qfrc_applied
+        self._twisted = self._data.xfrc_applied
 
     def _describe(self, spec: Any) -> None:
         """Adds the robot to an empty world."""
@@ -98,7 +103,7 @@ class MujocoSimulator(Simulator):
 
     def _push(self, u: tuple[float, float]) -> None:
         """Makes force u act until the next one does."""
-        self._data.qfrc_applied[:2] = u
+        self._pushed[:2] = u
 
     def _advance(self) -> None:
         self._mujoco.mj_step(self._model, self._data, self._substeps)
@@ -114,7 +119,7 @@ class MujocoContactSimulator(MujocoSimulator):
     The force u stands for the torque r e_z × u from the body on the ball, which is held over the control step.
     """
 
-    _places = np.array([0, 1, 3, 4])  # z is third, the ball's turn last
+    _places = (0, 1, 3, 4)  # z is third, the ball's turn last
     _longest = 0.002
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
@@ -187,10 +192,9 @@ class MujocoContactSimulator(MujocoSimulator):
             self._mujoco.mj_step(self._model, self._data)
 
     def _push(self, u: tuple[float, float]) -> None:
-        radius = self._params.ball_radius
-        torque = np.array((-radius * u[1], radius * u[0], 0.0))
-        self._data.body("ball").xfrc_applied[3:] = torque
-        self._data.body("body").xfrc_applied[3:] = -torque
+        radius, twisted = self._params.ball_radius, self._twisted
+        twisted[_BALL, 3], twisted[_BALL, 4] = -radius * u[1], radius * u[0]
+        twisted[_BODY, 3], twisted[_BODY, 4] = radius * u[1], -radius * u[0]
 
 
 def has_mujoco() -> bool:

@@ -32,7 +32,7 @@ _INCHES = (
     12.8,
 )  # of a film's figure: the narrowest and the widest, between which text has the same size in pixels
 _STRIP_SIZE = (520, 390)  # pixels of a strip's picture
-_FALLEN = 45.0  # deg: a failure at a smaller tilt is the touch of an obstacle
+_FALLEN = 45.0  # deg: at a smaller tilt a failure is the touch of an obstacle, or a lost grip
 _PAUSE = 1.5  # s, for which a film that loops shows its last picture
 
 
@@ -211,7 +211,7 @@ class _Film:
             tilt = axis.text(0.03, 0.97, "", fontsize=16, color=take.color, **corner)
             end = axis.text(0.97, 0.97, "", fontsize=16, color=_FAILED, ha="right", weight="bold", **corner)
             if take.failed:
-                end.set_text("fell" if _tilt(take.trajectory.x[-1]) > _FALLEN else "touched")
+                end.set_text("fell" if _tilt(take.trajectory.x[-1]) > _FALLEN else "failed")
             note = axis.text(
                 0.97,
                 0.03,
