@@ -21,9 +21,10 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import FunctionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import benchmark, evaluate
+from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.controllers import make_controller, make_packed, packed
-from ballbot_train.evaluation.results import leaderboard, read_results, summarize, write_leaderboard
-from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy, shipped_policies
+from ballbot_train.evaluation.results import cells, leaderboard, read_results, summarize, write_leaderboard
+from ballbot_train.policy import SHIPPED, PolicyNetwork, PolicySpec, save_policy, shipped_policies
 
 
 def test_regret_is_the_cost_above_the_optimum_and_failed_episodes_have_none():
@@ -170,7 +171,7 @@ def test_a_stable_baselines_model_is_evaluated_as_it_is():
 def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
     task = make_task("stabilize")
     path = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, hidden=(8,))), {})
-    assert evaluate.evaluate(path, "stabilize", 1, "rk4").controller == str(path)
+    assert evaluate.evaluate(path, "stabilize", 1, "rk4").controller == path.name
     assert evaluate.evaluate("lqr", "stabilize", 1, "rk4").success == 1
 
 
@@ -325,3 +326,24 @@ def test_the_files_of_a_policy_are_all_that_a_worker_needs(tmp_path):
         made.reset(0.0, x, c)
     assert np.array_equal(controller.act(0.0, x), expected.act(0.0, x))
     assert packed("lqr") == packed("dagger") == {}
+
+
+def test_whatever_is_evaluated_can_be_compared(tmp_path):
+    for gain in (0.0, 0.5):
+        row = ballbot_train.evaluate(
+            lambda seen, gain=gain: gain * seen[2:4], "turn", 8, "rk4", f"gain {gain}", out=tmp_path / str(gain)
+        )
+        about, results = read_results(tmp_path / str(gain))
+        assert about["physics"] == "rk4"
+        assert [(one.controller, one.episode) for one in results] == [(f"gain {gain}", i) for i in range(8)]
+        assert sum(one.failure for one in results) == row.falls
+    (compared,) = compare(read_results(tmp_path / "0.0"), read_results(tmp_path / "0.5"))
+    assert compared.controller == "gain 0.0 → gain 0.5"
+    assert compared.episodes == 8
+
+
+def test_a_table_names_a_policy_by_its_file(tmp_path):
+    path = shutil.copy(SHIPPED / "turn-dagger.json", tmp_path)
+    shutil.copy(SHIPPED / "turn-dagger.safetensors", tmp_path)
+    row = ballbot_train.evaluate(path, "turn", 1, "rk4")
+    assert row.controller == cells(row)[1] == "turn-dagger.json"

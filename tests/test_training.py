@@ -252,7 +252,7 @@ def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_t
     short_run, tmp_path, monkeypatch
 ):
     figures = iter(
-        (training.Score(ratio, 0.1, 0.1, 1.0, 0), training.Validation(cost, 1.0, 0, 1.0))
+        (training.Score(ratio, 0.1, 0.1, 0.1, 1.0, 0), training.Validation(cost, 1.0, 0, 1.0))
         for ratio, cost in ((1.5, 30.0), (1.4, 20.0), (1.1, 25.0))
     )
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: next(figures))
@@ -267,7 +267,7 @@ def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_t
 
 def test_of_policies_that_never_succeed_the_one_with_the_least_mean_cost_is_kept(short_run, tmp_path, monkeypatch):
     figures = iter(
-        (training.Score(10.0, 0.1, 0.1, 0.0, 0), training.Validation(800.0, 0.0, 0, mean))
+        (training.Score(10.0, 0.1, 0.1, 0.1, 0.0, 0), training.Validation(800.0, 0.0, 0, mean))
         for mean in (700.0, 80.0, 90.0)
     )
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: next(figures))
@@ -295,7 +295,7 @@ def test_a_policy_of_the_preparation_is_kept_only_until_there_is_a_later_one(sho
     monkeypatch.setattr(
         training,
         "score_and_validate",
-        lambda *policy: (training.Score(1.1, 0.1, 0.1, 1.0, 0), training.Validation(next(costs), 1.0, 0, 1.0)),
+        lambda *policy: (training.Score(1.1, 0.1, 0.1, 0.1, 1.0, 0), training.Validation(next(costs), 1.0, 0, 1.0)),
     )
     short_run()
     assert [about["chosen_by"]["cost"] for about in kept] == [30.0, 20.0, 25.0]

@@ -61,7 +61,7 @@ def fakes(monkeypatch):
 
     monkeypatch.setattr(type(LEARNERS["ppo"]), "make", make)
     monkeypatch.setattr(tuning.training, "validate", lambda network, task, robot: Validation(network, 1.0, 0, network))
-    monkeypatch.setattr(tuning.training, "score", lambda network, task, robot: Score(network, 0.1, 0.1, 1.0, 0))
+    monkeypatch.setattr(tuning.training, "score", lambda network, task, robot: Score(network, 0.1, 0.1, 0.1, 1.0, 0))
     space = {"learning_rate": Range(1e-4, 5e-3), "batch_size": Choice((512, 3072, 2048))}
     space["hidden"] = Choice(((64, 64), (128, 128)))
     monkeypatch.setitem(tuning.SPACES, "ppo", space)

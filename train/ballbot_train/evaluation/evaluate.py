@@ -22,9 +22,10 @@ from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.evaluation.results import Result, Row, summarize
+from ballbot_train.evaluation.results import Result, Row, summarize, write_leaderboard
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import PolicyError
+from ballbot_train.provenance import provenance
 
 
 def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
@@ -95,6 +96,7 @@ def evaluate(
     randomization: Randomization | None = None,
     robot: str | BallbotParams = PAPER,
     workers: int | Workers | None = None,
+    out: str | Path | None = None,
 ) -> Row:
     """The leaderboard row of anything that acts.
 
@@ -111,6 +113,7 @@ def evaluate(
         robot: a name in `ROBOTS`, or any BallbotParams.
         workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
             does: what it does must be under `if __name__ == "__main__"`.
+        out: folder for the results, as `ballbot benchmark` writes them and `ballbot compare` reads them.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes.
@@ -122,7 +125,15 @@ def evaluate(
         controller = as_controller(policy, env.task, env.params)
         optima.known(env.task, env.params, indices, workers)
         results = run_episodes(env, controller, name or _name(policy), task_name(env.task), indices)
-        return summarize(results)
+        row = summarize(results)
+        if out is not None:
+            facts = provenance() | {
+                "physics": env.physics,
+                "randomization": repr(env.randomization),
+                "robot": repr(env.params),
+            }
+            write_leaderboard([row], results, facts, Path(out))
+        return row
     finally:
         env.close()
 
@@ -163,7 +174,11 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
 
 
 def _name(policy: Any) -> str:
-    return str(policy) if isinstance(policy, str | Path) else getattr(policy, "__name__", type(policy).__name__.lower())
+    return (
+        Path(policy).name
+        if isinstance(policy, str | Path)
+        else getattr(policy, "__name__", type(policy).__name__.lower())
+    )
 
 
 def task_name(task: Task) -> str:

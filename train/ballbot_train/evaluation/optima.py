@@ -7,12 +7,12 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
-import filelock
 import numpy as np
 
 from ballbot_gym import certified
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
+from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER, checked_robot, file_name, robot_name
@@ -21,6 +21,11 @@ from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bars
 from ballbot_train.executors import Workers
+
+try:
+    import filelock
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 
 def known(

@@ -221,7 +221,7 @@ def cells(row: Row, busy: bool = False) -> list[str]:
     ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
     return [
         row.task,
-        row.controller,
+        Path(row.controller).name,  # a policy may be a long path
         f"{100 * row.success:.1f} %",
         f"{row.falls}/{row.episodes}",
         shown(row.regret_mean, ".2%") + ends,
