@@ -1,5 +1,6 @@
 # make demo   install into .venv and run the benchmark on a twentieth of the episodes: LQR, trajectory optimization, NMPC
 # make test   install into .venv, then lint, check types and test
+# make pythons  the same on other Pythons, without torch: tests of the environments and experts, and README's ten lines
 # make clients  install other people's libraries into .venv-clients and run docs/clients.md with them
 PYTHON ?= python3.11
 VENV := .venv
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 # imports anew: one that trains takes 6 s to start in place of 2.5.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types pytest test-slow bench soak faults fuzz docs pictures certify clients ray clean
+.PHONY: demo test types pytest test-slow bench soak faults fuzz docs pictures certify clients pythons ray clean
 
 demo: $(VENV)/runs
 	$(BIN)/ballbot benchmark --episodes 10 --out runs/demo
@@ -64,6 +65,26 @@ clients: $(VENV)/installed
 	.venv-clients/bin/pip install -c .venv-clients/constraints.txt -e ".[all]" pytest $(patsubst %,"%",$(CLIENTS))
 	.venv-clients/bin/python -m pytest -rs tests/test_clients.py
 
+# Every Python in an environment of its own, in which uv finds or fetches it: first what `[mujoco]` brings, where no warning may
+# appear, then experts and README's ten lines, and last whether all that `[train]` needs has wheels. One alone: make python-3.13
+PYTHONS := 3.10 3.12 3.13 3.14
+APPLY := $(addprefix tests/test_,env.py mujoco.py picture.py tasks.py dynamics.py step_code.py lqr.py optimum.py)
+
+pythons: $(addprefix python-,$(PYTHONS))
+
+.venv-pythons/uv/bin/uv:
+	python3 -m venv .venv-pythons/uv
+	.venv-pythons/uv/bin/pip install uv
+
+python-%: .venv-pythons/uv/bin/uv
+	.venv-pythons/uv/bin/uv venv --clear --seed --python $* .venv-pythons/$*
+	.venv-pythons/$*/bin/pip install --no-compile -e ".[mujoco]" pytest
+	.venv-pythons/$*/bin/python -m pytest tests/test_extras.py -k without_a_warning
+	.venv-pythons/$*/bin/pip install --no-compile -e ".[mujoco,baselines]" filelock hypothesis pytest rich tyro
+	.venv-pythons/$*/bin/python -m pytest -m "not slow" -k "not spec_of_an_env and not vector and not display" $(APPLY)
+	sed '1,/^```python/d; /^```/,$$d' README.md | .venv-pythons/$*/bin/python -
+	.venv-pythons/$*/bin/pip install --dry-run --quiet --only-binary=:all: -e ".[train]"
+
 # Ray clusters of two nodes on this machine, with nodes that are killed
 ray: $(VENV)/installed
 	$(INSTALL) -e ".[ray,tune]"
@@ -101,4 +122,4 @@ $(VENV)/installed: $(VENV)/python
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-clients runs build dist *.egg-info
+	rm -rf $(VENV) .venv-clients .venv-pythons runs build dist *.egg-info

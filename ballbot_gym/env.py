@@ -200,7 +200,7 @@ class BallbotEnv(gymnasium.Env):
         self._resets = 0
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
-        self._steps_left = 0
+        self._steps, self._steps_left = self.task.steps, 0
         self._closed = False
 
     def reset(
@@ -229,7 +229,7 @@ class BallbotEnv(gymnasium.Env):
             if self.randomization.varies_robot:
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
-        self._steps_left = self.task.steps
+        self._steps_left = self._steps
         if self.render_mode == "human":
             self.render()
         return self._observation(start), self._info(start)
@@ -418,7 +418,7 @@ class BallbotEnv(gymnasium.Env):
         if self.params.grips:
             grip, lost = self._grip(before, total)
             kept = -1.0 if lost else 0.0
-        steps = task.steps - self._steps_left
+        steps = self._steps - self._steps_left
         judged = None if self._judge is None else self._judge.judge(before, force, x, steps, kept)
         if judged is None:
             judged = outcome(task, before, force, x, c, steps, (kept,)), None, None

@@ -1,4 +1,4 @@
-"""Control steps per second: ours, single and batched, against the raw PyBullet loop, EnvPool and Gymnasium's MuJoCo.
+"""Control steps per second: ours, single and batched, against the raw loops of the engines, EnvPool and Gymnasium's MuJoCo.
 
 Random actions, resets included, one measurement after another, each in a process of its own. EnvPool and MuJoCo come with
 the extra `[bench]`; what is not installed is said so in the table.
@@ -22,7 +22,9 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from ballbot_gym import TASKS, BallbotEnv, files
+from ballbot_gym.engines import make_simulator
 from ballbot_gym.engines.bullet import BulletSimulator
+from ballbot_gym.engines.mujoco import MujocoSimulator, import_mujoco
 from ballbot_gym.params import default_params
 
 _CONTROL_DT = 0.02  # s
@@ -86,7 +88,8 @@ def main(
 def _plan(batches: tuple[int, ...], tasks: tuple[str, ...], peers: bool, soak: int) -> list[tuple[Callable, tuple]]:
     import torch
 
-    plan: list[tuple[Callable, tuple]] = [(raw_bullet, ()), (single, ("bullet",)), (single, ("rk4",))]
+    plan: list[tuple[Callable, tuple]] = [(raw, (physics,)) for physics in _RAW]
+    plan += [(single, (physics,)) for physics in _RAW]
     if peers:
         plan += [(envpool, ("InvertedPendulum-v4", count)) for count in (16, 256, 1024)]
         plan += [(envpool, ("InvertedDoublePendulum-v4", 256))]
@@ -113,34 +116,67 @@ def _guarded(measure: Callable[..., Row], args: tuple, seconds: float) -> Row:
         return Row(measure.__name__, str(args[0]), args[1], note=f"not installed: {error}")
 
 
-def raw_bullet(seconds: float) -> Row:
-    """What PyBullet itself needs for a control step: torques in, 20 substeps of 1 ms, joint states out."""
-    return _timed(Row("raw PyBullet loop", "ballbot.urdf", 1), _raw_step(), seconds)
+def raw(physics: str, seconds: float) -> Row:
+    """What an engine itself needs for a control step: torques in, its steps of the default length, joint states out."""
+    return _timed(Row(f"raw loop, {physics}", "paper", 1), _RAW[physics](), seconds)
 
 
-def _raw_step() -> Callable[[], None]:
+def _raw_bullet() -> Callable[[], None]:
     simulator = BulletSimulator(default_params(), _CONTROL_DT)
     bullet, client = simulator._bullet, simulator._client
     robot, joints = simulator._robot, simulator._joints
-    start = (0.0, 0.0, 0.3, 0.1, 1.0, 0.0, 0.0, 0.0)
-    count = 0
 
     def step() -> None:
-        nonlocal count
-        if count % _EPISODE == 0:
-            simulator.reset(start)
-        count += 1
         bullet.setJointMotorControlArray(
             robot, joints[:2], bullet.TORQUE_CONTROL, forces=(10.0, -5.0), physicsClientId=client
         )
         bullet.stepSimulation(physicsClientId=client)
         bullet.getJointStates(robot, joints, physicsClientId=client)
 
-    return step
+    return _with_resets(simulator, step)
+
+
+def _raw_mujoco() -> Callable[[], None]:
+    mujoco, simulator = import_mujoco(), MujocoSimulator(default_params(), _CONTROL_DT)
+    model, data, substeps = simulator._model, simulator._data, simulator._substeps
+    positions, velocities, pushed = data.qpos, data.qvel, data.qfrc_applied
+
+    def step() -> None:
+        pushed[0], pushed[1] = 10.0, -5.0
+        mujoco.mj_step(model, data, substeps)
+        positions.tolist(), velocities.tolist()
+
+    return _with_resets(simulator, step)
+
+
+def _raw_rk4() -> Callable[[], None]:
+    simulator = make_simulator("rk4", default_params(), _CONTROL_DT)
+    simulator.use_code(start=True)
+    while simulator._motion is None:  # until machine code is made
+        simulator.use_code(start=False)
+    return _with_resets(simulator, lambda: simulator.step((10.0, -5.0)))
+
+
+_RAW = {"bullet": _raw_bullet, "mujoco": _raw_mujoco, "rk4": _raw_rk4}
+
+
+def _with_resets(simulator: Any, step: Callable[[], object]) -> Callable[[], None]:
+    """A step before which the robot is put back now and then."""
+    start = (0.0, 0.0, 0.3, 0.1, 1.0, 0.0, 0.0, 0.0)
+    count = 0
+
+    def reset_and_step() -> None:
+        nonlocal count
+        if count % _EPISODE == 0:
+            simulator.reset(start)
+        count += 1
+        step()
+
+    return reset_and_step
 
 
 def single(physics: str, seconds: float) -> Row:
-    """One BallbotEnv; with Bullet also its share of the raw loop's speed, in turns with that loop."""
+    """One BallbotEnv, and its share of its engine's raw speed, in turns with that loop."""
     env = BallbotEnv("stabilize", physics=physics)
     env.reset(seed=0)
     actions = iter(_forever(np.random.default_rng(0).uniform(-1, 1, (1000, 2)).astype(np.float32)))
@@ -152,10 +188,9 @@ def single(physics: str, seconds: float) -> Row:
 
     _timed(Row("", "", 1), step, 1.0)  # meanwhile machine code is made, if it is not in the cache
     row = _timed(Row(f"BallbotEnv, {physics}", env.task.id, 1), step, seconds)
-    if physics == "bullet":
-        raw = _raw_step()
-        shares = [_seconds(raw, _TURN) / _seconds(step, _TURN) for _ in range(_TURNS)]
-        row.note = f"{np.median(shares):.1%} of the raw loop, median of {_TURNS} turns"
+    loop = _RAW[physics]()
+    shares = [_seconds(loop, _TURN) / _seconds(step, _TURN) for _ in range(_TURNS)]
+    row.note = f"{np.median(shares):.1%} of the raw loop, median of {_TURNS} turns"
     return row
 
 

@@ -19,7 +19,6 @@ from ballbot_gym.engines import installed_physics
 from ballbot_gym.params import default_params
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
-from ballbot_train import cli
 
 
 @pytest.fixture(scope="session")
@@ -98,6 +97,7 @@ def typed(tmp_path, monkeypatch, capsys):
 
     It runs in this process, because each new one needs seconds to import what it needs.
     """
+    from ballbot_train import cli
 
     def run(*arguments):
         monkeypatch.chdir(tmp_path)
