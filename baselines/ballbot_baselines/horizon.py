@@ -87,7 +87,7 @@ class HorizonQp:
     | attribute | shape | meaning |
     |---|---|---|
     | `x`, `a` | (N+1, 8), (N+1, 2) | where to linearize, and after `iterate` the solution; the last input is unused |
-    | `h`, `c` | (N+1,), (N+1, nc) | length of each interval, s, and the episode's constants, `at` its time if the task has a clock |
+    | `h`, `c` | (N+1,), (N+1, nc) | length of each interval, s, and the constants `at` its time |
     | `reserve` | (N+1,) | of normal force, as a fraction of the weight, where the robot's grip is limited |
     | `distinct` | (m,) | indices of the task's margins that are considered |
     | `disturbance` | | what is added to the model; None for nothing |

@@ -45,8 +45,8 @@ def quadratic_cost(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Half the Hessian of the task's cost rate at points of a trajectory, made positive semidefinite.
 
-    For a quadratic cost xᵀQx + uᵀRu these are Q and R, 1/s. The points' times in the episode, t (n,) or one, s, matter to tasks
-    with a clock.
+    For a quadratic cost xᵀQx + uᵀRu these are Q and R, 1/s. The points' times in the episode, t (n,) or one, s, matter
+    to tasks with a clock.
 
     Returns:
         Q: (n, 8, 8) and R: (n, 2, 2). Mixed terms of x and u are left out; no task has any.
