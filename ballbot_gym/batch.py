@@ -341,7 +341,8 @@ class BallbotBatch:
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
         new = self._start(seeds, episode, x, c)
         if x is not None:
-            violated = first_violated(self.task.limits(new.x, new.c))
+            begin = self.task.at(new.c, torch.zeros_like(new.x[0]))
+            violated = first_violated(self.task.limits(new.x, begin))
             bad = (mask & (violated >= 0)).nonzero()[:, 0].tolist()
             if bad:
                 raise ValueError(
@@ -516,7 +517,8 @@ class BallbotBatch:
             key = counter_rng.key(now.seed, now.episode, now.steps + 1)
             z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
             x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :])
-        return torch.stack(self.task.observe(x, now.c)).T
+        c = self.task.at(now.c, now.steps.to(self.dtype) * self.task.control_dt) if self.task.clock else now.c
+        return torch.stack(self.task.observe(x, c)).T
 
     def _stacked(self, rows: _Rows) -> BatchState:
         """The rows as tensors."""

@@ -87,11 +87,12 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
     x, c = _symbols("x", 8), _symbols("c", len(task.constant_names))
     z = _symbols("z", task.constant_draws), _symbols("y", task.state_draws)
     action, taken = _symbols("a", 2), _symbols("t", 1)
+    now = task.at(c, taken[0] * task.control_dt)
     blocks = [
         block(
             "advance", (("x", x), ("c", c), ("a", action), ("t", taken)), _advance(task, params, x, c, action, taken[0])
         ),
-        block("look", (("x", x), ("c", c)), (("seen", task.observe(x, c)), ("tilt", (_tilt(x),)))),
+        block("look", (("x", x), ("c", c), ("t", taken)), (("seen", task.observe(x, now)), ("tilt", (_tilt(x),)))),
         block("draw_constants", (("z", z[0]),), (("c", task.draw_constants(z[0], params)),)),
         block("draw_state", (("z", z[1]), ("c", c)), (("x", task.draw_state(z[1], c, params)),)),
     ]

@@ -200,7 +200,8 @@ class BallbotEnv(gymnasium.Env):
         self._resets = 0
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
-        self._steps, self._steps_left = self.task.steps, 0
+        self._steps = self.task.steps
+        self._steps_left = self._taken = 0
         self._closed = False
 
     def reset(
@@ -229,7 +230,7 @@ class BallbotEnv(gymnasium.Env):
             if self.randomization.varies_robot:
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
-        self._steps_left = self._steps
+        self._steps_left, self._taken = self._steps, 0
         if self.render_mode == "human":
             self.render()
         return self._observation(start), self._info(start)
@@ -341,6 +342,7 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError("the state is of an env with other randomization")
         self._set_constants(state.constants)
         self._state, self._steps_left = state.x, state.steps_left
+        self._taken = self.task.steps - state.steps_left
         self.np_random.bit_generator.state = state.rng
         if self._disturbance is not None and state.disturbance is not None:
             self._disturbance.set_state(state.disturbance)
@@ -418,7 +420,7 @@ class BallbotEnv(gymnasium.Env):
         if self.params.grips:
             grip, lost = self._grip(before, total)
             kept = -1.0 if lost else 0.0
-        steps = self._steps - self._steps_left
+        self._taken = steps = self._steps - self._steps_left
         judged = None if self._judge is None else self._judge.judge(before, force, x, steps, kept)
         if judged is None:
             judged = outcome(task, before, force, x, c, steps, (kept,)), None, None
@@ -450,7 +452,11 @@ class BallbotEnv(gymnasium.Env):
             if self._state:  # its episode goes on where this one cannot start
                 self._judge.set_constants(self._constants)
         task = self.task
-        violated = [name for name, limit in zip(task.limit_names, task.limits(x, c), strict=True) if not limit >= 0]
+        violated = [
+            name
+            for name, limit in zip(task.limit_names, task.limits(x, task.at(c, 0.0)), strict=True)
+            if not limit >= 0
+        ]
         if violated:
             values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
             raise ValueError(
@@ -497,7 +503,7 @@ class BallbotEnv(gymnasium.Env):
         x = self._state
         if self._disturbance is not None:
             x = self._disturbance.sensed(x, self.np_random)
-        return self.task.observe(x, self._constants)
+        return self.task.observe(x, self.task.at(self._constants, self._taken * self.task.control_dt))
 
     def _observation(self, step: Step) -> np.ndarray:
         if step.arrays is None or self._noisy:

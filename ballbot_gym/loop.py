@@ -218,7 +218,7 @@ class _Single(BallbotEnv):
         self._set_constants(tuple(c))
         self._state = tuple(x)
         self.taken, self.episode, self.seed = taken, episode, seed
-        self._steps_left = self.task.steps - taken
+        self._steps_left, self._taken = self.task.steps - taken, taken
         if self._disturbance is not None:
             pairs = tuple(zip(actuator[::2], actuator[1::2], strict=True))
             if not pairs:

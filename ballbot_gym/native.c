@@ -10,9 +10,9 @@ static void advance(const real *restrict x, int64_t sx, const real *restrict c, 
                     const real *restrict t, int64_t st, real *restrict end, int64_t send, real *restrict force, int64_t sforce,
                     real *restrict grip, int64_t sgrip, real *restrict pay, int64_t spay, real *restrict flags, int64_t sflags,
                     real *restrict violated, int64_t sviolated);
-/* states, constants -> observations, tilts */
-static void look(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, real *restrict seen, int64_t sseen,
-                 real *restrict tilt, int64_t stilt);
+/* states, constants, numbers of steps taken -> observations, tilts */
+static void look(const real *restrict x, int64_t sx, const real *restrict c, int64_t sc, const real *restrict t, int64_t st,
+                 real *restrict seen, int64_t sseen, real *restrict tilt, int64_t stilt);
 /* random numbers -> constants */
 static void draw_constants(const real *restrict z, int64_t sz, real *restrict c, int64_t sc);
 /* random numbers, constants -> states */
@@ -67,16 +67,18 @@ static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t 
 }
 
 /* What the count robots that which lists see, and their tilts. */
-static void look_at(int64_t B, int64_t count, const int64_t *which, const real *x, const real *c, real *seen, real *tilt) {
+static void look_at(int64_t B, int64_t count, const int64_t *which, const int64_t *steps, const real *x, const real *c,
+                    real *seen, real *tilt) {
     for (int64_t m = 0; m < count; m += LANES) {
-        real xs[8 * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, ss[SEEN * LANES], ts[LANES];
+        real xs[8 * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, taken[LANES] = {0}, ss[SEEN * LANES], ts[LANES];
         for (int k = 0; k < LANES && m + k < count; ++k) {
+            taken[k] = (real)steps[which[m + k]];
             for (int i = 0; i < 8; ++i)
                 xs[i * LANES + k] = x[i * B + which[m + k]];
             for (int i = 0; i < CONSTANTS; ++i)
                 cs[i * LANES + k] = c[i * B + which[m + k]];
         }
-        look(xs, LANES, cs, LANES, ss, LANES, ts, LANES);
+        look(xs, LANES, cs, LANES, taken, LANES, ss, LANES, ts, LANES);
         for (int k = 0; k < LANES && m + k < count; ++k) {
             for (int i = 0; i < SEEN; ++i)
                 seen[i * B + which[m + k]] = ss[i * LANES + k];
@@ -148,11 +150,12 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     const int64_t B = m->B;
     const real *const action = m->action + n * m->env;
     real *const told = m->told + n;
-    real taken[LANES] = {0}, acts[2 * LANES] = {0}, paid[2 * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
+    real taken[LANES] = {0}, after[LANES] = {0}, acts[2 * LANES] = {0}, paid[2 * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
     for (int64_t k = 0; k < count; ++k) {
         acts[k] = action[k * m->env];
         acts[LANES + k] = action[k * m->env + m->component];
         taken[k] = (real)m->steps[n + k];
+        after[k] = taken[k] + 1;
     }
     for (int k = 0; k < 2 * LANES; ++k)
         off += acts[k] - acts[k]; /* not a number, unless all are finite */
@@ -161,7 +164,7 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     if (count == LANES) {
         advance(m->x + n, B, m->c + n, B, acts, LANES, taken, LANES, told, B, told + FORCE * B, B,
                 told + GRIPPED * B, B, paid, LANES, marks, LANES, limit, LANES);
-        look(told, B, m->c + n, B, m->seen + n, B, told + TILT * B, B);
+        look(told, B, m->c + n, B, after, LANES, m->seen + n, B, told + TILT * B, B);
         tell(m, n, LANES, paid, marks, limit);
     } else {
         real in[(8 + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
@@ -170,7 +173,7 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
         rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
         advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
                 out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);
-        look(out, LANES, cs, LANES, ss, LANES, out + TILT * LANES, LANES);
+        look(out, LANES, cs, LANES, after, LANES, ss, LANES, out + TILT * LANES, LANES);
         rows_copy(TOLD, count, out, LANES, told, B);
         rows_copy(SEEN, count, ss, LANES, m->seen + n, B);
         tell(m, n, count, paid, marks, limit);
@@ -216,7 +219,7 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
         begun[count++] = n;
     }
     begin(B, count, begun, m->seed, m->new_episode, 0, m->told, m->new_c);
-    look_at(B, count, begun, m->told, m->new_c, m->seen, m->told + TILT * B);
+    look_at(B, count, begun, m->new_steps, m->told, m->new_c, m->seen, m->told + TILT * B);
 }
 
 /* Takes chunks of the batch and does their steps, until none is left. */
@@ -246,6 +249,7 @@ void start(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, 
     begin(B, count, which, seed, episode, given, x, c);
 }
 
-void observe(int64_t B, int64_t count, const int64_t *which, const real *x, const real *c, real *seen, real *tilt) {
-    look_at(B, count, which, x, c, seen, tilt);
+void observe(int64_t B, int64_t count, const int64_t *which, const int64_t *steps, const real *x, const real *c, real *seen,
+             real *tilt) {
+    look_at(B, count, which, steps, x, c, seen, tilt);
 }

@@ -235,7 +235,7 @@ class BallbotNative:
 
     def _look(self, which: np.ndarray, state: State, seen: np.ndarray, tilt: np.ndarray) -> None:
         """Writes what some envs see, and their tilts."""
-        self._code.observe(self.num_envs, len(which), *_pointers(which, state.x, state.c, seen, tilt))
+        self._code.observe(self.num_envs, len(which), *_pointers(which, state.steps, state.x, state.c, seen, tilt))
 
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and (B,) their tilts."""
@@ -360,7 +360,7 @@ def _code(task: Task, params: BallbotParams, double: bool) -> _Code:
         "step": [memory],
         "help": [memory],
         "start": [count] * 2 + [pointer] * 3 + [ctypes.c_int] + [pointer] * 2,
-        "observe": [count] * 2 + [pointer] * 5,
+        "observe": [count] * 2 + [pointer] * 6,
     }
     for name, signature in signatures.items():
         function = getattr(library, name)

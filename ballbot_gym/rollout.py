@@ -26,7 +26,7 @@ class Controller(Protocol):
     """Anything that turns states into forces: LQR, a tracked plan, MPC, a learned policy."""
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        """Starts an episode at time t, s, in state x (8,) with constants c (nc,)."""
+        """Starts at the episode's time t, s, in state x (8,) with constants c (nc,)."""
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         """Force (2,) N to hold until the next control step. The robot clips it to its limit."""
@@ -83,7 +83,8 @@ class ActionController:
         self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        observation = np.array(self._task.observe(tuple(np.asarray(x).tolist()), self._c), np.float32)
+        seen = self._task.observe(tuple(np.asarray(x).tolist()), self._task.at(self._c, t))
+        observation = np.array(seen, np.float32)
         action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
         return self._params.force_limit * action
@@ -135,7 +136,7 @@ def rollout(
     start = time.perf_counter()
     controller.reset(0.0, seen, c)
     reset_seconds = time.perf_counter() - start
-    states, forces, act_seconds, settled = [x], [], [], [task.is_goal(tuple(x), tuple(c))]
+    states, forces, act_seconds, settled = [x], [], [], [task.is_goal(tuple(x), task.at(tuple(c), 0.0))]
     cost, done = 0.0, False
     while not done:
         start = time.perf_counter()
@@ -147,7 +148,7 @@ def rollout(
         cost += info["cost"]
         states.append(x)
         forces.append(info["force"])
-        settled.append(task.is_goal(tuple(x), tuple(c)))
+        settled.append(task.is_goal(tuple(x), task.at(tuple(c), len(forces) * dt)))
     last_unsettled = max((k for k, inside in enumerate(settled) if not inside), default=-1)
     return Episode(
         trajectory=Trajectory(dt * np.arange(len(states)), np.array(states), np.array(forces)),

@@ -114,6 +114,7 @@ class Judge:
         def compute(before: tuple, u: tuple, x: tuple, step: tuple, c: tuple) -> tuple:
             steps, kept = step
             did = outcome(task, before, u, x, c, steps, (kept,))
+            c = task.at(c, steps * task.control_dt)
             finite = (*task.limits(x, c), *task.goal(x, c))  # an outcome does not tell
             return (*did, dynamics.tilt(x), *task.observe(x, c), *finite)
 

@@ -489,7 +489,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         drawn, c = self._array(state.x), self._array(state.c)
         wanted = finite_array(given, (self.num_envs, 8), "state", broadcast=True).T
         x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
-        safe = np.all([limit >= 0 for limit in self.task.limits(tuple(x), tuple(c))], axis=0)
+        safe = np.all([limit >= 0 for limit in self.task.limits(tuple(x), self.task.at(tuple(c), 0.0))], axis=0)
         if not safe[mask].all():
             bad = np.flatnonzero(mask & ~safe)
             raise ValueError(f"start states of envs {bad[:8].tolist()} violate a limit of {self.task.id}")

@@ -234,11 +234,12 @@ def _holds(
     number = np.repeat(np.arange(len(trajectories)), [len(trajectory.u) for trajectory in trajectories])
     before, after = (np.concatenate([trajectory.x[part] for trajectory in trajectories]) for part in _ENDS)
     u, c = np.concatenate([trajectory.u for trajectory in trajectories]), constants[number]
+    began, ended = (task.at(c, np.concatenate([trajectory.t[part] for trajectory in trajectories])) for part in _ENDS)
     known = costs[: len(trajectories)]
     with np.errstate(all="ignore"):  # of damaged files
         moved = np.abs(dynamics.step(params, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
-        found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, c), len(u)), len(known))
-        kept = all(np.min(margin) >= -_SAME for margin in task.margins(after, c))
+        found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, began), len(u)), len(known))
+        kept = all(np.min(margin) >= -_SAME for margin in task.margins(after, ended))
         return bool(moved.all() and (np.abs(found - known) <= _SAME * known).all() and kept)
 
 

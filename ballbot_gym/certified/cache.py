@@ -127,10 +127,11 @@ def _formulas(task: Task, params: BallbotParams) -> str:
     """What the task computes, as text."""
 
     def compute(x: tuple, u: tuple, c: tuple, z_constants: tuple, z_state: tuple) -> tuple[Any, ...]:
-        drawn = (*task.draw_constants(z_constants, params), *task.draw_state(z_state, c, params))
+        drawn = (*task.draw_constants(z_constants, params), *task.draw_state(z_state, c[:constants], params))
         return (task.cost(x, u, c), *task.margins(x, c), *task.goal(x, c), *drawn)
 
-    counts = (8, 2, len(task.constant_names), task.constant_draws, task.state_draws)
+    constants = len(task.constant_names)
+    counts = (8, 2, constants + task.clock, task.constant_draws, task.state_draws)
     try:
         return traced.function("problem", compute, counts)
     except Exception:  # whatever code of users raises that meets a traced number

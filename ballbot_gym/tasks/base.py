@@ -43,6 +43,10 @@ class Task(ABC):
     x is a state (..., 8), u a force (..., 2) in N, c the episode's constants (..., nc). Cost, margins, goal and observation
     are written with `ops`, so that NumPy, CasADi and torch evaluate the same lines; they are smooth in x and u.
 
+    Where `clock` is True, cost, goal, margins, arena and observation also depend on the episode's time: they find it, s, as
+    the last entry of c, after the constants of `constant_names`, and `at` puts it there. All other methods get c without it.
+    A step's cost is taken when the step begins, its goal and limits when it ends.
+
     A task is one file: it fills in the abstract methods, and `register_task` names it.
     """
 
@@ -81,6 +85,8 @@ class Task(ABC):
     """Uniform numbers that `draw_state` takes."""
     first_exit: ClassVar[bool] = False
     """Whether reaching the goal ends the episode."""
+    clock: ClassVar[bool] = False
+    """Whether cost, goal, margins, arena and observation depend on the episode's time."""
 
     LARGEST_CONSTANT: ClassVar[float] = 100.0
     """Bounds of observations and rewards hold while no constant of the episode exceeds this, m or m/s."""
@@ -125,6 +131,13 @@ class Task(ABC):
         """The task's name and the fields that define its optima: tells whether an optimum or a policy belongs to a task."""
         named = (f.name for f in fields(self) if f.name not in self.NOT_THE_PROBLEM)
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in named)})"
+
+    def at(self, c: Vector, time: Any) -> Vector:
+        """c (..., nc) as cost, goal, margins, arena and observe take it at an episode's time, s (...).
+
+        That is c unchanged, unless the task has a `clock`: then the time follows the constants.
+        """
+        return ops.stack((*ops.components(c), time), like=c) if self.clock else c
 
     def draw_constants(self, z: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         """The constants (nc) that `constant_draws` uniform numbers z in [0, 1) stand for; z may hold batches."""
@@ -253,7 +266,8 @@ class Task(ABC):
             force *= 1 + params.ball_radius * math.sqrt(felt / least_inertia)
         speed = 2 * (100.0 + force * self.duration / felt)
         rate = speed * math.sqrt(felt / least_inertia)
-        *_, radius = self.arena((self.LARGEST_CONSTANT,) * len(self.constant_names))
+        *_, radius = self.arena(self._always((self.LARGEST_CONSTANT,) * len(self.constant_names)))
+        radius = float(np.max(radius))
         return radius + speed * self.control_dt, self.max_tilt + rate * self.control_dt, speed, rate
 
     def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
@@ -273,14 +287,18 @@ class Task(ABC):
         distance, lean, speed, rate = self.state_bounds(params)
         x = (distance, distance, lean, lean, speed, speed, rate, rate)
         force = (2 * params.force_limit,) * 2  # twice, for randomized actuators
-        return self.cost(x, force, (0.0,) * len(self.constant_names))
+        return float(np.max(self.cost(x, force, self._always((0.0,) * len(self.constant_names)))))
+
+    def _always(self, c: tuple[float, ...]) -> tuple[Any, ...]:
+        """Constants at all times of an episode."""
+        return self.at(c, self.control_dt * np.arange(self.steps + 1))
 
     def observation_signs(self, mirror: Mirror) -> tuple[int, ...]:
         """The sign that each observed quantity takes in the mirror, found by observing a state and its mirror image."""
         rng = np.random.default_rng(0)
         x, c = rng.uniform(0.1, 0.9, 8), rng.uniform(1.0, 2.0, len(self.constant_names))
-        seen = self.observe(tuple(x), tuple(c))
-        mirrored = self.observe(tuple(x * mirror.state), tuple(c * (mirror.constants or 1)))
+        seen = self.observe(tuple(x), self.at(tuple(c), 0.5))
+        mirrored = self.observe(tuple(x * mirror.state), self.at(tuple(c * (mirror.constants or 1)), 0.5))
         return tuple(1 if math.isclose(a, b, abs_tol=1e-12) else -1 for a, b in zip(seen, mirrored, strict=True))
 
     def markers(self, c: np.ndarray) -> list[Marker]:

@@ -39,11 +39,12 @@ def outcome(
         before: (8,) state in which the step began.
         force: (2,) force that was held, N.
         end: (8,) state after it.
-        c: (nc,) constants of the episode.
+        c: (nc,) constants of the episode, without the time.
         steps: control steps of the episode, this one included.
         grip: further limits, ≥ 0 where they hold: what keeps a ball's grip.
     """
-    running = task.cost(before, force, c) * task.control_dt
+    running = task.cost(before, force, task.at(c, (steps - 1) * task.control_dt)) * task.control_dt
+    c = task.at(c, steps * task.control_dt)
     violated = first_violated((*task.limits(end, c), *grip))
     failure, last = violated >= 0, steps >= task.steps
     reached = ops.full_like(violated, 1.0)

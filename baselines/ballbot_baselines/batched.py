@@ -80,7 +80,9 @@ class BatchOptima:
 
 
 def solves(task: Task, params: BallbotParams) -> bool:
-    """Whether `find_optima` can solve this task here: C code can be compiled, and has all operations of the task."""
+    """Whether `find_optima` can solve this task here: C code can be compiled, it has all operations of the task, and the task
+    has no clock.
+    """
     try:
         ilqr(task, params)
     except (machine_code.NoMachineCodeError, NotImplementedError, OSError):

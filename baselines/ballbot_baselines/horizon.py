@@ -87,7 +87,7 @@ class HorizonQp:
     | attribute | shape | meaning |
     |---|---|---|
     | `x`, `a` | (N+1, 8), (N+1, 2) | where to linearize, and after `iterate` the solution; the last input is unused |
-    | `h`, `c` | (N+1,), (N+1, nc) | length of each interval, s, and the episode's constants |
+    | `h`, `c` | (N+1,), (N+1, nc) | length of each interval, s, and the constants `at` its time |
     | `reserve` | (N+1,) | of normal force, as a fraction of the weight, where the robot's grip is limited |
     | `distinct` | (m,) | indices of the task's margins that are considered |
     | `disturbance` | | what is added to the model; None for nothing |
@@ -96,7 +96,7 @@ class HorizonQp:
 
     def __init__(self, task: Task, params: BallbotParams, nodes: int):
         """Differentiates the stage and builds the solver; compiles on first use on a machine."""
-        count = len(task.margins((0.0,) * 8, (1.0,) * len(task.constant_names)))
+        count = len(task.margins((0.0,) * 8, (1.0,) * (len(task.constant_names) + task.clock)))
         self.distinct = np.arange(count)
         self.disturbance: DisturbanceEstimator | None = None
         self.curvature = np.zeros(nodes)
@@ -114,7 +114,7 @@ class HorizonQp:
         def rows(*shape: int) -> np.ndarray:
             return np.zeros((max(n + 1, computed.stop), *shape))
 
-        inputs = [rows(8), rows(2), rows(), rows(len(task.constant_names)), *([rows()] if grips else [])]
+        inputs = [rows(8), rows(2), rows(), rows(len(task.constant_names) + task.clock), *([rows()] if grips else [])]
         outputs = [rows(8), rows(10, 8), rows(10), rows(m), rows(8, m)]
         outputs += [rows(grips), rows(10, grips)] if grips else []
         self._stage = InPlace(
@@ -249,7 +249,7 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
     Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
     """
     x, a, h = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("h")
-    c = casadi.SX.sym("c", len(task.constant_names))
+    c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
     z, u = casadi.vertcat(x, a), params.force_limit * a
     after = dynamics.step(params, x, u, h, 2)  # two RK4 steps, as the env takes per control step
     margins = casadi.vertcat(*task.margins(x, c))

@@ -206,6 +206,8 @@ class Ilqr:
 @functools.lru_cache(maxsize=8)
 def ilqr(task: Task, params: BallbotParams, free_time: bool = False) -> Ilqr:
     """The solver, made once."""
+    if task.clock:
+        raise NotImplementedError(f"{task.id} has a clock, which batches of optima do not know; use find_optimum")
     return Ilqr(task, params, free_time)
 
 

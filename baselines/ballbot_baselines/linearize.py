@@ -40,22 +40,30 @@ def discretize(params: BallbotParams, x: np.ndarray, u: np.ndarray, dt: float) -
     return _blocks(a, len(x)), _blocks(b, len(x))
 
 
-def quadratic_cost(task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def quadratic_cost(
+    task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Half the Hessian of the task's cost rate at points of a trajectory, made positive semidefinite.
 
-    For a quadratic cost xᵀQx + uᵀRu these are Q and R, 1/s.
+    For a quadratic cost xᵀQx + uᵀRu these are Q and R, 1/s. The points' times in the episode, t (n,) or one, s, matter
+    to tasks with a clock.
 
     Returns:
         Q: (n, 8, 8) and R: (n, 2, 2). Mixed terms of x and u are left out; no task has any.
     """
     n = len(x)
-    q, r = _cost_hessians(task)(np.asarray(x).T, np.asarray(u).T, np.tile(np.asarray(c)[:, None], (1, n)))
+    q, r = _cost_hessians(task)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, n))
     return _semidefinite(0.5 * _blocks(q, n)), 0.5 * _blocks(r, n)
 
 
-def goal_weight(task: Task, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+def goal_weight(task: Task, x: np.ndarray, c: np.ndarray, t: float = 0.0) -> np.ndarray:
     """(8, 8) half the Hessian of the sum of the task's goal functions at x: about 1 per squared tolerance."""
-    return _semidefinite(0.5 * np.array(_goal_hessian(task)(x, c))[None])[0]
+    return _semidefinite(0.5 * np.array(_goal_hessian(task)(x, _constants(task, c, t, 1)))[None])[0]
+
+
+def _constants(task: Task, c: np.ndarray, t: np.ndarray | float, n: int) -> np.ndarray:
+    """(nc, n) constants at n times, with these below them if the task has a clock."""
+    return task.at(np.tile(np.asarray(c, np.float64), (n, 1)), np.broadcast_to(t, (n,))).T
 
 
 @cache
@@ -71,7 +79,7 @@ def _jacobians(params: BallbotParams, dt: float | None) -> casadi.Function:
 @cache
 def _cost_hessians(task: Task) -> casadi.Function:
     x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
-    c = casadi.SX.sym("c", len(task.constant_names))
+    c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
     cost = task.cost(x, u, c)
     outputs = [casadi.densify(casadi.hessian(cost, x)[0]), casadi.densify(casadi.hessian(cost, u)[0])]
     return casadi.Function("hessians", [x, u, c], outputs)
@@ -79,7 +87,7 @@ def _cost_hessians(task: Task) -> casadi.Function:
 
 @cache
 def _goal_hessian(task: Task) -> casadi.Function:
-    x, c = casadi.SX.sym("x", 8), casadi.SX.sym("c", len(task.constant_names))
+    x, c = casadi.SX.sym("x", 8), casadi.SX.sym("c", len(task.constant_names) + task.clock)
     return casadi.Function("hessian", [x, c], [casadi.densify(casadi.hessian(sum(task.goal(x, c)), x)[0])])
 
 

@@ -27,12 +27,12 @@ class Gains:
 
 
 def discrete_lqr(
-    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray
+    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """K (2, 8) and P (8, 8) of LQR about an equilibrium for the env's steps: Σ cost·control_dt = xᵀPx."""
     dt = task.control_dt
     a, b = (matrix[0] for matrix in discretize(params, x[None], u[None], dt))
-    q, r = (weight[0] * dt for weight in quadratic_cost(task, x[None], u[None], c))
+    q, r = (weight[0] * dt for weight in quadratic_cost(task, x[None], u[None], c, t))
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), p
 
@@ -44,6 +44,8 @@ def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.
         The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first eight observations
         of such a task are the scaled errors of the state. None for every other task.
     """
+    if task.clock:
+        return None
     x, c = task.sample(np.random.default_rng(0), params)
     reference = task.reference(x, c, params)
     if task.first_exit or len(reference.x) > 1 or np.abs(np.asarray(task.observe(reference.x[0], c))[:8]).max() > 0:
@@ -58,11 +60,11 @@ def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
     return bool(np.abs(dynamics.derivative(params, np.asarray(x), np.asarray(u))).max() < 1e-6)
 
 
-def final_weight(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+def final_weight(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, t: float = 0.0) -> np.ndarray:
     """(8, 8) cost-to-go at a trajectory's end: LQR's at an equilibrium, else `_GOAL_PRICE` per squared goal tolerance."""
     if is_equilibrium(params, x, np.zeros(2)):
-        return discrete_lqr(task, params, x, np.zeros(2), c)[1]
-    return _GOAL_PRICE * goal_weight(task, x, c)
+        return discrete_lqr(task, params, x, np.zeros(2), c, t)[1]
+    return _GOAL_PRICE * goal_weight(task, x, c, t)
 
 
 def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final: np.ndarray) -> Gains:
@@ -87,11 +89,20 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final:
 
 
 def tracking_gains(
-    task: Task, params: BallbotParams, x: np.ndarray, u: np.ndarray, c: np.ndarray, p_final: np.ndarray
+    task: Task,
+    params: BallbotParams,
+    x: np.ndarray,
+    u: np.ndarray,
+    c: np.ndarray,
+    p_final: np.ndarray,
+    start: float = 0.0,
 ) -> Gains:
-    """Time-varying LQR along states x (n, 8) and forces u (n, 2) at control steps, weighted by the task's own cost."""
+    """Time-varying LQR along states x (n, 8) and forces u (n, 2) at control steps, weighted by the task's own cost.
+
+    The first point is at the episode's time `start`, s.
+    """
     a, b = discretize(params, x, u, task.control_dt)
-    q, r = quadratic_cost(task, x, u, c)
+    q, r = quadratic_cost(task, x, u, c, start + task.control_dt * np.arange(len(x)))
     return riccati(a, b, q * task.control_dt, r * task.control_dt, p_final)
 
 
@@ -109,7 +120,7 @@ class LqrController:
     """LQR about the task's reference motion, with weights from the task's own cost.
 
     About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
-    gain is periodic, and the nearest point of the reference says which gain to use.
+    gain is periodic, and the nearest point of the reference says which gain to use. A task with a clock gives an open one.
 
     After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
     """
@@ -124,8 +135,8 @@ class LqrController:
         if reference.closed:
             self.gains = closed_gains(task, params, reference, c)
         else:
-            p_final = final_weight(task, params, reference.x[-1], c)
-            self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final)
+            p_final = final_weight(task, params, reference.x[-1], c, t + task.control_dt * len(reference.x))
+            self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final, t)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         reference = self.reference

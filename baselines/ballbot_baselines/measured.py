@@ -100,17 +100,18 @@ def regret(
 
 def _end(task: Task, params: BallbotParams, moved: Trajectory, x: np.ndarray, c: np.ndarray) -> tuple[int, str, bool]:
     """The control step at which an episode through states x (n+1, 8) ends, the violated limit, and whether it succeeds."""
-    if start := task.violated(x[0], c):
+    if start := task.violated(x[0], task.at(c, 0.0)):
         raise ValueError(f"{task.id}: the trajectory starts beyond the limit of {start}")
     for k in range(1, len(x)):
-        violated = task.violated(x[k], c)
+        now = task.at(c, k * task.control_dt)
+        violated = task.violated(x[k], now)
         if params.grips and not violated:
             force = moved.force((k - 0.5) * task.control_dt)
             grip = dynamics.limits(params, tuple(x[k - 1]), tuple(force), hold=task.control_dt)
             violated = "" if min(grip) >= 0 else GRIP
         if violated:
             return k, violated, False
-        if (task.first_exit or k == task.steps) and task.is_goal(x[k], c):
+        if (task.first_exit or k == task.steps) and task.is_goal(x[k], now):
             return k, "", True
     if len(x) <= task.steps:
         raise ValueError(
@@ -127,8 +128,9 @@ def _cost(task: Task, moved: Trajectory, x: np.ndarray, c: np.ndarray) -> float:
     edges = np.unique(np.concatenate([grid, moved.t[moved.t < grid[-1]]]))
     middles = (edges[1:] + edges[:-1]) / 2
     forces = np.array([moved.force(t) for t in middles])
-    states = x[np.minimum((middles / task.control_dt).astype(int), len(x) - 2)]
-    return float(np.sum(np.diff(edges) * np.broadcast_to(task.cost(states, forces, c), len(middles))))
+    steps = np.minimum((middles / task.control_dt).astype(int), len(x) - 2)
+    rates = task.cost(x[steps], forces, task.at(c, task.control_dt * steps))
+    return float(np.sum(np.diff(edges) * np.broadcast_to(rates, len(middles))))
 
 
 def _defects(params: BallbotParams, moved: Trajectory) -> np.ndarray:

@@ -92,7 +92,10 @@ class StagedNlp:
         self.lam_f, self.lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", self._constraints)
         self._stages = casadi.reshape(self.z[: self._final_column], self._width, intervals)
         self._last = self.z[self._final_column :]
-        self._p_all = casadi.repmat(self.p, 1, intervals)
+        # stage functions take of these what they depend on, which may be the stage's number
+        numbers = casadi.MX(casadi.DM(np.arange(intervals)[None]))
+        self._p_all = casadi.vertcat(casadi.repmat(self.p, 1, intervals), numbers)
+        self._p_last = casadi.vertcat(self.p, intervals)
 
     def functions(self) -> tuple[casadi.Function, dict[str, casadi.Function], dict[str, casadi.Function]]:
         """The program and its derivatives under the names that CasADi's solvers look for.
@@ -238,7 +241,7 @@ class StagedNlp:
         return [part[:, : self._n] if last else part for part in results]
 
     def _p_of(self, stage: Stage) -> casadi.MX:
-        return self.p[: stage.params]
+        return self._p_last[: stage.params]
 
 
 def _scatter(places: list[tuple[np.ndarray, ...]], values: casadi.MX, shape: tuple[int, int]) -> casadi.MX:

@@ -85,23 +85,25 @@ class PreparedPlan:
     distinct: np.ndarray
 
 
-def prepared_plan(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, backoff: Backoff) -> PreparedPlan:
-    """Plans from state x (8,) with constants c (nc,), and prepares the plan.
+def prepared_plan(
+    task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, backoff: Backoff, start: float = 0.0
+) -> PreparedPlan:
+    """Plans from state x (8,) at the episode's time `start`, s, with constants c (nc,), and prepares the plan.
 
     Raises:
         PlanError: there is no plan.
     """
-    plan = plan_to_track(task, params, x, c, backoff)
+    plan = plan_to_track(task, params, x, c, backoff, start)
     trajectory = plan.trajectory
     tracker = TvlqrController.for_task(task, params, trajectory, c)
-    q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
-    margins = np.array([task.margins(x, c) for x in trajectory.x])
+    q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c, trajectory.t[:-1])
+    margins = np.array([task.margins(x, task.at(c, t)) for t, x in zip(trajectory.t, trajectory.x, strict=True)])
     return PreparedPlan(
         plan=plan,
         tracker=tracker,
         q=2 * q,
         r=2 * r * params.force_limit**2,
-        p=np.concatenate([tracker.gains.p, final_weight(task, params, trajectory.x[-1], c)[None]]),
+        p=np.concatenate([tracker.gains.p, final_weight(task, params, trajectory.x[-1], c, trajectory.t[-1])[None]]),
         slopes=np.concatenate([np.zeros((1, 8)), plan.costates]),
         sums=np.concatenate([np.zeros((1, 2)), np.cumsum(trajectory.u, axis=0)]) / params.force_limit,
         distinct=np.unique(margins, axis=1, return_index=True)[1],  # unused obstacles repeat others
@@ -168,7 +170,8 @@ class NmpcController:
         c, self.disturbance = np.asarray(c, np.float64), None
         for _ in range(self._delay):  # before the first force acts there is none
             x = self._moved(x, np.zeros(2))
-        self.start(t, c, prepared_plan(self._task, self._params, x, c, self.backoff))
+        begins = t + self._delay * self._task.control_dt
+        self.start(t, c, prepared_plan(self._task, self._params, x, c, self.backoff, begins))
 
     def start(self, t: float, c: np.ndarray, prepared: PreparedPlan) -> None:
         """As `reset`, with a plan that `prepared_plan` has made before, for instance in another process."""
@@ -241,7 +244,8 @@ class NmpcController:
             return False
         self.counts.replans += 1
         try:
-            self._follow(t, prepared_plan(self._task, self._params, x, self._c, self.backoff))
+            begins = t + self._delay * self._task.control_dt
+            self._follow(t, prepared_plan(self._task, self._params, x, self._c, self.backoff, begins))
         except PlanError:
             self._lost = True
         return not self._lost
@@ -282,7 +286,8 @@ class NmpcController:
         qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
         qp.x[0] = x
         qp.distinct, qp.disturbance, qp.curvature = prepared.distinct, self.disturbance, self._curvature
-        qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._c, self._reserve
+        times = self._trajectory.t[0] + dt * self._nodes
+        qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._task.at(self._c, times), self._reserve
         at, weight = np.minimum(self._nodes[:-1], self._length - 1), (dt * self._lengths)[:, None, None]
         qp.set_weights(
             prepared.q[at] * weight, prepared.r[at] * weight, prepared.p[end], prepared.slopes[end], self._x_plan[-1]

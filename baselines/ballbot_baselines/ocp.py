@@ -66,13 +66,16 @@ class Ocp:
     """(s, p) -> (me,), each 0."""
     final_inequalities: FinalFunction = no_path
     """(s, p) -> (mi,), each ≥ 0."""
+    counts_stages: bool = False
+    """Whether p of every function has one entry more, at its end: the stage's number k, and N at the end."""
     initial_matrix: np.ndarray | None = None
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
 
     @functools.cached_property
     def stages(self) -> "Stages":
         """The stage functions with their derivatives, made once for solvers of every horizon."""
-        s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", self.states), ("w", self.inputs), ("p", self.params)))
+        params = self.params + self.counts_stages
+        s, w, p = (casadi.SX.sym(*symbol) for symbol in (("s", self.states), ("w", self.inputs), ("p", params)))
         equal, final_equal = self.equalities(s, w, p), self.final_equalities(s, p)
         z, path = casadi.vertcat(s, w), casadi.vertcat(equal, self.inequalities(s, w, p))
         final_path = casadi.vertcat(final_equal, self.final_inequalities(s, p))

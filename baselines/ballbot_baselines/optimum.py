@@ -76,6 +76,7 @@ def find_optimum(
     backoff: Backoff = Backoff(),
     guesses: int = _CONSIDERED,
     paths: list[np.ndarray] | None = None,
+    start: float = 0.0,
 ) -> Optimum:
     """The cheapest episode from state x0 with constants c.
 
@@ -88,6 +89,7 @@ def find_optimum(
         guesses: how many of the task's guessed paths to solve at most. For a slalom all choices of sides are considered, and
             those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
         paths: ground paths to start from instead of the task's, (n+1, 2) each, m, one point for each control step.
+        start: the episode's time at x0, s: the trajectory's times begin there. It matters to tasks with a clock.
 
     Returns:
         The cheapest optimum found. If no try converged, the cheapest feasible episode found; look at `status`.
@@ -98,7 +100,7 @@ def find_optimum(
     """
     task, params = make_task(task, params), checked_robot(params)
     x0, c = finite_array(x0, (8,), "x0"), finite_array(c, (len(task.constant_names),), "c")
-    episode = Shooting(task, params, x0, c, backoff)
+    episode = Shooting(task, params, x0, c, backoff, start)
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     tried = search(episode, guesses, paths)
     best = min((t for t in tried if t[1].is_within_limits), key=_rank, default=None)
@@ -111,7 +113,9 @@ def find_optimum(
     return Optimum(
         cost=solution.cost,
         trajectory=Trajectory(
-            task.control_dt * np.arange(len(solution.states)), solution.states, params.force_limit * solution.inputs
+            start + task.control_dt * np.arange(len(solution.states)),
+            solution.states,
+            params.force_limit * solution.inputs,
         ),
         status="optimal" if solution.is_optimal else "feasible",
         solver_status=solution.status,
@@ -141,7 +145,9 @@ def _rank(tried: Found) -> tuple[bool, float]:
     return not tried[1].success, tried[1].cost
 
 
-def plan_to_track(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff) -> Optimum:
+def plan_to_track(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff, start: float = 0.0
+) -> Optimum:
     """As `find_optimum`, for feedback to track. Where no plan keeps the whole reserve of force and friction, it keeps less.
 
     Args: as of `find_optimum`.
@@ -154,7 +160,7 @@ def plan_to_track(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarr
     *more, last = dict.fromkeys(tries)
     for reserve in more:
         try:
-            return find_optimum(task, params, x0, c, reserve)
+            return find_optimum(task, params, x0, c, reserve, start=start)
         except PlanError:
             pass
-    return find_optimum(task, params, x0, c, last)
+    return find_optimum(task, params, x0, c, last, start=start)

@@ -45,10 +45,12 @@ class Member:
     righted: int
 
 
-def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, force: float) -> list[Member]:
+def righted(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, force: float, start: float = 0.0
+) -> list[Member]:
     """The cheapest member for each side of the fall that rights the robot without violating a margin, if there is one.
 
-    From state x0 (8,), with constants c (nc,) and at most this force per axis, N.
+    From state x0 (8,) at the episode's time `start`, s, with constants c (nc,) and at most this force per axis, N.
     """
     aside = [(0.0, 0.3), *((sign * lean, fade) for lean in _SIDEWAYS for fade in _FADES for sign in (-1, 1))]
     gains = np.array([(*loops, *a) for *loops, a in itertools.product(_LEAN_BANDWIDTHS, _TIME_CONSTANTS, aside)]).T
@@ -57,13 +59,14 @@ def righted(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, fo
         if params.grips:
             force = min(force, _GRIPPING * params.friction * params.weight)
         x, u = simulate(params, x0, gains, target, task.steps, task.control_dt, force)
-        margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in task.margins(x, c)], axis=0)
+        t = start + task.control_dt * np.arange(len(x))[:, None]
+        margins = np.min([np.broadcast_to(m, x.shape[:2]) for m in task.margins(x, task.at(c, t))], axis=0)
         safe = np.logical_and.accumulate(margins >= 0, axis=0)
         if params.grips:
             limits = dynamics.limits(params, x[:-1], u, hold=task.control_dt)
             gripping = np.logical_and.reduce([limit >= 0 for limit in limits])
             safe[1:] &= np.logical_and.accumulate(gripping, axis=0)
-        costs = np.asarray(task.cost(x[:-1], u, c))
+        costs = np.asarray(task.cost(x[:-1], u, task.at(c, t[:-1])))
         upright = (np.abs(x[..., 2:4]).max(-1) < _UPRIGHT) & (np.abs(x[..., 6:8]).max(-1) < _STEADY) & safe
     found = []
     for side in (1, -1, 0):

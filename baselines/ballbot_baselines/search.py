@@ -155,7 +155,7 @@ def _from_righting(episode: Shooting) -> list[Found]:
     """
     task, params, c, limit = episode.task, episode.params, episode.c, episode.params.force_limit
     found: list[Found] = []
-    for member in righting.righted(task, params, episode.x0, c, (1 - episode.backoff.force) * limit):
+    for member in righting.righted(task, params, episode.x0, c, (1 - episode.backoff.force) * limit, episode.start):
         if not task.first_exit and len(member.u) == task.steps:
             found.append((FROM_RIGHTING, _simulated(episode, member)))
         if member.side == 0 and _any_optimal(found):
@@ -173,8 +173,9 @@ def _from_righting(episode: Shooting) -> list[Found]:
 def _simulated(episode: Shooting, member: righting.Member) -> OcpSolution:
     """A simulated recovery that lasts the whole episode as a solution."""
     task, params, c, backoff = episode.task, episode.params, episode.c, episode.backoff
-    room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(member.x[-1], c)]
-    room += [np.asarray(margin) - backoff.margin for margin in task.margins(member.x, c)]
+    t = episode.start + task.control_dt * np.arange(len(member.x))
+    room = [(1 - backoff.goal) ** 2 - 1 - np.asarray(excess) for excess in task.goal(member.x[-1], task.at(c, t[-1]))]
+    room += [np.asarray(margin) - backoff.margin for margin in task.margins(member.x, task.at(c, t))]
     room += dynamics.limits(params, member.x[:-1], member.u, backoff.grip, task.control_dt)
     return OcpSolution(
         success=False,

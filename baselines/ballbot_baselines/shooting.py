@@ -74,7 +74,7 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
     nc, limit = len(task.constant_names), params.force_limit
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(*task.margins(x, p[1 : 1 + nc])) - p[1 + nc]
+        return casadi.vertcat(*task.margins(x, _constants(task, p, p[0]))) - p[1 + nc]
 
     def path(x: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
         return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[3 + nc], p[0]))
@@ -83,27 +83,36 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
         if not task.first_exit:
             return margins(x, p)
         # Goal functions are normalized, q/tolerance² − 1: keeping a fraction b of the tolerance asks (1−b)² − 1 − g ≥ 0.
-        room = (1 - p[2 + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, p[1 : 1 + nc]))
+        room = (1 - p[2 + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, _constants(task, p, p[0])))
         return casadi.vertcat(margins(x, p), room)
 
     return Ocp(
         name=task.id,
         states=8,
         inputs=2,
-        params=nc + 3 + params.grips,
+        params=nc + 3 + params.grips + task.clock,
+        counts_stages=task.clock,
         next=lambda x, a, p: dynamics.step(params, x, limit * a, p[0], dynamics.substeps_for(task.control_dt)),
-        cost=lambda x, a, p: task.cost(x, limit * a, p[1 : 1 + nc]) * p[0],
+        cost=lambda x, a, p: task.cost(x, limit * a, _constants(task, p, p[0])) * p[0],
         inequalities=path if params.grips else lambda x, a, p: margins(x, p),
         final_inequalities=final,
     )
 
 
 def shooting_parameters(
-    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, coarseness: int = 1
+    task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, coarseness: int = 1, start: float = 0.0
 ) -> list[float]:
-    """p of `shooting_ocp`: s that forces are held, c, back-offs from margins and goal, and of grip if friction is limited."""
+    """p of `shooting_ocp`: s that forces are held, c, back-offs from margins and goal, of grip if friction is limited, and
+    the episode's time at the start, s, if the task has a clock.
+    """
     reserve = [backoff.grip] if params.grips else []
-    return [task.control_dt * coarseness, *c, backoff.margin, backoff.goal, *reserve]
+    return [task.control_dt * coarseness, *c, backoff.margin, backoff.goal, *reserve, *([start] if task.clock else [])]
+
+
+def _constants(task: Task, p: casadi.SX, h: casadi.SX) -> casadi.SX:
+    """c of a stage of length h, with its time if the task has a clock."""
+    c = p[1 : 1 + len(task.constant_names)]
+    return task.at(c, p[-2] + p[-1] * h) if task.clock else c
 
 
 @lru_cache(maxsize=256)
@@ -132,16 +141,19 @@ def shooting_solver(
 @lru_cache(maxsize=8)
 def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolver:
     """A solver of a first-exit task over intervals of one free length h, the ninth state. It tells roughly when to arrive."""
-    nc = len(task.constant_names)
     fixed, limit = shooting_ocp(task, params), params.force_limit
+
+    def with_length(s: casadi.SX, p: casadi.SX) -> casadi.SX:
+        return casadi.vertcat(s[8], p[1:]) if task.clock else p  # the length is also what the stage's time is found by
+
     ocp = replace(
         fixed,
         name=f"{task.id}-free-time",
         states=9,
         next=lambda s, a, p: casadi.vertcat(dynamics.step(params, s[:8], limit * a, s[8], 2), s[8]),
-        cost=lambda s, a, p: task.cost(s[:8], limit * a, p[1 : 1 + nc]) * s[8],
-        inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, p),
-        final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], p),
+        cost=lambda s, a, p: task.cost(s[:8], limit * a, _constants(task, p, s[8])) * s[8],
+        inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, with_length(s, p)),
+        final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], with_length(s, p)),
     )
     return OcpSolver(ocp, FREE_TIME_INTERVALS, solver, _tolerance(params))
 
@@ -160,6 +172,8 @@ class Shooting:
     x0: np.ndarray
     c: np.ndarray
     backoff: Backoff
+    start: float = 0.0
+    """The episode's time at x0, s."""
     compared: dict[int, float] = field(default_factory=dict)
     """What guesses cost, by their index, that were solved on a coarser grid, or with free time, to choose among them."""
 
@@ -243,7 +257,7 @@ class Shooting:
         return bounds
 
     def _parameters(self, coarseness: int = 1) -> list[float]:
-        return shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness)
+        return shooting_parameters(self.task, self.params, self.c, self.backoff, coarseness, self.start)
 
 
 def _resampled(x: np.ndarray, a: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:

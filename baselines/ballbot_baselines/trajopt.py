@@ -25,7 +25,7 @@ class TrajoptController:
         self.plan: Optimum | None = None
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self.plan = plan_to_track(self._task, self._params, x, c, self._backoff)
+        self.plan = plan_to_track(self._task, self._params, x, c, self._backoff, start=t)
         self._tracker = TvlqrController.for_task(self._task, self._params, self.plan.trajectory, c)
         self._tracker.reset(t, x, c)
 

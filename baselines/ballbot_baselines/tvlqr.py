@@ -46,12 +46,18 @@ class TvlqrController:
     def for_task(
         cls, task: Task, params: BallbotParams, trajectory: Trajectory, c: np.ndarray | tuple = ()
     ) -> "TvlqrController":
-        """With weights from the task's own cost; c (nc,) are the constants the trajectory was planned for."""
+        """With weights from the task's own cost; c (nc,) are the constants the trajectory was planned for.
+
+        Its times are the episode's.
+        """
         c, dt, end = np.asarray(c, np.float64), task.control_dt, trajectory.x[-1]
-        q, r = quadratic_cost(task, *_sampled(trajectory, dt), c)
+        x, u = _sampled(trajectory, dt)
+        q, r = quadratic_cost(task, x, u, c, trajectory.t[0] + dt * np.arange(len(x)))
         rest = is_equilibrium(params, end, np.zeros(2))
-        end_gain = discrete_lqr(task, params, end, np.zeros(2), c)[0] if rest else None
-        return cls(params, trajectory, dt, q * dt, r * dt, final_weight(task, params, end, c), end_gain)
+        end_gain = discrete_lqr(task, params, end, np.zeros(2), c, trajectory.t[-1])[0] if rest else None
+        return cls(
+            params, trajectory, dt, q * dt, r * dt, final_weight(task, params, end, c, trajectory.t[-1]), end_gain
+        )
 
     @classmethod
     def for_weights(

@@ -122,10 +122,11 @@ def _check_start(task: Task, params: BallbotParams, index: int) -> None:
     """Raises a ValueError that names the method of a task with which an episode cannot even begin."""
     kind, where = type(task).__name__, f"at the start of episode {index}"
     x, c = cache.episode(task, params, index)
-    if violated := task.violated(x, c):  # as a state does that is not finite
+    begin = task.at(c, 0.0)
+    if violated := task.violated(x, begin):  # as a state does that is not finite
         raise ValueError(f"{kind}.draw_state draws {x.tolist()} {where}, which is beyond the limit of {violated}")
     force = np.full(2, 0.1 * params.force_limit)
-    cost, more = (float(task.cost(x, u, c)) for u in (np.zeros(2), force))
+    cost, more = (float(task.cost(x, u, begin)) for u in (np.zeros(2), force))
     if not (0 <= cost < math.inf and 0 <= more < math.inf):
         raise ValueError(
             f"{kind}.cost gives {cost:g} without force and {more:g} with one {where}; make it finite and ≥ 0"

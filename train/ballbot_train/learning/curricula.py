@@ -452,7 +452,9 @@ class CurriculumBatch(BallbotBatch):
                 self._full, self.params, self.curriculum.optima, self._own.steps, self.curriculum.starts_reserve
             )
         if self._eligible is None:  # states outside of the goal, which may be wide
-            inside = self.task.goal(self._starts.x.unbind(0), self._starts.c.unbind(0))
+            inside = self.task.goal(
+                self._starts.x.unbind(0), self.task.at(self._starts.c.unbind(0), self.task.duration)
+            )
             reached = torch.stack([excess <= 0 for excess in inside]).all(0)
             near = torch.ones_like(reached)
             if self._reach:

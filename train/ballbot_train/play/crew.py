@@ -262,7 +262,7 @@ def _optimum_costs(task: Tunable, params: BallbotParams, x: np.ndarray, c: np.nd
     from ballbot_baselines import find_optimum
 
     trajectory = find_optimum(task, params, x, c).trajectory
-    rates = task.cost(tuple(trajectory.x[:-1].T), tuple(trajectory.u.T), tuple(c))
+    rates = task.cost(tuple(trajectory.x[:-1].T), tuple(trajectory.u.T), task.at(tuple(c), trajectory.t[:-1]))
     return np.concatenate([[0.0], np.cumsum(rates * task.control_dt)])
 
 

@@ -194,7 +194,10 @@ class Runner:
     def weigh_again(self, c: tuple[float, ...]) -> None:
         """Counts the cost so far with other weights."""
         dt = self._task.control_dt
-        self.cost = sum(self._task.cost(x, u, c) * dt for x, u in zip(self._states, self._forces, strict=False))
+        self.cost = sum(
+            self._task.cost(x, u, self._task.at(c, k * dt)) * dt
+            for k, (x, u) in enumerate(zip(self._states, self._forces, strict=False))
+        )
 
     def close(self) -> None:
         """Releases the simulator; may be called again."""

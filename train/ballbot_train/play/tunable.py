@@ -25,6 +25,7 @@ _SHARED = (
     "constant_draws",
     "state_draws",
     "first_exit",
+    "clock",
     "frame",
     "mirrors",
 )
@@ -61,7 +62,7 @@ class Tunable(Task):
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         parts = ops.components(c)
         weighted = copy.copy(self.base)
-        for name, value in zip(weight_names(self.base), parts[self._own :], strict=True):
+        for name, value in zip(weight_names(self.base), parts[self._own : len(self.constant_names)], strict=True):
             object.__setattr__(weighted, name, value)  # it may be a symbol, which the task's own checks would refuse
         return weighted.cost(x, u, self._base_constants(c))
 
@@ -97,5 +98,7 @@ class Tunable(Task):
         return len(self.base.constant_names)
 
     def _base_constants(self, c: Vector) -> Vector:
-        """The task's own constants, of the same kind as c."""
-        return ops.stack(ops.components(c)[: self._own], like=c) if self._own else ()
+        """The task's own constants, and the time if it has a clock, of the same kind as c."""
+        parts = ops.components(c)
+        own = parts[: self._own] + parts[len(self.constant_names) :]
+        return ops.stack(own, like=c) if own else ()

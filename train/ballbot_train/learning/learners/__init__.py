@@ -63,6 +63,11 @@ class Algorithm:
         """
         if demos is not None and not self.demonstrations:
             raise ValueError(f"{self.module.rpartition('.')[2]} uses no demonstrations")
+        if task.clock and self.module.rpartition(".")[2] in ("dagger", "shac"):
+            raise ValueError(
+                f"{self.module.rpartition('.')[2]} does not know the time, on which cost and goal of {task.id} depend; "
+                "train ppo or sac"
+            )
         with load("ballbot_train.weights:own_defaults")():
             return load(f"{self.module}:make")(task, params, settings, seed, demos)
 

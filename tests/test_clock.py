@@ -1,0 +1,135 @@
+"""Tasks whose cost, goal and observation depend on the episode's time: examples/figure_eight.py and examples/waypoints.py."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from test_examples import load
+
+from ballbot_baselines import find_optimum, regret
+from ballbot_baselines.batched import solves
+from ballbot_baselines.nmpc import NmpcController
+from ballbot_baselines.trajopt import TrajoptController
+from ballbot_gym import BallbotEnv
+from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.loop import BallbotLoop
+from ballbot_gym.native import BallbotNative
+from ballbot_gym.rollout import rollout
+from ballbot_gym.step_code import Judge
+from ballbot_gym.tasks.transition import outcome
+
+STEPS = 16
+CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}
+
+
+@pytest.fixture(params=CLASSES)
+def task(request):
+    return getattr(load(request.param), CLASSES[request.param])()
+
+
+def test_at_puts_the_time_behind_the_constants_of_tasks_with_a_clock_alone(task):
+    c = np.arange(float(len(task.constant_names)))
+    assert task.at(tuple(c), 0.5) == (*c, 0.5)
+    np.testing.assert_array_equal(task.at(c, np.array([1.0, 2.0]))[:, -1], [1.0, 2.0])
+    other = BallbotEnv("stabilize", physics="rk4").task
+    assert other.at(c, 0.5) is c
+
+
+def test_env_and_every_kind_of_batch_agree_on_rewards_and_observations(task, params):
+    """Envs of different ages, because one begins its next episode before the others."""
+    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (STEPS, 2, 2))
+    batches = {
+        "torch": BallbotBatch(task, 2, dtype="float64", compile=False, params=params),
+        "loop": BallbotLoop(task, 2, np.float64, params),
+        "native": BallbotNative(task, 2, np.float64, params),
+    }
+    found = {}
+    for name, batch in batches.items():
+        batch.state = batch.initial_state(seed=3)
+        seen, paid = [np.asarray(batch.observe(batch.state))], []
+        for k, action in enumerate(actions):
+            if k == STEPS // 2:
+                mask = np.array([True, False])
+                batch.state = batch.initial_state(mask=torch.as_tensor(mask) if name == "torch" else mask)
+            step = batch.step(torch.as_tensor(action)) if name == "torch" else batch.step(action, None, True)
+            seen.append(np.asarray(step.observation))
+            paid.append(np.asarray(step.reward))
+        found[name] = np.array(seen), np.array(paid)
+        state = batch.state
+    for name in ("loop", "native"):
+        for mine, theirs in zip(found[name], found["torch"], strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-5)
+    assert np.asarray(state.steps).tolist() == [STEPS // 2, STEPS]
+
+    env = BallbotEnv(task, physics="rk4", params=params)
+    first = BallbotLoop(task, 2, np.float64, params)
+    start = first.initial_state(seed=3)
+    observation, _ = env.reset(options={"state": start.x[:, 1], "constants": start.c[:, 1]})
+    np.testing.assert_allclose(observation, found["torch"][0][0][1], atol=1e-5)
+    for k, action in enumerate(actions):
+        observation, reward, *_ = env.step(action[1])
+        np.testing.assert_allclose(observation, found["torch"][0][k + 1][1], atol=1e-5)
+        assert reward == pytest.approx(found["torch"][1][k][1], abs=1e-6)
+
+
+def test_a_step_costs_what_it_costs_at_its_beginning_and_is_judged_at_its_end(task, params):
+    x, c = task.sample(np.random.default_rng(0), params)
+    x, c, u, dt = tuple(x), tuple(c), (3.0, -2.0), task.control_dt
+    did = outcome(task, x, u, x, c, task.steps)
+    assert did.cost == dt * task.cost(x, u, (*c, (task.steps - 1) * dt))
+    assert did.success == task.is_goal(x, (*c, task.duration))
+    assert task.observe(x, (*c, 0.0)) != task.observe(x, (*c, 1.0))
+
+
+def test_machine_code_of_a_single_env_computes_the_bits_of_python(task, params):
+    deadline = time.monotonic() + 30
+    while (code := Judge.made(task, start=True)) is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert code is not None
+    x, c = task.sample(np.random.default_rng(1), params)
+    x, c, u, steps = tuple(x.tolist()), tuple(c.tolist()), (3.0, -2.0), 40
+    judge = Judge(code, task)
+    judge.set_constants(c)
+    did, _, (seen, *_) = judge.judge(x, u, x, steps, 0.0)
+    expected = outcome(task, x, u, x, c, steps, (0.0,))
+    assert tuple(did) == tuple(map(float, expected))
+    np.testing.assert_array_equal(seen, np.array(task.observe(x, (*c, steps * task.control_dt)), np.float32))
+
+
+def test_the_optimum_repeats_in_the_env_at_its_cost_and_controllers_come_near_it(task, params):
+    x, c = task.sample(np.random.default_rng(2), params)
+    optimum = find_optimum(task, params, x, c)
+    assert optimum.is_optimal
+    assert optimum.violation < 1e-6
+    env = BallbotEnv(task, physics="rk4", params=params)
+    start = {"state": x, "constants": c}
+    tracked = rollout(env, TrajoptController(task, params), options=start)
+    assert tracked.success
+    assert tracked.cost == pytest.approx(optimum.cost, rel=0.01)
+    assert rollout(env, NmpcController(task, params), options=start).cost == pytest.approx(optimum.cost, rel=0.01)
+    env.reset(options=start)
+    costs = [env.step(u / params.force_limit)[4]["cost"] for u in optimum.trajectory.u[:STEPS]]  # rounding grows later
+    rates = [
+        task.cost(tuple(x), tuple(u), (*c, t))
+        for t, x, u in zip(optimum.trajectory.t, optimum.trajectory.x, optimum.trajectory.u, strict=False)
+    ]
+    np.testing.assert_allclose(costs, task.control_dt * np.array(rates[:STEPS]), rtol=1e-4, atol=1e-7)
+    assert optimum.cost == pytest.approx(task.control_dt * sum(rates), rel=1e-9)
+    found = regret(optimum.trajectory, task, params, c)
+    assert found.success
+    assert abs(found.regret) < 1e-6
+
+
+def test_an_optimum_may_start_later_in_the_episode(task, params):
+    x, c = task.sample(np.random.default_rng(2), params)
+    whole = find_optimum(task, params, x, c)
+    late = find_optimum(task, params, x, c, start=0.7)
+    assert late.trajectory.t[0] == 0.7
+    assert abs(late.cost / whole.cost - 1) > 0.01
+    rates = task.cost(late.trajectory.x[:-1], late.trajectory.u, task.at(c, late.trajectory.t[:-1]))
+    assert late.cost == pytest.approx(task.control_dt * np.sum(rates), rel=1e-9)
+
+
+def test_batches_of_optima_leave_a_task_with_a_clock_to_find_optimum(task, params):
+    assert not solves(task, params)
