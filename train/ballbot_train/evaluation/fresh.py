@@ -23,6 +23,7 @@ from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import limit_names, make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.evaluation.controllers import is_expert, is_file, is_saved_model
@@ -44,7 +45,7 @@ EPISODES = 10_000
 
 _MOST_EPISODES = 1_000_000
 _BATCH = 2500  # episodes that run at once
-_CHUNK = 40  # episodes of a job that finds optima
+_CHUNK = 5  # episodes of a job that finds optima
 _PURPOSES = {"evaluation": 0, "validation": 1, "training": 2}
 _DISCRETE = 12  # a quantity with at most so many values gets a bin for each of them
 _PER_BIN = 125  # episodes of a bin on average, by default
@@ -394,12 +395,19 @@ def find_optima(
 
 
 def _optima(task_name: str, seed: int, robot: str, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
-    from ballbot_baselines.batched import optimal_costs  # it imports CasADi
+    from ballbot_baselines.optimum import find_optimum  # it imports CasADi
 
     task = make_task(task_name, robot)
-    found = optimal_costs(task, named_robot(robot), *draw(task, episodes, seed, robot=robot))
-    for i, cost in zip(episodes, found, strict=True):
-        yield {"episode": i, "error": cost} if isinstance(cost, str) else {"episode": i, "cost": cost}
+    for i, x, c in zip(episodes, *draw(task, episodes, seed, robot=robot), strict=True):
+        try:
+            optimum = find_optimum(task, named_robot(robot), x, c)
+        except PlanError as error:
+            yield {"episode": i, "error": str(error)}
+            continue
+        if optimum.is_optimal:
+            yield {"episode": i, "cost": optimum.cost}
+        else:
+            yield {"episode": i, "error": f"only a feasible episode was found ({optimum.solver_status})"}
 
 
 def write(
