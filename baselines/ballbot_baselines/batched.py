@@ -2,7 +2,9 @@
 
 The search is that of `search.py`, for all episodes together:
 
-- Tasks that end at rest without obstacles start from the cheapest simulated recovery (`righting.steering`).
+- Tasks that end at rest without obstacles start from the cheapest simulated recovery (`righting.steering`). Only the first
+  seconds are optimized, with LQR's cost-to-go as the cost of their last state, and then LQR is simulated to the end. Where
+  that costs something else than LQR's cost-to-go, the whole episode is optimized from there.
 - Slaloms are first solved without their obstacles and with forces held longer. That predicts what every choice of sides costs
   (`sides.py`), and the likely ones are compared, with forces held longer too.
 - First-exit tasks are first solved along each guessed path with a free length of the steps, then for whole numbers of control
@@ -14,18 +16,16 @@ What remains unsolved is left to `find_optimum`. `benchmarks/batched_optima.py` 
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from ballbot_baselines import guess, righting, search
 from ballbot_baselines.ilqr import MARGIN, Options, Solutions, ilqr
-from ballbot_baselines.optimum import find_optimum
 from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, shooting_parameters
 from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
 # of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s
@@ -48,6 +48,8 @@ _ROUGH_SOLUTION = tuple(
     for bends, width, multiplier in ((1, 0.01, 3.0), (0, 0.01, 3.0), (3, 0.01, 3.0), (1, 0.02, 1.0))
 )
 _SIDES_DOUBT = 0.005  # relative: how differently the coarse grid and rough solutions may order choices of sides
+_SECONDS = 3.0  # optimized of a task that ends at rest
+_AT_REST = 1e-5  # relative to an episode's cost: how wrong LQR's cost-to-go may be after these
 _SAME = 0.02  # m: rough solutions that are nowhere farther apart are the same
 _AT_ONCE = 256  # episodes in memory
 _GUESSES = 5  # as of `find_optimum`
@@ -139,24 +141,6 @@ def find_optima(
     return optima
 
 
-def optimal_costs(task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray) -> Iterator[float | str]:
-    """The cost of each optimum from x0 (B, 8) with constants c (B, nc), or a sentence that says why there is none.
-
-    `find_optima` finds nearly all, and `find_optimum` the rest.
-    """
-    costs = find_optima(task, params, x0, c).costs if solves(task, params) else np.full(len(x0), np.nan)
-    for cost, x, constants in zip(costs.tolist(), x0, c, strict=True):
-        if not math.isnan(cost):
-            yield cost
-            continue
-        try:
-            optimum = find_optimum(task, params, x, constants)
-        except PlanError as error:
-            yield str(error)
-        else:
-            yield optimum.cost if optimum.is_optimal else f"only a feasible episode was found ({optimum.solver_status})"
-
-
 @dataclass(frozen=True)
 class _Guesses:
     """J guesses: of which episodes, states (J, n+1, 8 or 9), actions (J, n, 2), and numbers of steps (J,)."""
@@ -194,16 +178,17 @@ class _Batch:
         elif task.passed_obstacles(self._c[0]) is not None and task.steps % search.COARSE == 0:
             self._weave()
         elif len(task.reference(self._x0[0], self._c[0], self._params).x) == 1:
-            self._keep(self._recoveries(forces), _MOTION)
+            self._recover(forces)
             self._follow_paths(np.flatnonzero(np.isnan(self._optima.costs)))
         else:
             self._follow_paths(np.arange(len(self._x0)))
 
-    def _given(self, c: np.ndarray) -> np.ndarray:
-        """Parameters of `ilqr`, (J, np), of constants (J, nc)."""
+    def _given(self, c: np.ndarray, then_rest: bool = False, free_time: bool = False) -> np.ndarray:
+        """Parameters of `ilqr`, (J, np), of constants (J, nc). With `then_rest`, LQR's cost-to-go counts."""
+        share = [] if free_time or self._solver.rest is None else [float(then_rest)]
         backoff = replace(Backoff(), margin=MARGIN, goal=MARGIN)
         rest = shooting_parameters(self._task, self._params, c[0], backoff)[1 + c.shape[1] :]
-        return np.column_stack([c, np.tile(rest, (len(c), 1))])
+        return np.column_stack([c, np.tile([*rest, *share], (len(c), 1))])
 
     def _solve(
         self,
@@ -219,7 +204,7 @@ class _Batch:
         solver, lengths = (
             (ilqr(task, self._params, True), 1.0) if free_time else (self._solver, coarseness * task.control_dt)
         )
-        given = self._given((self._c if c is None else c)[guesses.of])
+        given = self._given((self._c if c is None else c)[guesses.of], coarseness == 1 and n < task.steps, free_time)
         if free_time:
             bounds = task.control_dt / 4, task.duration / n
             given = np.column_stack([given, np.tile(bounds, (len(given), 1))])
@@ -255,11 +240,13 @@ class _Batch:
         """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,)."""
         if not len(guesses.of):
             return np.zeros(0)
-        found, optima, limit = (
-            self._solve(guesses, tries, chosen_sides=chosen_sides),
-            self._optima,
-            self._params.force_limit,
-        )
+        found = self._solve(guesses, tries, chosen_sides=chosen_sides)
+        self._write(guesses, found)
+        return found.costs
+
+    def _write(self, guesses: _Guesses, found: Solutions) -> None:
+        """Keeps the cheapest solution of every episode."""
+        optima, limit = self._optima, self._params.force_limit
         for i in np.argsort(-found.costs, kind="stable"):  # the cheapest last
             row, steps = guesses.of[i], guesses.steps[i]
             if not found.solved[i] or found.costs[i] >= optima.costs[row]:
@@ -275,18 +262,52 @@ class _Batch:
                 (optima.slopes, found.slopes, 1.0),
             ):
                 kept[row, :steps], kept[row, steps:] = unit * values[i, :steps], 0
-        return found.costs
+
+    def _recover(self, forces: np.ndarray | None) -> None:
+        """From the recoveries, over the first seconds where LQR is right about the rest."""
+        guesses, rest, dt, limit = (
+            self._recoveries(forces),
+            self._solver.rest,
+            self._task.control_dt,
+            self._params.force_limit,
+        )
+        left = self._task.steps - guesses.a.shape[1]
+        if rest is None or not left:
+            self._keep(guesses, _MOTION)
+            return
+        found = self._solve(guesses, _MOTION)
+        end = found.x[:, -1]
+        x, a, costs = self._solver.stay(end, dt, self._given(self._c[guesses.of]), left)
+        expected = rest.costs(end)
+        whole = Solutions(
+            np.concatenate([found.x, x[:, 1:]], axis=1),
+            np.concatenate([found.a, a], axis=1),
+            np.concatenate([found.gains, np.broadcast_to(rest.gain / limit, (len(a), left, 2, 8))], axis=1),
+            np.concatenate([found.slopes, rest.slopes(x[:, :-1])], axis=1),
+            found.costs - expected + costs,
+            found.solved,
+            found.iterations,
+        )
+        exact = np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
+        again = _Guesses(guesses.of, whole.x, whole.a, guesses.steps + left)
+        whole.solved[:] &= exact
+        self._write(again, whole)
+        self._keep(again.some(~exact & np.isfinite(whole.costs)), _MOTION)
 
     def _recoveries(self, forces: np.ndarray | None) -> _Guesses:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
-        task, x0, count, n = self._task, self._x0, len(self._x0), self._task.steps
+        task, x0, count, rest = self._task, self._x0, len(self._x0), self._solver.rest
+        n = task.steps if rest is None else min(task.steps, round(_SECONDS / task.control_dt))
         given, times = self._given(self._c), task.control_dt * np.arange(n)
         best = np.full(count, np.inf)
         x, a = np.zeros((count, n + 1, 8)), np.zeros((count, n, 2))
 
         def improve(rows: np.ndarray, simulated: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-            cheaper = simulated[2] < best[rows]
-            for kept, values in zip((x, a, best), simulated, strict=True):
+            states, actions, costs = simulated
+            if rest is not None and n < task.steps:
+                costs = costs + rest.costs(states[:, -1])
+            cheaper = costs < best[rows]
+            for kept, values in zip((x, a, best), (states, actions, costs), strict=True):
                 kept[rows[cheaper]] = values[cheaper]
 
         side = righting.leaning_aside(x0, np.ones(count)).T
@@ -301,7 +322,8 @@ class _Batch:
                 improve(rows, followed)
         if forces is not None:
             improve(
-                np.arange(count), self._solver.simulate(x0, task.control_dt, given, forces / self._params.force_limit)
+                np.arange(count),
+                self._solver.simulate(x0, task.control_dt, given, forces[:, :n] / self._params.force_limit),
             )
         return _Guesses(np.arange(count), x, a, np.full(count, n)).some(np.isfinite(best))
 

@@ -243,13 +243,14 @@ void solve(int64_t jobs, int64_t n, const options *o, const int64_t *steps, cons
     for (unsigned i = 0; i < sizeof made / sizeof *made; ++i) free(made[i]);
 }
 
-/* Simulates the cascade along paths (jobs, n, 8) with its two settings, or the actions a where there is no path.
-   x (jobs, n+1, STATES) has the initial states. */
+/* Simulates the cascade along paths (jobs, n, 8) with its two settings, or the actions a where there is no path, with feedback
+   where there is one: its gain (2, STATES), and the state about which it is. x (jobs, n+1, STATES) has the initial states. */
 void follow(int64_t jobs, int64_t n, const double *lengths, const double *given, const double *path_all,
-            const double *settings, double *x_all, double *a_all, double *costs, double *missed_all) {
+            const double *settings, const double *feedback, double *x_all, double *a_all, double *costs, double *missed_all) {
     for (int64_t first = 0; first < jobs; first += LANES) {
         real x[2][STATES][LANES], a[2][LANES], path[8][LANES], p[PARAMS + 1][LANES], set[2][LANES], rate[1][LANES];
-        real dt[1][LANES], g[PATH + 1][LANES], cost[LANES] = {0}, missed[LANES] = {0}, zero[2 * STATES + PATH + 1][LANES] = {{0}};
+        real dt[1][LANES], g[PATH + 1][LANES], cost[LANES] = {0}, missed[LANES] = {0}, zero[PATH + 3][LANES] = {{0}};
+        real lqr[3 * STATES][LANES] = {{0}};
         real one[1][LANES], priced[1][LANES], taken[2][LANES];
         int64_t job[LANES];
         EACH_LANE {
@@ -257,6 +258,8 @@ void follow(int64_t jobs, int64_t n, const double *lengths, const double *given,
             one[0][k] = 1, dt[0][k] = lengths[j], set[0][k] = settings[2 * j], set[1][k] = settings[2 * j + 1];
             for (int i = 0; i < STATES; ++i) x[0][i][k] = x_all[j * (n + 1) * STATES + i];
             for (int i = 0; i < PARAMS; ++i) p[i][k] = given[j * PARAMS + i];
+            if (feedback)
+                for (int i = 0; i < 3 * STATES; ++i) lqr[i][k] = feedback[i];
         }
         for (int64_t t = 0; t < n; ++t) {
             real *now = &x[t & 1][0][0], *after = &x[(t + 1) & 1][0][0];
@@ -265,8 +268,8 @@ void follow(int64_t jobs, int64_t n, const double *lengths, const double *given,
                 steer(now, LANES, AT(path), AT(set), AT(p), AT(a));
             } else
                 EACH_LANE for (int i = 0; i < 2; ++i) a[i][k] = a_all[(job[k] * n + t) * 2 + i];
-            hold(now, LANES, AT(a), AT(zero), AT(zero), AT(zero), now, LANES, AT(dt), AT(p), AT(zero), AT(one), after, LANES,
-                 AT(taken), AT(rate), AT(g), AT(priced));
+            hold(now, LANES, AT(a), AT(zero), AT(zero), AT(lqr), &lqr[2 * STATES][0], LANES, AT(dt), AT(p), AT(zero), AT(one),
+                 after, LANES, AT(taken), AT(rate), AT(g), AT(priced));
             EACH_LANE {
                 const int64_t j = job[k];
                 cost[k] += rate[0][k];

@@ -8,6 +8,8 @@ The other inequalities g ≥ 0 are the task's margins, its goal and the robot's 
 multiplier m, a width w that shrinks, and the logarithm f(t) = −log(1 + t), which goes on as a parabola below t = −½ (Ben-Tal
 and Zibulevsky, "Penalty/barrier multiplier methods for convex programming problems", 1997). So constraints that are not
 violated yet are felt too, and steps can stay long.
+
+Where a task ends at rest, LQR's cost-to-go can stand for the end of an episode.
 """
 
 import ctypes
@@ -22,6 +24,7 @@ import numpy as np
 
 from ballbot_baselines import righting
 from ballbot_baselines.compiled import LANES, SIMD
+from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
 from ballbot_baselines.shooting import shooting_ocp
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
@@ -99,8 +102,36 @@ class Solutions:
     iterations: np.ndarray
 
 
+@dataclass(frozen=True)
+class Rest:
+    """The state (8,) where a task ends at rest, and LQR about it: its gain (2, 8), and P (8, 8) of its cost-to-go xᵀPx."""
+
+    x: np.ndarray
+    gain: np.ndarray
+    p: np.ndarray
+
+    def slopes(self, x: np.ndarray) -> np.ndarray:
+        """(..., 8) of the cost-to-go of states (..., 8)."""
+        off = x - self.x  # BLAS would add in an order that depends on the number of states
+        return sum((2 * off[..., i, None] * row for i, row in enumerate(self.p)), np.zeros(8))
+
+    def costs(self, x: np.ndarray) -> np.ndarray:
+        """(...) costs-to-go of states (..., 8)."""
+        return 0.5 * (self.slopes(x) * (x - self.x)).sum(axis=-1)
+
+
+def rest(task: Task, params: BallbotParams) -> Rest | None:
+    """Where the task ends at rest, if that is the same equilibrium for all episodes."""
+    if task.first_exit or task.constant_names:
+        return None
+    end = task.reference(np.zeros(8), np.zeros(0), params)
+    if len(end.x) > 1 or not is_equilibrium(params, end.x[0], end.u[0]):
+        return None
+    return Rest(end.x[0], *discrete_lqr(task, params, end.x[0], end.u[0], np.zeros(0)))
+
+
 class Ilqr:
-    """The solver of a task and a robot.
+    """The solver of a task and a robot. `rest` says where the task ends at rest.
 
     With `free_time`, the length of the steps is free, within the last two parameters of each problem.
 
@@ -112,12 +143,13 @@ class Ilqr:
     def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
         stage = _Stage(task, params, free_time)
         name = f"{task.id}-ilqr{'-free' if free_time else ''}"
+        self._limit = params.force_limit
         library = ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD)))
-        self.states, self._sizes = stage.ns, stage.sizes
+        self.states, self.rest, self._sizes = stage.ns, stage.rest, stage.sizes
         self._solve, self._follow = library.solve, library.follow
         count, pointer = ctypes.c_int64, ctypes.c_void_p
         self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 12], None
-        self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 8], None
+        self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 9], None
 
     def solve(
         self, x: np.ndarray, a: np.ndarray, steps: Any, lengths: Any, given: np.ndarray, options: Options = Options()
@@ -129,7 +161,8 @@ class Ilqr:
             a: (J, n, 2) actions.
             steps: (J,) or one number of steps, n at most.
             lengths: (J,) or one length of a step, s; 1 where it is free.
-            given: (J, np) parameters: p of `shooting_ocp` but the first, and the bounds of a free length, s.
+            given: (J, np) parameters: p of `shooting_ocp` but the first, and the bounds of a free length, s, or else, for
+                tasks with a `rest`, the share of LQR's cost-to-go that the last state costs, 0 or 1.
             options: of the solver.
         """
         jobs, n = a.shape[:2]
@@ -178,6 +211,14 @@ class Ilqr:
         """The same under actions a (J, n, 2)."""
         return self._simulated(x0, np.array(a, np.float64, order="C"), length, given, None, (0.0, 0.0))
 
+    def stay(
+        self, x0: np.ndarray, length: float, given: np.ndarray, n: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same for n steps under LQR about the task's `rest`."""
+        assert self.rest is not None
+        feedback = np.concatenate([self.rest.gain.ravel() / self._limit, self.rest.x])
+        return self._simulated(x0, np.zeros((len(x0), n, 2)), length, given, None, (0.0, 0.0), feedback)
+
     def _simulated(
         self,
         x0: np.ndarray,
@@ -186,15 +227,16 @@ class Ilqr:
         given: np.ndarray,
         paths: np.ndarray | None,
         settings: tuple[float, float],
+        lqr: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         jobs, n = a.shape[:2]
         x, costs, missed = np.zeros((jobs, n + 1, self.states)), np.zeros(jobs), np.zeros(jobs)
         x[:, 0] = x0
-        followed = None if paths is None else paths.ctypes.data
+        followed, held = (None if array is None else array.ctypes.data for array in (paths, lqr))
         before = *self._given(jobs, length, given), np.tile(np.array(settings, np.float64), (jobs, 1))
         of_steps, of_problems, of_feedback = (array.ctypes.data for array in before)
         after = (array.ctypes.data for array in (x, a, costs, missed))
-        self._follow(jobs, n, of_steps, of_problems, followed, of_feedback, *after)
+        self._follow(jobs, n, of_steps, of_problems, followed, of_feedback, held, *after)
         return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
 
     def _given(self, jobs: int, lengths: Any, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -221,9 +263,10 @@ class _Stage:
             dynamics.substeps_for(task.control_dt),
         )
         self._free, self.ns = free_time, 9 if free_time else 8
+        self.rest = None if free_time else rest(task, params)
         symbol = casadi.SX.sym
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
-        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time)
+        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + (self.rest is not None))
         self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
@@ -307,6 +350,8 @@ class _Stage:
         """The cost of the last state, with what is ahead of the last step, and its constraints."""
         x, p = self._x, self._all
         limits, cost = self._ocp.final_inequalities(x[:8], p), self._ocp.final_cost(x[:8], p)
+        if self.rest is not None:
+            cost += self._p[-1] * casadi.bilin(self.rest.p, x - self.rest.x, x - self.rest.x)
         push, stiffness = _price_slopes(limits, self._end_multipliers, self._width)
         of_limits, held = casadi.jacobian(limits, x), casadi.SX.sym("held", push.shape[0])
         # How the goal bends counts: its functions are squares, which have no slope in its middle.
