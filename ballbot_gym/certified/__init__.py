@@ -152,7 +152,15 @@ def from_cache(task: Task, params: BallbotParams, episodes: Iterable[int]) -> Ev
 
     `statuses` say how each optimum was found.
     """
-    needed = list(episodes)
+    needed = tuple(episodes)
+    return _from_cache(needed, cache.versions(task, params, needed), type(task), task, params)
+
+
+@lru_cache(maxsize=16)
+def _from_cache(
+    needed: tuple[int, ...], versions: tuple[Any, ...], kind: type[Task], task: Task, params: BallbotParams
+) -> EvaluationSet | None:
+    """`from_cache` of files in their present versions. Steps them once, however often they are asked for."""
     found = cache.read(task, params, needed)
     if len(found) < len(set(needed)) or not found:
         return None
@@ -173,7 +181,10 @@ def from_cache(task: Task, params: BallbotParams, episodes: Iterable[int]) -> Ev
         return None
     first = range(next(i for i in range(rows + 1) if i not in moves))
     trajectories = tuple(moves[i] for i in first[:TRAJECTORIES])
-    return EvaluationSet(**arrays, statuses=np.array(statuses), trajectories=trajectories)
+    arrays["statuses"] = np.array(statuses)
+    for array in arrays.values():
+        array.setflags(write=False)  # everybody who loads the set gets it
+    return EvaluationSet(**arrays, trajectories=trajectories)
 
 
 @lru_cache(maxsize=16)

@@ -96,6 +96,13 @@ def read(task: Task, params: BallbotParams, indices: Iterable[int]) -> dict[int,
     return found
 
 
+def versions(task: Task, params: BallbotParams, indices: Iterable[int]) -> tuple[tuple[int, int] | None, ...]:
+    """When the optimum of each of some episodes was written, ns, and its size; None where there is none."""
+    paths = [_path(task, params, index) for index in indices]
+    stats = [path.stat() if path.exists() else None for path in paths]
+    return tuple(None if one is None else (one.st_mtime_ns, one.st_size) for one in stats)
+
+
 def forget(task: Task, params: BallbotParams, index: int) -> None:
     """Deletes the optimum of an episode, if there is one."""
     _path(task, params, index).unlink(missing_ok=True)

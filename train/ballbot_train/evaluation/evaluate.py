@@ -123,8 +123,9 @@ def evaluate(
     try:
         indices = episode_indices(episodes, certified.EPISODES)
         controller = as_controller(policy, env.task, env.params)
-        optima.known(env.task, env.params, indices, workers)
-        results = run_episodes(env, controller, name or _name(policy), task_name(env.task), indices)
+        known = optima.known(env.task, env.params, indices, workers)
+        named = name or _name(policy), task_name(env.task)
+        results = list(iterate_episodes(env, controller, *named, indices, 0, known))
         row = summarize(results)
         if out is not None:
             facts = provenance() | {
