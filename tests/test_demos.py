@@ -198,7 +198,7 @@ def test_an_expert_without_a_plan_keeps_its_last_one(monkeypatch):
     expert.reset(0.0, x, np.zeros(0))
     before = expert.label(0.0, x)
 
-    def find_none(*arguments):
+    def find_none(*arguments, **keywords):
         raise PlanError("no feasible episode")
 
     monkeypatch.setattr(trajopt, "plan_to_track", find_none)

@@ -396,9 +396,9 @@ def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(p
     reserve = Backoff(goal=0.1, force=0.02)
     failed = []
 
-    def find(*arguments):
+    def find(*arguments, **keywords):
         try:
-            return find_optimum(*arguments)
+            return find_optimum(*arguments, **keywords)
         except PlanError:
             failed.append(arguments[-1])
             raise

@@ -179,7 +179,7 @@ def test_where_the_expert_is_too_late_the_replay_says_so(monkeypatch):
     assert late.note.endswith("trajopt finds no way on from 0.36 s")
     assert len(early.ghosts) == 1
 
-    def find_none(*arguments):
+    def find_none(*arguments, **keywords):
         raise PlanError("no feasible episode")
 
     monkeypatch.setattr(trajopt, "plan_to_track", find_none)  # it looks for long, and found none above
