@@ -15,6 +15,7 @@ import casadi
 import numpy as np
 
 from ballbot_baselines import guess
+from ballbot_baselines.formulas import check_formulas
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.ops import is_number
@@ -176,6 +177,9 @@ class Shooting:
     """The episode's time at x0, s."""
     compared: dict[int, float] = field(default_factory=dict)
     """What guesses cost, by their index, that were solved on a coarser grid, or with free time, to choose among them."""
+
+    def __post_init__(self) -> None:
+        check_formulas(self.task, self.params)
 
     def along(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A guess that roughly follows a ground path (n+1, 2), m, one point for each control step."""
