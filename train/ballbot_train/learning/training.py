@@ -32,6 +32,7 @@ The best policy is that of the least validation_cost, and of the least validatio
 import io
 import math
 import os
+import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -271,6 +272,9 @@ def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any], test_episod
     writer = SummaryWriter(str(run.out / "tensorboard"), purge_step=learner.iteration)
     every = max(1, learner.iterations // learner.evaluations)
     saved = time.monotonic()
+    console.print(
+        f"to watch it learn: tensorboard --logdir {shlex.quote(str(run.out / 'tensorboard'))}", soft_wrap=True
+    )
     with _interruptible() as interrupted, progress_bar() as progress:
         bar = progress.add_task(config["learner"], total=learner.iterations, completed=learner.iteration)
         if learner.iteration == 0:
@@ -385,9 +389,11 @@ class _Run:
 
     @property
     def best_text(self) -> str:
-        """The best so far, for the progress bar."""
+        """The best policy so far, for the progress bar: regret on the certified episodes, the rest on those of validation."""
         best = self._chosen
-        return f"cost {best['validation_cost']:.2f}, {best['validation_failures']} fail"
+        regret = "no regret yet" if math.isnan(best["regret_mean"]) else f"{best['regret_mean']:.1%} regret"
+        failures = f"{best['validation_failures']} of {self.validation_episodes} fail"
+        return f"{regret}, {best['validation_success']:.1%} success, {failures}"
 
     def save(self) -> None:
         """Writes the checkpoint, with the best policy in it, so that both are of the same iteration."""
