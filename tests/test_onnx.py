@@ -16,6 +16,8 @@ from ballbot_train.policy import SHIPPED, PolicyController, PolicyNetwork, Polic
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
 
 CLOSE = 5e-6  # of actions in [−1, 1], in float32: where a policy turns into a frame and back, rounding grows
+EACH_KIND = {"orbit-sac", "stabilize-rolling-rsl_ppo", "turn-ppo", "weave-dagger"}
+"""Policies whose graphs differ in kind: in frame, squashing, activation, oddness, routes and robot."""
 SHIPPED_NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
 
 
@@ -34,7 +36,10 @@ def observations_of_an_episode(env, policy):
     return np.array(seen)
 
 
-@pytest.mark.parametrize("name", SHIPPED_NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[] if name in EACH_KIND else pytest.mark.slow) for name in SHIPPED_NAMES],
+)
 def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path):
     task, *others, learner = name.split("-")
     robot = others[0] if others else "paper"
@@ -53,22 +58,11 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     assert np.abs(at_once).max() <= 1
 
 
-def test_files_are_of_a_version_that_older_runtimes_read(tmp_path):
-    export("shac", task="weave", onnx=tmp_path / "policy.onnx")
-    model = onnx.load(tmp_path / "policy.onnx")
-    assert model.ir_version <= 7  # onnxruntime 1.16 reads up to 9
-    assert max(each.version for each in model.opset_import) <= 14  # and up to 19
-
-
 @pytest.mark.parametrize(
     ("task", "fields"),
     [
-        ("orbit", {"frame": "radial"}),
-        ("weave", {"frame": "slalom"}),
-        ("orbit", {"frame": "radial", "squash": "tanh_in_frame"}),
         ("orbit", {"frame": "radial", "squash": "tanh_in_frame", "centred": True}),
         ("weave", {"frame": "fine_slalom", "centred": True}),
-        ("weave", {"frame": "routed_slalom", "routes": (8,)}),
         ("stabilize", {"odd": True, "linear": False, "squash": "clip"}),
         ("weave", {"mirrors": True, "activation": "silu"}),
     ],
@@ -108,6 +102,9 @@ def test_the_file_says_what_it_takes_and_gives(tmp_path, capsys, monkeypatch):
     assert "| 8 | speed v | 5 | m/s |" in about["observation"]
     assert str(tmp_path).encode() not in path.read_bytes()
     assert b"policy.py" not in path.read_bytes()  # of the machine that wrote it
+    model = onnx.load(path)
+    assert model.ir_version <= 7  # onnxruntime 1.16 reads up to 9
+    assert max(each.version for each in model.opset_import) <= 14  # and up to 19
 
 
 def test_the_file_of_another_robot_names_it_and_its_force_limit(tmp_path, monkeypatch):
@@ -128,18 +125,3 @@ def test_the_layout_has_a_row_for_every_observed_number(name):
     table = observation_table(task)
     assert table.startswith(f"float32 ({len(task.observation_scale)},):")
     assert "Action" not in table
-
-
-@pytest.mark.parametrize(
-    ("policy", "task", "message"),
-    [
-        ("lqr", None, "lqr is an expert"),
-        ("nobody", None, "unknown policy 'nobody'; BallbotStabilize-v0 has ppo, sac, shac"),
-        ("sac", "dance", "unknown task dance"),
-        ("nowhere.json", None, "no such file"),
-    ],
-)
-def test_what_is_no_policy_is_refused_and_nothing_is_written(policy, task, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        export(policy, task=task, onnx=tmp_path / "a.onnx")
-    assert not any(tmp_path.iterdir())

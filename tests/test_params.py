@@ -3,7 +3,7 @@ import dataclasses
 import pytest
 
 from ballbot_gym.params import URDF_PATH, BallbotParams, UrdfError, default_params
-from ballbot_gym.robots import named_robot
+from ballbot_gym.robots import ROBOTS, named_robot
 
 
 def test_packaged_robot_has_the_numbers_that_give_the_papers_linearization():
@@ -33,7 +33,7 @@ def test_derived_quantities_are_those_of_the_two_masses(params):
     assert params.pivot_inertia == pytest.approx(1.2875 + 15 * 0.6**2)
 
 
-@pytest.mark.parametrize("robot", ["paper", "rolling"])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_written_urdf_reads_back_bit_by_bit(robot, tmp_path):
     params = named_robot(robot)
     numbers = {name: value for name, value in dataclasses.asdict(params).items() if value and value is not True}

@@ -250,13 +250,12 @@ def test_another_task_keeps_the_controllers_that_it_has(play):
     assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
 
 
-@pytest.mark.parametrize(("robot", "seed"), [("rolling", 0), ("rolling", 1)])
-@pytest.mark.parametrize("physics", ["rk4", "bullet"])
-def test_an_episode_of_another_robot_is_that_of_the_env(play, robot, seed, physics):
+@pytest.mark.parametrize(("physics", "seed"), [("rk4", 0), ("bullet", 1)])
+def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
     if physics == "bullet":
         pytest.importorskip("pybullet")
-    playground = play(robot=robot, episode=None, seed=seed, physics=physics)
-    (state, constants), env = playground.start, BallbotEnv("stabilize", robot=robot, physics=physics)
+    playground = play(robot="rolling", episode=None, seed=seed, physics=physics)
+    (state, constants), env = playground.start, BallbotEnv("stabilize", robot="rolling", physics=physics)
     controller = CONTROLLERS["lqr"](env.task, env.params)
     expected = rollout(env, controller, options={"state": state, "constants": constants})
     while not playground.scores:
@@ -278,40 +277,41 @@ def test_another_robot_keeps_the_controllers_that_it_has(play, interpreted):
 # --- bad input ---
 
 
-@pytest.mark.parametrize("push", [(math.nan, 0.0), (math.inf, 1.0), (1e300, 1e300), (-1e9, 0.0), (0.0, 0.0)])
-def test_no_push_harms(play, push):
+def test_no_push_harms(play):
     playground = play()
-    playground.push(*push)
-    go(playground, 0.1)
-    assert np.isfinite(playground.main.x).all()
-    assert (
-        np.hypot(*playground.main.x[4:6]) < 8 + LARGEST_PUSH
-    )  # m/s: every kilogram that is pushed weighs more than 1 kg
+    for push in ((math.nan, 0.0), (math.inf, 1.0), (1e300, 1e300), (-1e9, 0.0), (0.0, 0.0)):
+        playground.restart()
+        playground.settle()
+        playground.push(*push)
+        go(playground, 0.1)
+        assert np.isfinite(playground.main.x).all()
+        # every kilogram that is pushed weighs more than 1 kg
+        assert np.hypot(*playground.main.x[4:6]) < 8 + LARGEST_PUSH  # m/s
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda p: p.set_task("dance"), "unknown task dance"),
-        (lambda p: p.set_robot("teapot"), "unknown robot teapot"),
-        (lambda p: p.set_controller("nobody"), "unknown controller 'nobody'"),
-        (lambda p: p.set_controller("nowhere/policy.json"), "unknown controller"),
-        (lambda p: p.set_ghosts(["nobody"]), "unknown controller 'nobody'"),
-        (lambda p: p.set_weight("nothing", 1.0), "unknown weight nothing"),
-        (lambda p: p.set_weight("effort_weight", math.nan), "effort_weight must be"),
-        (lambda p: p.set_weight("effort_weight", -1.0), "effort_weight must be"),
-        (lambda p: p.set_plant("mass", math.nan), "mass must be -50 to 100"),
-        (lambda p: p.set_plant("mass", 1e9), "mass must be -50 to 100"),
-        (lambda p: p.set_plant("weather", 1.0), "unknown change weather"),
-        (lambda p: p.start_certified(200), "episode must be 0 to 199, not 200"),
-    ],
-)
-def test_wrong_input_is_refused_and_the_robot_goes_on(play, change, message):
+WRONG = [
+    (lambda p: p.set_task("dance"), "unknown task dance"),
+    (lambda p: p.set_robot("teapot"), "unknown robot teapot"),
+    (lambda p: p.set_controller("nobody"), "unknown controller 'nobody'"),
+    (lambda p: p.set_controller("nowhere/policy.json"), "unknown controller"),
+    (lambda p: p.set_ghosts(["nobody"]), "unknown controller 'nobody'"),
+    (lambda p: p.set_weight("nothing", 1.0), "unknown weight nothing"),
+    (lambda p: p.set_weight("effort_weight", math.nan), "effort_weight must be"),
+    (lambda p: p.set_weight("effort_weight", -1.0), "effort_weight must be"),
+    (lambda p: p.set_plant("mass", math.nan), "mass must be -50 to 100"),
+    (lambda p: p.set_plant("mass", 1e9), "mass must be -50 to 100"),
+    (lambda p: p.set_plant("weather", 1.0), "unknown change weather"),
+    (lambda p: p.start_certified(200), "episode must be 0 to 199, not 200"),
+]
+
+
+def test_wrong_input_is_refused_and_the_robot_goes_on(play):
     playground = play()
-    with pytest.raises(ValueError, match=message):
-        change(playground)
-    go(playground, 0.1)
-    assert playground.crew.notice == ""
+    for change, message in WRONG:
+        with pytest.raises(ValueError, match=message):
+            change(playground)
+        go(playground, 0.04)
+        assert playground.crew.notice == ""
 
 
 @pytest.fixture

@@ -121,4 +121,4 @@ def test_simulated_recovery_is_a_plan_where_no_solver_finds_one(altered, make_en
     assert controller.plan.solver == "simulation"
     assert run.cost == pytest.approx(controller.plan.cost, rel=1e-6)
     with pytest.raises(PlanError):
-        controller.reset(0.0, leaning(75, lean_rate=5.0), NO_CONSTANTS)
+        TrajoptController(Stabilize(duration=1.0), params).reset(0.0, leaning(75, lean_rate=5.0), NO_CONSTANTS)

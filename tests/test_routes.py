@@ -101,6 +101,7 @@ def test_costs_predicted_for_many_slaloms_are_those_predicted_for_each(slaloms):
         assert np.array_equal(alone.sides, sides.choices(len(obstacles)))
 
 
+@pytest.mark.slow
 def test_routes_learn_to_cost_less_than_the_nearer_sides():
     torch.manual_seed(0)
     network = PolicyNetwork(spec_for(TASK, "routes", (8,)))
@@ -136,6 +137,7 @@ def test_a_spec_with_routes_needs_a_frame_with_a_route():
 def test_a_learner_teaches_its_routes_first_and_keeps_them(name, monkeypatch):
     monkeypatch.setattr(routing, "EPISODES", 60)
     monkeypatch.setattr(routing, "_STEPS", 5)
+    monkeypatch.setattr(routing, "_DISTANCES", 1)
     tiny = {
         "shac": {"num_envs": 4, "horizon": 3, "iterations": 2, "one_way": True},
         "dagger": {
@@ -144,6 +146,7 @@ def test_a_learner_teaches_its_routes_first_and_keeps_them(name, monkeypatch):
             "rollouts_per_plan": 0,
             "tracked_rollouts_per_plan": 1,
             "gradient_steps": 2,
+            "max_guesses": 1,
             "iterations": 2,
         },
     }[name]

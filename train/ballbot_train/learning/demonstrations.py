@@ -54,7 +54,7 @@ from ballbot_train import jobs, shards
 from ballbot_train.console import check_names
 from ballbot_train.evaluation import controllers
 from ballbot_train.executors import Workers
-from ballbot_train.policy import OBSERVATION_VERSION
+from ballbot_train.policy_files import OBSERVATION_VERSION
 
 _CHUNK = 5  # episodes of a job
 _ARRAYS = "npz"  # where an entry holds the arrays of its episode
