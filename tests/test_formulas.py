@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ballbot_baselines import find_optimum
+from ballbot_baselines import batched, find_optimum
 from ballbot_gym import ops
 from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -31,8 +31,11 @@ def test_the_optimum_of_a_cost_that_no_optimizer_can_use_is_refused(name):
             return change(super().cost(x, u, c), ops.components(x)[0])
 
     task, robot = Bad(), named_robot("paper")
+    x, c = task.sample(np.random.default_rng(0), robot)
     with pytest.raises(ValueError, match=f"{task.id}: {message}"):
-        find_optimum(task, robot, *task.sample(np.random.default_rng(0), robot))
+        find_optimum(task, robot, x, c)
+    with pytest.raises(ValueError, match=f"{task.id}: {message}"):
+        batched.find_optima(task, robot, x[np.newaxis], c[np.newaxis])
 
 
 def test_goals_and_margins_are_checked_as_well():

@@ -1,7 +1,6 @@
 """Whether a task's formulas can be optimized: differentiable, smooth and finite, with costs that are not negative."""
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import casadi
@@ -19,7 +18,6 @@ _ADVICE = (
 )
 
 
-@lru_cache(maxsize=64)
 def check_formulas(task: Task, params: BallbotParams) -> None:
     """Checks cost, margins and goal of a task near some of its starts.
 
@@ -29,7 +27,7 @@ def check_formulas(task: Task, params: BallbotParams) -> None:
     rng = np.random.default_rng(0)
     starts = [task.sample(rng, params) for _ in range(_SEGMENTS)]
     x = np.stack([x for x, _ in starts])
-    ends = x + rng.uniform(-1, 1, x.shape) * _REACH, rng.uniform(-1, 1, (_SEGMENTS, 2)) * params.force_limit
+    towards, u = rng.uniform(-1, 1, x.shape) * _REACH, rng.uniform(-1, 1, (_SEGMENTS, 2)) * params.force_limit
     at_times = rng.uniform(0, task.duration, _SEGMENTS)
     c = np.stack([task.at(c, np.float64(t)) for (_, c), t in zip(starts, at_times, strict=True)])
     share = np.linspace(0, 1, _POINTS)
@@ -41,8 +39,7 @@ def check_formulas(task: Task, params: BallbotParams) -> None:
     for name, method in methods.items():
         along = _along(task, name, method, c.shape[1])
         for k in range(_SEGMENTS):
-            found = along(x[k], ends[0][k] - x[k], ends[1][k], c[k], share[None])
-            values, slopes, bends = np.array(found).reshape(3, -1, _POINTS)
+            values, slopes, bends = np.array(along(x[k], towards[k], u[k], c[k], share[None])).reshape(3, -1, _POINTS)
             start = f"x = {np.round(x[k], 3).tolist()}, c = {np.round(c[k], 3).tolist()}"
             if not np.isfinite(values[:, 0]).all():
                 raise ValueError(f"{task.id}: {name} is not finite at the start {start}. {_ADVICE}")

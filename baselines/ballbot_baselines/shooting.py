@@ -71,7 +71,11 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
 
     Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, so that
     problems on fine and coarse grids share all compiled functions, and all tasks of a robot share those of the dynamics.
+
+    Raises:
+        ValueError: no optimizer can use the task's formulas; see `check_formulas`.
     """
+    check_formulas(task, params)
     nc, limit = len(task.constant_names), params.force_limit
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
@@ -177,9 +181,6 @@ class Shooting:
     """The episode's time at x0, s."""
     compared: dict[int, float] = field(default_factory=dict)
     """What guesses cost, by their index, that were solved on a coarser grid, or with free time, to choose among them."""
-
-    def __post_init__(self) -> None:
-        check_formulas(self.task, self.params)
 
     def along(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A guess that roughly follows a ground path (n+1, 2), m, one point for each control step."""
