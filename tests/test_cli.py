@@ -204,6 +204,21 @@ def test_damaged_files_of_other_commands_are_named_and_skipped_and_paths_are_pri
     assert (runs / "[red]x[/b]:smile:" / "leaderboard.csv").exists()
 
 
+def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_path, typed):
+    arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "trajopt", "--workers", "1", "--out", "out")
+    first = subprocess.Popen(
+        [sys.executable, "-m", "ballbot_train.cli", *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not (tmp_path / "out" / "unfinished").exists():
+        time.sleep(0.05)
+    ended, printed = typed(*arguments)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    assert (ended, "another run is using out right now" in printed) == (1, True), printed
+    assert not (tmp_path / "out" / "leaderboard.csv").exists()
+
+
 def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     packaged = certified.path_of(make_task("turn")).read_bytes()

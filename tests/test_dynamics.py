@@ -40,6 +40,17 @@ def test_linearization_at_origin_is_the_papers(params):
     np.testing.assert_array_equal(np.round(b, 3), expected_b)
 
 
+def test_linearization_is_that_of_the_numpy_model_too(params):
+    # central differences: truncation h² and rounding 1e-16/h are both about 1e-10 of entries up to 60
+    h = 1e-5
+    x = h * np.eye(8)
+    a = (dynamics.derivative(params, x, np.zeros((8, 2))) - dynamics.derivative(params, -x, np.zeros((8, 2)))) / (2 * h)
+    assert a.T[4, 2] == pytest.approx(-35.07244, abs=5e-6)
+    assert a.T[6, 2] == pytest.approx(60.40254, abs=5e-6)
+    slope = dynamics.derivative(params, np.zeros(8), np.array([1.0, 0.0]))
+    np.testing.assert_allclose(slope, [0, 0, 0, 0, 0.295172, 0, -0.397241, 0], atol=5e-7)
+
+
 def test_upright_at_rest_is_an_equilibrium(params):
     assert dynamics.derivative(params, (0.0,) * 8, (0.0, 0.0)) == (0.0,) * 8
 
@@ -129,6 +140,13 @@ def test_control_steps_are_cut_into_as_few_rk4_steps_as_are_short_enough(dt, sub
 def test_motion_in_one_plane_stays_in_it(params):
     after = dynamics.step(params, (0.0, 0.3, 0.0, 0.4, 0.0, 1.0, 0.0, -0.5), (0.0, 70.0), 0.3, 30)
     assert [after[i] for i in (0, 2, 4, 6)] == [0.0] * 4
+
+
+def test_mirrored_start_gives_mirrored_motion(params):
+    mirror, mirror_force = np.array([-1, 1] * 4), np.array([-1, 1])
+    after = dynamics.step(params, np.array(START), np.array(FORCE), 0.1, 10)
+    mirrored = dynamics.step(params, mirror * START, mirror_force * FORCE, 0.1, 10)
+    np.testing.assert_allclose(mirrored, mirror * after, rtol=1e-13)
 
 
 def test_tilt_is_the_angle_of_the_bodys_axis():

@@ -100,6 +100,12 @@ def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
     assert about == ({} if name.endswith(".csv") else {"commit": "none"})
 
 
+def test_a_file_without_episodes_is_refused(tmp_path):
+    (tmp_path / "leaderboard.json").write_text('{"rows": []}')
+    with pytest.raises(ValueError, match="holds no episodes"):
+        read_results(tmp_path)
+
+
 @pytest.mark.parametrize(
     "name", ["=cmd|' /C calc'!A0.json", "+1+1", "@SUM(A1)", "-x", "'=x", "\tx", "plain", 'a,"b"', "'x"]
 )
@@ -169,6 +175,11 @@ def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
     assert evaluate.evaluate("lqr", "stabilize", 1, "rk4").success == 1
 
 
+def test_what_cannot_act_is_refused():
+    with pytest.raises(TypeError, match="is no policy"):
+        evaluate.evaluate(3, "stabilize", 1, "rk4")
+
+
 def test_noise_reaches_the_controller_and_only_it():
     seen = []
     idle = FunctionController(lambda t, x: seen.append(x) or np.zeros(2))
@@ -196,17 +207,57 @@ def test_without_names_every_expert_and_shipped_policy_is_benchmarked():
         assert names == [*CONTROLLERS, *shipped_policies(make_task(task))]
 
 
-def test_a_policy_is_given_once_whatever_its_path_is(tmp_path, monkeypatch):
+def test_an_unknown_controller_is_an_error_that_names_the_known_ones():
+    with pytest.raises(ValueError, match=r"unknown controller pid; known: lqr, trajopt"):
+        benchmark.controllers_of(["stabilize"], ["pid"])
+
+
+def test_controllers_and_tasks_are_given_once_and_at_least_one_task(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="controller lqr is given more than once"):
+        benchmark.controllers_of(["stabilize"], ["lqr", "nmpc", "lqr"])
+    with pytest.raises(ValueError, match="task turn is given more than once"):
+        benchmark.controllers_of(["turn", "turn"])
+    with pytest.raises(ValueError, match="give at least one task: stabilize, turn"):
+        benchmark.controllers_of([])
     monkeypatch.chdir(tmp_path)
     save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {})
     with pytest.raises(ValueError, match=r"controller ./mine.safetensors is given more than once"):
         benchmark.controllers_of(["turn"], ["mine.json", "./mine.safetensors"])
 
 
+@pytest.mark.parametrize(
+    ("episodes", "message"),
+    [
+        (0, "must be 1 to 200, or a list of indices, not 0"),
+        (201, "must be 1 to 200"),
+        ([], "is empty"),
+        ([0, 0], "names an episode twice"),
+        ([0, 200], "must be 0 to 199, not 200"),
+        ([-1], "must be 0 to 199, not -1"),
+    ],
+)
+def test_episodes_that_do_not_exist_or_come_twice_are_refused(episodes, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate.evaluate("lqr", "stabilize", episodes, "rk4")
+
+
+def test_episodes_that_are_no_numbers_are_refused():
+    for episodes in (1.5, ["0"]):
+        with pytest.raises(TypeError, match=r"whole numbers|number of episodes"):
+            evaluate.evaluate("lqr", "stabilize", episodes, "rk4")
+
+
 def test_chosen_episodes_are_those_that_are_run():
     rows = [evaluate.evaluate("lqr", "stabilize", chosen, "rk4") for chosen in ([3], np.array([3]), range(3, 4))]
     assert len({row.cost_mean for row in rows}) == 1
     assert rows[0].cost_mean != evaluate.evaluate("lqr", "stabilize", [4], "rk4").cost_mean
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"about": {}, "episodes": [{"task": 3}]}', "\xff", '{"about": 3}'])
+def test_damaged_results_are_refused(content, tmp_path):
+    (tmp_path / "leaderboard.json").write_text(content, encoding="latin-1")
+    with pytest.raises(ValueError, match="holds no episodes"):
+        read_results(tmp_path)
 
 
 def test_results_that_are_cut_off_are_refused(tmp_path):
@@ -232,10 +283,12 @@ print(sorted({{"torch", "casadi", "scipy", "stable_baselines3", "tyro", "matplot
 @pytest.mark.parametrize(
     ("code", "loaded"),
     [
-        ("from ballbot_train.evaluation import basins, benchmark, comparison, robustness", []),
+        ("from ballbot_train import evaluate, shipped_policies", []),
+        ("import ballbot_train.evaluation.benchmark, ballbot_train.evaluation.comparison", []),
+        ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
         ("import ballbot_train.learning.demonstrations", ["casadi", "scipy"]),
         (
-            "from ballbot_train import evaluate, shipped_policies\n"
+            "from ballbot_train import evaluate\n"
             "class Idle:\n"
             "    def reset(self, t, x, c): pass\n"
             "    def act(self, t, x): return (0.0, 0.0)\n"

@@ -55,6 +55,54 @@ def test_what_was_finished_before_an_error_is_not_done_again(tmp_path):
     assert log.read_text().split() == ["0", "1", "2", "3"]
 
 
+def test_half_a_line_that_a_kill_left_is_done_again(tmp_path):
+    log = tmp_path / "log"
+    jobs.run([job(squares, log, range(3))], tmp_path, 1, ignore)
+    path = next(tmp_path.rglob("job.jsonl"))
+    path.write_text(path.read_text()[:-10])
+    (entries,) = jobs.run([job(squares, log, range(3))], tmp_path, 1, ignore)
+    assert [entry["square"] for entry in entries] == [0, 1, 4]
+    assert log.read_text().split() == ["0", "1", "2", "2"]
+
+
+SLOWLY = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, {folder!r})
+from ballbot_train import jobs
+
+def slow(items):
+    for item in items:
+        time.sleep(0.02)
+        yield {{"item": item}}
+
+jobs.run([jobs.Job("job", slow, (), tuple(range(1000)))], Path({out!r}), 1, lambda group, count: None)
+"""
+
+
+def test_a_killed_process_loses_no_finished_item(tmp_path):
+    code = SLOWLY.format(folder=os.getcwd(), out=str(tmp_path))
+    process = subprocess.Popen([sys.executable, "-c", code])
+    path = tmp_path / "unfinished" / "job.jsonl"
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not (path.exists() and path.read_text().count("\n") >= 5):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = path.read_text().count("\n")
+    assert kept >= 5
+    started = []
+
+    def rest(items):
+        started.extend(items)
+        for item in items:
+            yield {"item": item}
+
+    (entries,) = jobs.run([jobs.Job("job", rest, (), tuple(range(1000)))], tmp_path, 1, ignore)
+    assert [entry["item"] for entry in entries] == list(range(1000))
+    assert started[0] == kept
+
+
 ENDLESS = """
 import os, time
 from pathlib import Path
@@ -220,12 +268,13 @@ def test_an_item_whose_process_dies_twice_is_named_and_everything_else_is_kept(t
     assert sorted(map(int, log.read_text().split())) == sorted([*range(12), 5, 5])
 
 
-def test_the_calling_process_outlives_the_last_item(tmp_path, monkeypatch):
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_calling_process_outlives_the_last_item(workers, tmp_path, monkeypatch):
     monkeypatch.delenv("BALLBOT_IN_PROCESS")
     log = tmp_path / "log"
     with pytest.raises(jobs.WorkerError, match="at job1, item 5"):
-        jobs.run(deadly_jobs(log, True)[1:2], tmp_path, 1, ignore)
-    (entries,) = jobs.run(deadly_jobs(log, False)[1:2], tmp_path, 1, ignore)
+        jobs.run(deadly_jobs(log, True)[1:2], tmp_path, workers, ignore)
+    (entries,) = jobs.run(deadly_jobs(log, False)[1:2], tmp_path, workers, ignore)
     assert [entry["square"] for entry in entries] == [16, 25, 36, 49]
 
 
@@ -250,6 +299,11 @@ def careless(items):
 def test_a_run_never_ends_with_items_missing(tmp_path):
     with pytest.raises(ValueError, match="holds 0 of 1 items though the run has ended"):
         jobs.run([jobs.Job("job", careless, (), (str(tmp_path),))], tmp_path, 1, ignore)
+
+
+def test_a_run_needs_a_worker(tmp_path):
+    with pytest.raises(ValueError, match="workers must be at least 1, not 0"):
+        jobs.run([job(squares, tmp_path / "log", range(3))], tmp_path, 0, ignore)
 
 
 def test_a_result_names_the_commit_of_the_checkout_that_tracks_the_code(tmp_path):

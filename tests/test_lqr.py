@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from ballbot_baselines.linearize import discretize, goal_weight, quadratic_cost
+from ballbot_baselines.linearize import discretize, goal_weight, linearize, quadratic_cost
 from ballbot_baselines.lqr import (
     LqrController,
     closed_gains,
@@ -46,6 +46,17 @@ def test_weights_are_positive_semidefinite_where_the_cost_is_curved_the_other_wa
     # inside its circle Orbit's radius error squared has a negative second derivative along the circle
     q, _ = quadratic_cost(Orbit(), np.array([[0.1, 0, 0, 0, 0, 0, 0, 0]]), NO_FORCE[None], np.array([2.0, 3.0]))
     assert np.linalg.eigvalsh(q[0]).min() >= -1e-12
+
+
+def test_discrete_model_is_the_continuous_ones_exponential(params):
+    from scipy.linalg import expm
+
+    a, b = linearize(params, ORIGIN, NO_FORCE)
+    ad, bd = discretize(params, ORIGIN[None], NO_FORCE[None], 0.02)
+    exact = expm(0.02 * np.block([[a, b], [np.zeros((2, 10))]]))
+    # RK4 over 10 ms: (7.77·0.01)⁵/120 twice is 5e-8, times rates of up to 60
+    np.testing.assert_allclose(ad[0], exact[:8, :8], atol=2e-6)
+    np.testing.assert_allclose(bd[0], exact[:8, 8:], atol=2e-8)
 
 
 def test_step_model_along_a_trajectory_is_the_steps_derivative(params, rng):

@@ -169,6 +169,14 @@ def test_what_cannot_be_registered_says_what_to_do(name):
     assert before == (TASKS, ROBOTS)
 
 
+def test_a_urdf_without_the_chain_is_refused_where_it_is_registered(tmp_path):
+    text = URDF_PATH.read_text().replace('joint name="gamma"', 'joint name="other"')
+    (tmp_path / "other.urdf").write_text(text)
+    with pytest.raises(UrdfError, match=r"other.urdf: joint 'gamma' is missing"):
+        register_robot("other", tmp_path / "other.urdf")
+    assert "other" not in ROBOTS
+
+
 def test_a_cell_of_a_notebook_may_run_twice():
     def cell(weight):
         @register_task

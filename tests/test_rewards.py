@@ -255,3 +255,7 @@ def test_pay_and_arena_are_no_part_of_the_problem(task):
     assert other.problem() == task.problem()
     assert type(task)(duration=4.0).problem() != task.problem()
     np.testing.assert_array_equal(certified.load(other, "paper").costs, certified.load(task, "paper").costs)
+
+
+def test_registry_is_complete():
+    assert all(kind.reward_threshold > 0 for kind in TASKS.values())

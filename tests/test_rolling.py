@@ -23,7 +23,7 @@ from ballbot_gym.engines.bullet import BulletContactSimulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.env import BallbotEnv, limit_names, make_task
 from ballbot_gym.params import BallbotParams, UrdfError, default_params
-from ballbot_gym.robots import ROBOTS, checked_robot, named_robot
+from ballbot_gym.robots import ROBOTS, checked_robot, named_robot, robot_name
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
@@ -186,6 +186,15 @@ def test_the_contact_at_the_end_of_a_step_is_that_of_its_end_state(rolling, rng)
 def test_the_paper_has_no_limits_of_grip(params, rng):
     assert dynamics.limits(params, np.zeros(8), np.zeros(2)) == ()
     assert params.moving_mass == params.total_mass
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robots_urdf_is_read_back_exactly(name, tmp_path):
+    robot = named_robot(name)
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot.to_urdf())
+    assert BallbotParams.from_urdf(path) == robot
+    assert robot_name(robot) == name
 
 
 @pytest.mark.parametrize(

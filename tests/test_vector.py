@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 pytest.importorskip("torch")
 
@@ -16,6 +17,7 @@ import torch
 from ballbot_gym import BallbotEnv, BallbotParams, counter_rng, dynamics
 from ballbot_gym import batch as batch_module
 from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.engines.bullet import BulletSimulator
 from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import ActionController, rollout
@@ -150,6 +152,29 @@ def test_one_step_in_float32_is_within_its_rounding(task, make_env, rng):
             assert result.terminated[i] == terminated
 
 
+def test_reaching_turns_goal_ends_the_episode_as_a_success_without_further_cost(make_vec):
+    vec = make_vec(2, "turn")
+    gate = np.array([0.98, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    vec.reset(seed=0, options={"state": gate, "constants": {"speed": [3.0, 5.0]}})
+    _, rewards, terminations, truncations, infos = vec.step(np.zeros((2, 2)))
+    assert terminations.tolist() == [True, False]
+    assert not truncations.any()
+    assert infos["final_info"]["success"].tolist() == [True, False]
+    assert not infos["final_info"]["failure"].any()
+    cost = vec.task.cost(tuple(gate), (0.0, 0.0), (3.0,)) * 0.02
+    assert infos["final_info"]["cost"][0] == pytest.approx(cost)
+    assert rewards[0] == pytest.approx(vec.task.survival_pay - cost)
+
+
+def test_resting_at_the_origin_to_the_end_is_a_success(make_vec):
+    vec = make_vec(2, duration=0.1)
+    vec.reset(seed=0, options={"state": np.stack([np.zeros(8), np.full(8, 0.3)])})
+    for _ in range(5):
+        *_, truncations, infos = vec.step(np.zeros((2, 2)))
+    assert truncations.all()
+    assert infos["final_info"]["success"].tolist() == [True, False]
+
+
 def test_state_that_is_not_finite_fails_and_its_neighbours_go_on():
     batch = BallbotBatch("stabilize", 3, compile=False)
     batch.reset(seed=0)
@@ -167,6 +192,25 @@ def test_tilt_is_of_the_state_that_follows_and_final_tilt_of_the_one_before_the_
         for tilt, x in ((result.tilt, batch.state.x), (result.final_tilt, result.final_x)):
             np.testing.assert_allclose(np.cos(tilt), np.cos(x[2]) * np.cos(x[3]), rtol=1e-12)
         assert (result.final_tilt != result.tilt).tolist() == (result.terminated | result.truncated).tolist()
+
+
+def test_batch_agrees_with_pybullet_to_its_integrators_error(params):
+    """Bullet is of first order, so its distance from the RK4 model falls to a quarter with a quarter of its step."""
+    x0, action = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0), (60 / 350, -40 / 350)
+    batch = BallbotBatch("stabilize", 1, dtype=torch.float64, compile=False)
+    batch.reset(x=torch.tensor(x0, dtype=torch.float64)[:, None])
+    for _ in range(15):
+        batch.step(torch.tensor([action], dtype=torch.float64))
+    errors = []
+    for physics_dt in (1e-3, 0.25e-3):
+        bullet = BulletSimulator(params, 0.02, physics_dt)
+        bullet.reset(x0)
+        for _ in range(15):
+            x = bullet.step((60.0, -40.0))
+        bullet.close()
+        errors.append(np.abs(np.array(x) - batch.state.x[:, 0].numpy()).max())
+    assert errors[0] == pytest.approx(2.0e-2, rel=0.1)  # DESIGN: measured against the exact solution
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
 
 
 # --- Gymnasium's rules ---
@@ -271,6 +315,21 @@ def test_only_masked_envs_are_reset(make_vec):
 
 
 @pytest.mark.parametrize(
+    ("mask", "error", "message"),
+    [
+        ([True, False], TypeError, "NumPy array of bool"),
+        (np.array([1, 0]), TypeError, "NumPy array of bool"),
+        (np.array([True]), ValueError, "shape"),
+        (np.array([False, False]), ValueError, "True somewhere"),
+        (np.ma.masked_array([True, False], [True, False]), TypeError, "NumPy array of bool"),
+    ],
+)
+def test_bad_reset_mask_is_refused(mask, error, message, make_vec):
+    with pytest.raises(error, match=message):
+        make_vec(2).reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize(
     ("task", "options", "message"),
     [
         ("stabilize", {"stat": 1}, "unknown reset options"),
@@ -345,6 +404,19 @@ def test_what_a_step_returned_is_never_written_to_again(make_vec, rng):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="read-only"):
         infos["state"][0] = 0
+
+
+def test_gymnasiums_episode_statistics_are_the_sum_of_rewards(make_vec, rng):
+    vec = RecordEpisodeStatistics(make_vec(4, duration=0.3))
+    vec.reset(seed=0)
+    total, seen = np.zeros(4), 0
+    for _ in range(40):
+        _, rewards, terminations, truncations, infos = vec.step(rng.uniform(-1, 1, (4, 2)))
+        total += rewards
+        for i in np.flatnonzero(terminations | truncations):
+            assert infos["episode"]["r"][i] == pytest.approx(total[i])
+            total[i], seen = 0, seen + 1
+    assert seen > 6
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
@@ -430,6 +502,12 @@ def test_seed_repeats_everything_and_without_one_the_next_episodes_come():
     assert (other.reset() != BallbotBatch("weave", 5, compile=False).reset()).any()
 
 
+def test_float32_and_float64_start_alike(task):
+    name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
+    single, double = (BallbotBatch(name, 9, dtype=dtype, compile=False) for dtype in (torch.float32, torch.float64))
+    np.testing.assert_allclose(single.reset(seed=1), double.reset(seed=1), rtol=1e-5, atol=1e-6)
+
+
 def test_hashed_numbers_are_uniform_and_uncorrelated():
     n = 20_000
     seed = torch.arange(n)
@@ -477,7 +555,7 @@ def casadi_gradient(task, params, x0, gain, forces):
     return np.array(gradient(forces.numpy().T)).T
 
 
-@pytest.mark.parametrize(("steps", "feedback"), [(100, True), (25, False)], ids=["2 s under LQR", "0.5 s open loop"])
+@pytest.mark.parametrize(("steps", "feedback"), [(400, True), (25, False)], ids=["8 s under LQR", "0.5 s open loop"])
 def test_gradient_of_the_cost_agrees_with_finite_differences_and_casadi(steps, feedback, params):
     lqr = pytest.importorskip("ballbot_baselines.lqr")
     batch = BallbotBatch("stabilize", 1, dtype=torch.float64, compile=False)

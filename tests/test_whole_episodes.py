@@ -20,6 +20,24 @@ def made(name, seed=0, **settings):
     return LEARNERS["shac"].make(make_task(name), default_params(), settings, seed, None)
 
 
+def parameters(learner):
+    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_it_goes_on_from_its_state_as_if_never_stopped(name):
+    whole, first, second = made(name), made(name), made(name, 5)
+    for _ in range(4):
+        whole.iterate()
+    for _ in range(2):
+        first.iterate()
+    second.load_state_dict(first.state_dict())
+    for _ in range(2):
+        second.iterate()
+    assert torch.equal(parameters(whole), parameters(second))
+    assert not torch.equal(parameters(whole), parameters(made(name)))
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_the_gradient_is_the_slope_of_the_cost_of_whole_episodes(name):
     learner = made(name, num_envs=3, margin_clearance=0.2, margin_penalty=10.0)
