@@ -29,18 +29,17 @@ def real_array(value: Any, what: str, shape: tuple[int, ...] | None = None) -> n
         ValueError: it does not have the shape, if one is given; or it holds anything but real numbers: complex ones, truth
             values, words, whole numbers of more than 64 bits, other objects, or masked entries.
     """
+    if type(value) is np.ndarray and value.dtype in _FLOATS and (shape is None or value.shape == shape):
+        return value
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):  # rows of different lengths, or a tensor elsewhere than on the CPU
         raise ValueError(f"{what} must be real numbers, not {shown(value)}") from None
     if shape is not None and array.shape != shape:
         raise ValueError(f"{what} must have shape {shape}, not {array.shape}")
-    if array.dtype in _FLOATS:
-        if type(value) is np.ndarray or not np.ma.is_masked(value):
-            return array
-    elif array.dtype.kind in "iuf" and not np.ma.is_masked(value):
+    if array.dtype.kind in "iuf" and not np.ma.is_masked(value):
         with np.errstate(over="ignore"):  # what is beyond float64 is infinite, and nowhere allowed
-            return array.astype(np.float64)
+            return array if array.dtype in _FLOATS else array.astype(np.float64)
     raise ValueError(f"{what} must be real numbers, not {shown(value)}")
 
 
@@ -69,7 +68,8 @@ def reset_options(options: Any, *names: str) -> list[Any]:
     Raises:
         ValueError: options is no dict, or has other keys.
     """
-    options = {} if options is None else options
+    if options is None:
+        return [None] * len(names)
     if not isinstance(options, dict):
         raise ValueError(f"options must be a dict with {' and '.join(map(repr, names))}, not {shown(options)}")
     unknown = sorted(set(options) - set(names), key=repr)

@@ -29,6 +29,8 @@ from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.viewer import PageScene
 
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
+_NO_GRIP = (0.0, 0.0, 0.0, 0.0)
+_FLOAT32 = np.dtype(np.float32)
 
 
 _Kind = TypeVar("_Kind", bound=type)
@@ -75,27 +77,6 @@ class EnvState(NamedTuple):
     """Of the randomized robot and actuator; None where nothing varies."""
     memory: tuple[float, ...] = ()
     """What the simulator remembers besides the state; see `Simulator.memory`."""
-
-
-class Step(NamedTuple):
-    """What one control step did, as plain numbers."""
-
-    terminated: bool
-    truncated: bool
-    reward: tuple[float, float, float]
-    """Its parts, named in `REWARD_PARTS`."""
-    cost: float
-    force: tuple[float, float]
-    success: bool
-    violated: int
-    """Index in `limit_names`, or −1."""
-    clipped: bool
-    grip: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    """The floor's force on the ball, N, and the friction that it needs, of robots whose friction is limited."""
-    tilt: float | None = None
-    """rad, if it is known already."""
-    arrays: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-    """(no) float32 observation without noise, (8,) state after the step and (2,) force, if they are known already."""
 
 
 @fixed("task", "params", "randomization", "physics", "render_mode", "action_space", "observation_space")
@@ -200,7 +181,9 @@ class BallbotEnv(gymnasium.Env):
         self._resets = 0
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
-        self._steps = self.task.steps
+        # read in every step
+        self._steps, self._survive = self.task.steps, self.task.survival_reward * self.task.control_dt
+        self._grips, self._force_limit, self._human = self.params.grips, self.params.force_limit, render_mode == "human"
         self._steps_left = self._taken = 0
         self._closed = False
 
@@ -222,7 +205,7 @@ class BallbotEnv(gymnasium.Env):
         x, c = self._draw(options)
         self._resets += 1
         self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
-        start = self._start(x, c)
+        judge, tilt = self._start(x, c)
         self._set_constants(c)
         self._state = x
         if self._disturbance is not None:
@@ -231,9 +214,9 @@ class BallbotEnv(gymnasium.Env):
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
         self._steps_left, self._taken = self._steps, 0
-        if self.render_mode == "human":
+        if self._human:
             self.render()
-        return self._observation(start), self._info(start)
+        return self._shown(judge, tilt)
 
     def step(self, action: Sequence[float] | np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds a force for one control step.
@@ -251,12 +234,34 @@ class BallbotEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended; call reset()" if self._state else "step() before reset()"
             )
-        step = self._advance(*self._force(action))
-        if self.render_mode == "human":
+        force, clipped = self._force(action)
+        total = force
+        if self._disturbance is not None:
+            force = self._disturbance.actuate(force)
+            total = self._disturbance.pushed(force, self.np_random)
+        before = self._state
+        self._state = x = self._simulator.step(total)
+        self._steps_left -= 1
+        grip, kept = _NO_GRIP, 0.0
+        if self._grips:
+            grip, lost = self._grip(before, total)
+            kept = -1.0 if lost else 0.0
+        self._taken = steps = self._steps - self._steps_left
+        judge = self._judge
+        judged = None if judge is None else judge.judge(before, force, x, steps, kept)
+        if judged is None:
+            did = outcome(self.task, before, force, x, self._constants, steps, (kept,))
+            judge, judged = None, (*did, dynamics.tilt(x))
+        cost, running, goal, terminated, truncated, success, _, violated, tilt = judged
+        if terminated > 0:
+            self._steps_left = 0
+        if self._human:
             self.render()
-        survive, running, goal = step.reward
-        reward = survive + running + goal
-        return self._observation(step), reward, step.terminated, step.truncated, self._info(step)
+        survive, running = self._survive, -running
+        seen, info = self._shown(
+            judge, tilt, cost, survive, running, goal, success > 0, int(violated), force, clipped, grip
+        )
+        return seen, survive + running + goal, terminated > 0, truncated > 0, info
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -407,31 +412,6 @@ class BallbotEnv(gymnasium.Env):
             self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state, memory)
 
-    def _advance(self, force: tuple[float, float], clipped: bool) -> Step:
-        """Holds a force, N, for one control step."""
-        task, c, total = self.task, self._constants, force
-        if self._disturbance is not None:
-            force = self._disturbance.actuate(force)
-            total = self._disturbance.pushed(force, self.np_random)
-        before = self._state
-        self._state = x = self._simulator.step(total)
-        self._steps_left -= 1
-        grip, kept = _START.grip, 0.0
-        if self.params.grips:
-            grip, lost = self._grip(before, total)
-            kept = -1.0 if lost else 0.0
-        self._taken = steps = self._steps - self._steps_left
-        judged = None if self._judge is None else self._judge.judge(before, force, x, steps, kept)
-        if judged is None:
-            judged = outcome(task, before, force, x, c, steps, (kept,)), None, None
-        did, tilt, arrays = judged
-        terminated, truncated, success = did.terminated > 0, did.truncated > 0, did.success > 0
-        if terminated:
-            self._steps_left = 0
-        reward = (task.survival_reward * task.control_dt, -did.running, did.goal)
-        violated = int(did.violated)
-        return Step(terminated, truncated, reward, did.cost, force, success, violated, clipped, grip, tilt, arrays)
-
     def _grip(self, x: State, total: tuple[float, float]) -> tuple[tuple[float, ...], bool]:
         """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
         simulated = self._simulator.floor_force()
@@ -442,13 +422,13 @@ class BallbotEnv(gymnasium.Env):
         needed = max(map(dynamics.needed_friction, asked))
         return (*asked[0], needed), not dynamics.keeps_grip(robot, asked)
 
-    def _start(self, x: State, c: State) -> Step:
-        """What `reset` reports of a start. Raises a ValueError if it is out of range."""
+    def _start(self, x: State, c: State) -> tuple[Judge | None, float]:
+        """Who judged a start, if machine code did, and its tilt, rad. Raises a ValueError if it is out of range."""
         if self._judge is not None:
             self._judge.set_constants(c)
-            judged = self._judge.judge(x, _START.force, x, 0, 0.0)
-            if judged is not None and judged[0].violated < 0:
-                return _START._replace(tilt=judged[1], arrays=judged[2])
+            judged = self._judge.judge(x, (0.0, 0.0), x, 0, 0.0)
+            if judged is not None and judged[7] < 0:
+                return self._judge, judged[8]
             if self._state:  # its episode goes on where this one cannot start
                 self._judge.set_constants(self._constants)
         task = self.task
@@ -463,7 +443,7 @@ class BallbotEnv(gymnasium.Env):
                 f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
                 f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
             )
-        return _START
+        return None, dynamics.tilt(x)
 
     def _draw(self, options: dict[str, Any] | None) -> tuple[State, State]:
         """Initial state and constants. Those that the options do not give are drawn."""
@@ -487,11 +467,9 @@ class BallbotEnv(gymnasium.Env):
         return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
-        return self._clipped(*real_array(action, "action", (2,)).tolist())
-
-    def _clipped(self, ax: float, ay: float) -> tuple[tuple[float, float], bool]:
         """The force, N, of an action, and whether it was clipped."""
-        limit = self.params.force_limit
+        ax, ay = real_array(action, "action", (2,)).tolist()
+        limit = self._force_limit
         if -1.0 <= ax <= 1.0 and -1.0 <= ay <= 1.0:
             return (limit * ax, limit * ay), False
         if not (math.isfinite(ax) and math.isfinite(ay)):
@@ -505,40 +483,46 @@ class BallbotEnv(gymnasium.Env):
             x = self._disturbance.sensed(x, self.np_random)
         return self.task.observe(x, self.task.at(self._constants, self._taken * self.task.control_dt))
 
-    def _observation(self, step: Step) -> np.ndarray:
-        if step.arrays is None or self._noisy:
-            return np.array(self._observed(), np.float32)
-        return step.arrays[0]
-
-    def _info(self, step: Step) -> dict[str, Any]:
-        survive, running, goal = step.reward
-        state, force = (np.array(self._state), np.array(step.force)) if step.arrays is None else step.arrays[1:]
+    def _shown(
+        self,
+        judge: Judge | None,
+        tilt: float,
+        cost: float = 0.0,
+        survive: float = 0.0,
+        running: float = 0.0,
+        goal: float = 0.0,
+        success: bool = False,
+        violated: int = -1,
+        force: tuple[float, float] = (0.0, 0.0),
+        clipped: bool = False,
+        grip: tuple[float, ...] = _NO_GRIP,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Observation and `info` of a step that a judge judged last, or of one that Python judged; by default of a start."""
+        seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
+        failure = violated >= 0
         info = {
-            "state": state,
-            "cost": step.cost,
+            "state": np.array(self._state) if judge is None else judge.x.copy(),
+            "cost": cost,
             "reward_survive": survive,
             "reward_cost": running,
             "reward_goal": goal,
-            "tilt": dynamics.tilt(self._state) if step.tilt is None else step.tilt,
-            "success": step.success,
-            "is_success": step.success,
-            "failure": step.violated >= 0,
-            "violated": step.violated,
-            "constraint_cost": float(step.violated >= 0),
-            "force": force,
-            "clipped": step.clipped,
+            "tilt": tilt,
+            "success": success,
+            "is_success": success,
+            "failure": failure,
+            "violated": violated,
+            "constraint_cost": 1.0 if failure else 0.0,
+            "force": np.array(force) if judge is None else judge.force.copy(),
+            "clipped": clipped,
             "constants": self._constants_array.copy(),
         }
-        if self.params.grips:
-            info["grip"] = np.array(step.grip)
-        return info
+        if self._grips:
+            info["grip"] = np.array(grip)
+        return seen, info
 
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 """Keys of `info` whose values add up to the reward."""
-
-_START = Step(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, -1, False)
-"""What `reset` reports."""
 
 GRIP = "grip"
 """The limit that a robot violates that loses its grip."""

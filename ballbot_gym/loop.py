@@ -15,13 +15,10 @@ from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BatchState, BatchStep, seeds_of
 from ballbot_gym.checks import check_num_envs
 from ballbot_gym.engines import State
-from ballbot_gym.env import BallbotEnv, Step, fixed
+from ballbot_gym.env import BallbotEnv, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import DisturbanceState, Randomization
 from ballbot_gym.tasks import Task
-
-_NOTHING = Step(False, False, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0), False, -1, False)
-"""The outcome of a step that only starts an episode."""
 
 _NOMINAL = (1.0, 1.0, 1.0, 1.0, 1.0, 0.0)
 """What `Randomization.draw` draws where neither robot nor actuator varies."""
@@ -106,7 +103,7 @@ class BallbotLoop:
     def observe(self, state: BatchState) -> np.ndarray:
         """(B, no) observations of a state, which becomes that of the loop."""
         self.state = state
-        return np.array([single.seen() for single in self._singles], np.float32)
+        return np.array([single._observed() for single in self._singles], np.float32)
 
     def tilt(self, state: BatchState) -> np.ndarray:
         """(B,) rad, of a state."""
@@ -119,51 +116,46 @@ class BallbotLoop:
         """
         if not self._started:
             raise gymnasium.error.ResetNeeded("step() before reset()")
-        outcomes: list[Step] = []
+        told: list[Any] = []
         final_x: list[State] = []
-        final_seen: list[tuple] = []
-        begun: list[_Single] = []
-        for i, (single, action) in enumerate(zip(self._singles, actions.tolist(), strict=True)):
+        begun: list[int] = []
+        for i, (single, action) in enumerate(zip(self._singles, actions, strict=True)):
             if waiting is not None and waiting[i]:
                 single.begin_next()
-                begun.append(single)
-                outcome = _NOTHING
+                begun.append(i)
+                seen, info = single._shown(None, dynamics.tilt(single._state))
+                step = seen, 0.0, False, False, info
             else:
-                outcome = single.advance(action)
-            outcomes.append(outcome)
+                step = single.step(action)
+            told.append(step)
             final_x.append(single._state)
-            final_seen.append(single.seen())
-            if restart and (outcome.terminated or outcome.truncated):
+            if restart and (step[2] or step[3]):
                 single.begin_next()
-                begun.append(single)
+                begun.append(i)
+        ended = [step[2] or step[3] for step in told]
+        final_observation = np.array([step[0] for step in told])
         final_states = np.array(final_x, self.dtype).T
-        final_observation = np.array(final_seen, np.float32)
-        final_tilt = np.array([dynamics.tilt(x) for x in final_x], self.dtype)
-        if not begun and self._shown is not None:
-            self._shown = final_states, self._shown[1]
-        else:
-            self._shown = None
+        names = ("cost", "success", "failure", "violated", "clipped")
+        info = {name: np.array([step[4][name] for step in told]) for name in (*names, "force", "tilt")}
+        final_tilt = info["tilt"].astype(self.dtype)
+        self._shown = None if begun or self._shown is None else (final_states, self._shown[1])
         observation, tilt = final_observation, final_tilt
         if restart and begun:
-            observation = np.array([single.seen() for single in self._singles], np.float32)
-            tilt = np.array([dynamics.tilt(single._state) for single in self._singles], self.dtype)
-        terminated, truncated, reward, cost, force, success, violated, clipped, grip, *_ = zip(*outcomes, strict=True)
-        fields: Any = {
+            observation, tilt = observation.copy(), tilt.copy()
+            for i in begun:
+                observation[i], tilt[i] = self._singles[i]._observed(), dynamics.tilt(self._singles[i]._state)
+        grips = self.params.grips
+        fields: Any = {name: info[name] for name in names} | {
             "observation": observation,
-            "reward": np.array([sum(parts) for parts in reward]),
-            "cost": np.array(cost),
-            "terminated": np.array(terminated),
-            "truncated": np.array(truncated),
-            "final_observation": final_observation[np.logical_or(terminated, truncated)],
+            "reward": np.array([step[1] for step in told]),
+            "terminated": np.array([step[2] for step in told]),
+            "truncated": np.array([step[3] for step in told]),
+            "final_observation": final_observation[ended],
             "final_x": final_states,
-            "success": np.array(success),
-            "failure": np.array(violated) >= 0,
-            "violated": np.array(violated),
-            "force": np.array(force, self.dtype).T,
-            "clipped": np.array(clipped),
+            "force": info["force"].astype(self.dtype).T,
             "final_tilt": final_tilt,
             "tilt": tilt,
-            "grip": np.array(grip, self.dtype).T if self.params.grips else np.zeros((0, self.num_envs), self.dtype),
+            "grip": np.array([step[4]["grip"] if grips else () for step in told], self.dtype).T,
         }
         return BatchStep(**fields)
 
@@ -185,7 +177,7 @@ class _Single(BallbotEnv):
 
     def __init__(self, task: Task, params: BallbotParams | None, randomization: Randomization | None):
         super().__init__(task, "rk4", params=params, randomization=randomization)
-        self.seed, self.episode, self.taken = 0, 0, 0
+        self.seed, self.episode = 0, 0
         self._rng: Any = _Counter()
         self._np_random = self._rng
 
@@ -210,14 +202,14 @@ class _Single(BallbotEnv):
             drawn, force, past = self._disturbance.get_state()
             pairs = (force, *past) if noise.varies_actuator else ()
             actuator = tuple(part for pair in pairs for part in pair)
-        return self._state, self._constants, self.taken, self.episode, self.seed, drawn, actuator
+        return self._state, self._constants, self._taken, self.episode, self.seed, drawn, actuator
 
     def remember(self, x: Any, c: Any, taken: int, episode: int, seed: int, drawn: Any, actuator: Any) -> None:
         """Goes on from a `memory`."""
         self._use_code(start=episode > 0)
         self._set_constants(tuple(c))
         self._state = tuple(x)
-        self.taken, self.episode, self.seed = taken, episode, seed
+        self.episode, self.seed = episode, seed
         self._steps_left, self._taken = self.task.steps - taken, taken
         if self._disturbance is not None:
             pairs = tuple(zip(actuator[::2], actuator[1::2], strict=True))
@@ -231,19 +223,16 @@ class _Single(BallbotEnv):
         """Begins the next episode."""
         self.remember(*self.start(self.seed, self.episode + 1))
 
-    def advance(self, action: list[float]) -> Step:
-        """Holds an action for one control step. It is finite."""
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if self._disturbance is not None:
             self._rng.seek(self, 0)
-        outcome = self._advance(*self._clipped(*action))
-        self.taken += 1
-        return outcome
+        return super().step(action)
 
-    def seen(self) -> tuple[float, ...]:
+    def _observed(self) -> tuple[float, ...]:
         """(no) observation, whose noise depends on the number of steps taken in the episode."""
         if self._disturbance is not None:
             self._rng.seek(self, Randomization.PUSH_DRAWS)
-        return self._observed()
+        return super()._observed()
 
 
 class _Counter:
@@ -256,6 +245,6 @@ class _Counter:
     def random(self, count: int) -> np.ndarray:
         """(count,) numbers."""
         single = self._single
-        key = counter_rng.key(single.seed, single.episode, single.taken + 1)
+        key = counter_rng.key(single.seed, single.episode, single._taken + 1)
         self._at += count
         return np.array(counter_rng.floats(key, self._at)[-count:])

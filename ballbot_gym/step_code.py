@@ -14,6 +14,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ import numpy as np
 from ballbot_gym import dynamics, machine_code, traced
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import Outcome, outcome
+from ballbot_gym.tasks.transition import outcome
 
 _log = logging.getLogger(__name__)
 
@@ -31,12 +32,11 @@ _ROBOT = ("moving_mass", "first_moment", "pivot_inertia", "axial_inertia", "grav
 
 _TRIALS = 64
 _YIELD = 1e-4  # s, at every reset until the code is there
-_MOVED = struct.Struct("9d")  # whether all is finite, and a state
-_HELD = struct.Struct("10d")  # a state and a force
-_JUDGED = struct.Struct("10d")  # whether all is finite, an outcome, and the tilt
+_HELD, _MOVED = struct.Struct("10d"), struct.Struct("8d")  # a state and a force, and the state after it
+_JUDGED = struct.Struct("9d")  # an outcome, and the tilt
 _STEP = struct.Struct(
     "20d"
-)  # a state, a force, the state after it, the number of steps, and whether the ball keeps its grip
+)  # states before and after, between them the force; the number of steps, and whether grip is kept
 
 State = tuple[float, ...]
 
@@ -50,21 +50,26 @@ class Code(NamedTuple):
 
 
 class _Work:
-    """A function's numbers in memory: of one simulator or one env."""
+    """A function's numbers in memory: of one simulator or one env.
 
-    def __init__(self, code: Code, in_place: bool = False):
+    `pack` writes the first arguments, `call` calls it, `unpack` reads the first results, and check[0] is 0 if all are finite.
+    """
+
+    def __init__(self, code: Code, given: struct.Struct, told: struct.Struct, in_place: bool = False):
         self.first = 1 if in_place else 1 + code.results  # of the arguments
-        self.bytes = bytearray(8 * (self.first + code.arguments))
-        self.numbers = np.frombuffer(self.bytes)
-        self.at = ctypes.c_void_p(self.numbers.ctypes.data)
+        memory = bytearray(8 * (self.first + code.arguments))
+        self.numbers, self.check = np.frombuffer(memory), memoryview(memory).cast("d")
+        self.pack, self.unpack = partial(given.pack_into, memory, 8 * self.first), partial(told.unpack_from, memory, 8)
+        self.call = partial(code.call, ctypes.c_void_p(self.numbers.ctypes.data))
 
 
 class Motion:
     """RK4 steps of the closed form."""
 
     def __init__(self, code: Code, params: BallbotParams, dt: float, substeps: int):
-        work = _Work(code, in_place=True)
-        self._call, self._bytes, self._at, self._numbers = code.call, work.bytes, work.at, work.numbers
+        work = _Work(code, _HELD, _MOVED, in_place=True)
+        self._pack, self._call, self._check, self._unpack = work.pack, work.call, work.check, work.unpack
+        self._numbers = work.numbers
         self._substeps = range(substeps)
         self._numbers[11] = dt / substeps
         self.set_params(params)
@@ -85,27 +90,24 @@ class Motion:
 
     def step(self, x: State, u: tuple[float, float]) -> State | None:
         """The state after the force u, N, was held; None where Python must compute it."""
-        _HELD.pack_into(self._bytes, 8, *x, *u)
+        self._pack(*x, *u)
         for _ in self._substeps:
-            self._call(self._at)
-        check, *end = _MOVED.unpack_from(self._bytes)
-        return tuple(end) if check == 0 else None
-
-
-Judgement = tuple[Outcome, float, tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""What a step did, the tilt after it, rad; and what is seen, float32, state and force as arrays."""
+            self._call()
+        return self._unpack() if self._check[0] == 0 else None
 
 
 class Judge:
-    """What a task says of control steps."""
+    """What a task says of control steps.
+
+    Of the step that was judged last, `seen` is the (no) observation without noise, `x` the (8,) state after it, and `force`
+    (2,) in N. They are overwritten by the next.
+    """
 
     def __init__(self, code: Code, task: Task):
-        work = _Work(code)
-        self._call, self._bytes, self._at, self._numbers = code.call, work.bytes, work.at, work.numbers
-        self._first = work.first
-        seen, first = len(task.observation_scale), work.first
-        self._seen = self._numbers[10 : 10 + seen]
-        self._force, self._x = self._numbers[first + 8 : first + 10], self._numbers[first + 10 : first + 18]
+        work = _Work(code, _STEP, _JUDGED)
+        self._pack, self._call, self._check, self._unpack = work.pack, work.call, work.check, work.unpack
+        self.seen = work.numbers[10 : 10 + len(task.observation_scale)]
+        _, self.force, self.x, _, self._constants = np.split(work.numbers[work.first :], (8, 10, 18, 20))
 
     @staticmethod
     def made(task: Task, start: bool) -> Code | None:
@@ -122,10 +124,12 @@ class Judge:
 
     def set_constants(self, c: State) -> None:
         """Makes c the constants of the episode."""
-        self._numbers[self._first + 20 :] = c
+        self._constants[:] = c
 
-    def judge(self, before: State, force: tuple[float, float], x: State, steps: int, kept: float) -> "Judgement | None":
-        """What a force, N, did that led from one state to the state x; None where Python must compute it.
+    def judge(self, before: State, force: tuple[float, float], x: State, steps: int, kept: float) -> State | None:
+        """(9,) what a force, N, did that led from one state to the state x: an `Outcome`, and the tilt at its end, rad.
+
+        None where Python must compute it.
 
         Args:
             before: (8,) state.
@@ -134,13 +138,9 @@ class Judge:
             steps: of the episode, this one included.
             kept: ≥ 0 if the ball keeps its grip.
         """
-        _STEP.pack_into(self._bytes, 8 * self._first, *before, *force, *x, steps, kept)
-        self._call(self._at)
-        check, *did, tilt = _JUDGED.unpack_from(self._bytes)
-        if check != 0:
-            return None
-        arrays = self._seen.astype(np.float32), self._x.copy(), self._force.copy()
-        return Outcome(*did), tilt, arrays
+        self._pack(*before, *force, *x, steps, kept)
+        self._call()
+        return self._unpack() if self._check[0] == 0 else None
 
 
 _codes: dict[Any, Code | None] = {}
@@ -192,13 +192,10 @@ def _checked(compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_pl
         given = rng.uniform(-1.5, 1.5, sum(counts))
         expected = compute(*(tuple(part.tolist()) for part in np.split(given, ends)))
         code = code._replace(results=len(expected))
-        work = _Work(code, in_place)
+        work = _Work(code, _MOVED, _MOVED, in_place)
         work.numbers[work.first : work.first + len(given)] = given
-        call(work.at)
-        if (
-            work.numbers[0] == 0
-            and work.numbers[1 : 1 + len(expected)].tobytes() != np.array(expected, float).tobytes()
-        ):
+        work.call()
+        if work.check[0] == 0 and work.numbers[1 : 1 + len(expected)].tobytes() != np.array(expected, float).tobytes():
             raise ArithmeticError("machine code computes other bits than Python")
     return code
 

@@ -22,15 +22,11 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from ballbot_gym import TASKS, BallbotEnv, files
-from ballbot_gym.engines import make_simulator
-from ballbot_gym.engines.bullet import BulletSimulator
-from ballbot_gym.engines.mujoco import MujocoSimulator, import_mujoco
-from ballbot_gym.params import default_params
+from ballbot_gym.engines.mujoco import import_mujoco
 
-_CONTROL_DT = 0.02  # s
-_EPISODE = 40  # control steps after which the raw loop resets, about as long as random forces leave the robot upright
-
-_TURNS, _TURN = 41, 1000  # turns in which raw loop and env are compared, and the steps of each
+_TURNS = 41  # in which raw loop and env are compared
+_GAIN = np.array([[0.3, 0, 1.3, 0, 0.7, 0, 1.3, 0], [0, 0.3, 0, 1.3, 0, 0.7, 0, 1.3]])
+_UPRIGHT = 1  # seed of a start from which this gain brings the robot to rest
 
 
 @dataclass
@@ -117,89 +113,84 @@ def _guarded(measure: Callable[..., Row], args: tuple, seconds: float) -> Row:
 
 
 def raw(physics: str, seconds: float) -> Row:
-    """What an engine itself needs for a control step: torques in, its steps of the default length, joint states out."""
-    return _timed(Row(f"raw loop, {physics}", "paper", 1), _RAW[physics](), seconds)
-
-
-def _raw_bullet() -> Callable[[], None]:
-    simulator = BulletSimulator(default_params(), _CONTROL_DT)
-    bullet, client = simulator._bullet, simulator._client
-    robot, joints = simulator._robot, simulator._joints
-
-    def step() -> None:
-        bullet.setJointMotorControlArray(
-            robot, joints[:2], bullet.TORQUE_CONTROL, forces=(10.0, -5.0), physicsClientId=client
-        )
-        bullet.stepSimulation(physicsClientId=client)
-        bullet.getJointStates(robot, joints, physicsClientId=client)
-
-    return _with_resets(simulator, step)
-
-
-def _raw_mujoco() -> Callable[[], None]:
-    mujoco, simulator = import_mujoco(), MujocoSimulator(default_params(), _CONTROL_DT)
-    model, data, substeps = simulator._model, simulator._data, simulator._substeps
-    positions, velocities, pushed = data.qpos, data.qvel, data.qfrc_applied
-
-    def step() -> None:
-        pushed[0], pushed[1] = 10.0, -5.0
-        mujoco.mj_step(model, data, substeps)
-        positions.tolist(), velocities.tolist()
-
-    return _with_resets(simulator, step)
-
-
-def _raw_rk4() -> Callable[[], None]:
-    simulator = make_simulator("rk4", default_params(), _CONTROL_DT)
-    simulator.use_code(start=True)
-    while simulator._motion is None:  # until machine code is made
-        simulator.use_code(start=False)
-    return _with_resets(simulator, lambda: simulator.step((10.0, -5.0)))
-
-
-_RAW = {"bullet": _raw_bullet, "mujoco": _raw_mujoco, "rk4": _raw_rk4}
-
-
-def _with_resets(simulator: Any, step: Callable[[], object]) -> Callable[[], None]:
-    """A step before which the robot is put back now and then."""
-    start = (0.0, 0.0, 0.3, 0.1, 1.0, 0.0, 0.0, 0.0)
-    count = 0
-
-    def reset_and_step() -> None:
-        nonlocal count
-        if count % _EPISODE == 0:
-            simulator.reset(start)
-        count += 1
-        step()
-
-    return reset_and_step
+    """What an engine itself needs for a control step: forces in, its steps of the default length, joint states out."""
+    loop, _, steps = _episode(physics)
+    return _timed(Row(f"raw loop, {physics}", "paper", 1), loop, seconds, steps)
 
 
 def single(physics: str, seconds: float) -> Row:
     """One BallbotEnv, and its share of its engine's raw speed, in turns with that loop."""
-    env = BallbotEnv("stabilize", physics=physics)
-    env.reset(seed=0)
-    actions = iter(_forever(np.random.default_rng(0).uniform(-1, 1, (1000, 2)).astype(np.float32)))
-
-    def step() -> None:
-        _, _, terminated, truncated, _ = env.step(next(actions))
-        if terminated or truncated:
-            env.reset()
-
-    _timed(Row("", "", 1), step, 1.0)  # meanwhile machine code is made, if it is not in the cache
-    row = _timed(Row(f"BallbotEnv, {physics}", env.task.id, 1), step, seconds)
-    loop = _RAW[physics]()
-    shares = [_seconds(loop, _TURN) / _seconds(step, _TURN) for _ in range(_TURNS)]
-    row.note = f"{np.median(shares):.1%} of the raw loop, median of {_TURNS} turns"
+    loop, episode, steps = _episode(physics)
+    row = _timed(Row(f"BallbotEnv, {physics}", TASKS["stabilize"].id, 1), episode, seconds, steps)
+    shares = [_seconds(loop) / _seconds(episode) for _ in range(_TURNS)]
+    row.note = f"{np.median(shares):.1%} of the raw loop, median of {_TURNS} turns, of processor time"
     return row
 
 
-def _seconds(step: Callable[[], object], count: int) -> float:
-    """How long so many steps take."""
-    start = time.perf_counter()
-    for _ in range(count):
-        step()
-    return time.perf_counter() - start
+def _episode(physics: str) -> tuple[Callable[[], None], Callable[[], None], int]:
+    """The start and the forces of an episode in the engine alone, that episode in BallbotEnv, and its steps."""
+    env = BallbotEnv("stabilize", physics=physics)
+    actions: list[np.ndarray] = []
+
+    def episode() -> None:
+        env.reset(seed=_UPRIGHT)
+        for action in actions:
+            env.step(action)
+
+    seen, info = env.reset(seed=_UPRIGHT)
+    start, forces, ended = tuple(info["state"].tolist()), [], False
+    while not ended:
+        actions.append(np.clip(_GAIN @ seen, -1, 1).astype(np.float32))
+        seen, _, terminated, truncated, info = env.step(actions[-1])
+        forces.append(tuple(info["force"].tolist()))
+        ended = terminated or truncated
+    until = time.perf_counter() + 1.0
+    while time.perf_counter() < until:  # until machine code is made, if it is not in the cache
+        episode()
+    simulator: Any = env._simulator
+    step = _RAW[physics](simulator)
+
+    def loop() -> None:
+        simulator.reset(start)
+        for force in forces:
+            step(force)
+
+    return loop, episode, len(forces)
+
+
+def _raw_bullet(simulator: Any) -> Callable[[tuple[float, float]], object]:
+    bullet, client, robot, joints = simulator._bullet, simulator._client, simulator._robot, simulator._joints
+    hold, advance, states = bullet.setJointMotorControlArray, bullet.stepSimulation, bullet.getJointStates
+    moved, kind, zero = joints[:2], bullet.TORQUE_CONTROL, (0.0, 0.0)
+
+    def step(force: tuple[float, float]) -> object:
+        hold(robot, moved, kind, zero, zero, force, zero, zero, client)
+        advance(client)
+        return states(robot, joints, client)
+
+    return step
+
+
+def _raw_mujoco(simulator: Any) -> Callable[[tuple[float, float]], object]:
+    model, data, substeps, advance = simulator._model, simulator._data, simulator._substeps, import_mujoco().mj_step
+    positions, velocities, pushed = data.qpos, data.qvel, data.qfrc_applied
+
+    def step(force: tuple[float, float]) -> object:
+        pushed[0], pushed[1] = force
+        advance(model, data, substeps)
+        return positions.tolist(), velocities.tolist()
+
+    return step
+
+
+_RAW = {"bullet": _raw_bullet, "mujoco": _raw_mujoco, "rk4": lambda simulator: simulator.step}
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    """Time of the processor: what others do meanwhile does not count."""
+    start = time.process_time()
+    work()
+    return time.process_time() - start
 
 
 def batched(task: str, count: int, device: str, mode: str, soak: int = 0, *, seconds: float) -> Row:
@@ -253,18 +244,19 @@ def mujoco(name: str, count: int, seconds: float) -> Row:
     return _timed(Row("Gymnasium MuJoCo", name, count), step, seconds)
 
 
-def _timed(row: Row, step: Callable[[], object], seconds: float) -> Row:
+def _timed(row: Row, step: Callable[[], object], seconds: float, steps: int = 1) -> Row:
+    """The row with the speed of step, which takes so many control steps."""
     start = time.perf_counter()
     step()
     row.first_step_seconds = time.perf_counter() - start
     for _ in range(3):
         step()
-    steps, start = 0, time.perf_counter()
+    taken, start = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - start) < seconds:
         for _ in range(10):
             step()
-        steps += 10
-    row.steps_per_second = steps * row.batch / elapsed
+        taken += 10 * steps
+    row.steps_per_second = taken * row.batch / elapsed
     return row
 
 

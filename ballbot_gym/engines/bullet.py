@@ -104,12 +104,11 @@ class BulletContactSimulator(BulletSimulator):
 
     def step(self, u: tuple[float, float]) -> State:
         bullet, client, robot, radius = self._bullet, self._client, self._robot, self._params.ball_radius
-        torque = (-radius * u[1], radius * u[0], 0.0)
-        bullet.applyExternalTorque(robot, self._ball, torque, bullet.WORLD_FRAME, physicsClientId=client)
-        opposite = (-torque[0], -torque[1], 0.0)
-        bullet.applyExternalTorque(robot, self._joints[3], opposite, bullet.WORLD_FRAME, physicsClientId=client)
-        bullet.stepSimulation(physicsClientId=client)
-        a, b, c, d = bullet.getJointStates(robot, self._joints, physicsClientId=client)
+        tx, ty = -radius * u[1], radius * u[0]
+        bullet.applyExternalTorque(robot, self._ball, (tx, ty, 0.0), bullet.WORLD_FRAME, client)
+        bullet.applyExternalTorque(robot, self._joints[3], (-tx, -ty, 0.0), bullet.WORLD_FRAME, client)
+        bullet.stepSimulation(client)
+        a, b, c, d = bullet.getJointStates(robot, self._joints, client)
         return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1])
 
     def floor_force(self) -> tuple[float, float, float]:

@@ -41,6 +41,7 @@ class MujocoSimulator(Simulator):
         self._substeps = whole_substeps(control_dt, physics_dt)
         self._dt = physics_dt
         self._mujoco = import_mujoco()
+        self._mj_step = self._mujoco.mj_step
         self._make(params)
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
@@ -56,11 +57,9 @@ class MujocoSimulator(Simulator):
         self._make(params)
 
     def step(self, u: tuple[float, float]) -> State:
-        self._push(u)
-        self._advance()
-        x, y, gamma, theta = self._places
-        p, v = self._positions.tolist(), self._velocities.tolist()
-        return p[x], p[y], p[gamma], p[theta], v[x], v[y], v[gamma], v[theta]
+        self._pushed[0], self._pushed[1] = u  # a third of the time that a slice takes
+        self._mj_step(self._model, self._data, self._substeps)
+        return (*self._positions.tolist(), *self._velocities.tolist())
 
     def close(self) -> None:
         pass
@@ -100,13 +99,6 @@ class MujocoSimulator(Simulator):
         )
         for axis, name in _LEANS:
             body.add_joint(name=name, type=self._mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
-
-    def _push(self, u: tuple[float, float]) -> None:
-        """Makes force u act until the next one does."""
-        self._pushed[0], self._pushed[1] = u  # a third of the time that a slice takes
-
-    def _advance(self) -> None:
-        self._mujoco.mj_step(self._model, self._data, self._substeps)
 
     @property
     def _kept(self) -> int:
@@ -178,23 +170,24 @@ class MujocoContactSimulator(MujocoSimulator):
             solimp=(0.9999, 0.9999, 0.0001, 0.5, 2),
         )
 
-    def _advance(self) -> None:
-        """Takes the steps one by one.
+    def step(self, u: tuple[float, float]) -> State:
+        """Takes MuJoCo's steps one by one.
 
         MuJoCo's friction wants to stop a slip within solreffriction, and its convex cone lifts the ball off the floor where
         friction is too weak for that. So friction is given the time that it needs under the robot's weight.
         """
-        robot, least, softness = self._params, 2 * self._dt, self._model.pair_solreffriction[0]
+        robot, least, softness, twisted = self._params, 2 * self._dt, self._model.pair_solreffriction[0], self._twisted
+        radius = robot.ball_radius
+        twisted[_BALL, 3], twisted[_BALL, 4] = -radius * u[1], radius * u[0]
+        twisted[_BODY, 3], twisted[_BODY, 4] = radius * u[1], -radius * u[0]
         strength = min(robot.friction, MOST_FRICTION) * robot.weight * robot.ball_radius**2 / robot.ball_inertia
         softness[1] = 1
         for _ in range(self._substeps):
             softness[0] = max(least, 2 * math.hypot(*self.slip()) / strength)
-            self._mujoco.mj_step(self._model, self._data)
-
-    def _push(self, u: tuple[float, float]) -> None:
-        radius, twisted = self._params.ball_radius, self._twisted
-        twisted[_BALL, 3], twisted[_BALL, 4] = -radius * u[1], radius * u[0]
-        twisted[_BODY, 3], twisted[_BODY, 4] = radius * u[1], -radius * u[0]
+            self._mj_step(self._model, self._data)
+        x, y, _, gamma, theta, *_ = self._positions.tolist()
+        vx, vy, _, dgamma, dtheta, *_ = self._velocities.tolist()
+        return x, y, gamma, theta, vx, vy, dgamma, dtheta
 
 
 def has_mujoco() -> bool:
