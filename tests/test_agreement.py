@@ -3,6 +3,8 @@
 import csv
 import functools
 import math
+import re
+import sys
 
 import pytest
 
@@ -58,3 +60,14 @@ def test_transfer_over_engines_writes_where_they_disagree_and_a_film(tmp_path, m
     assert (tmp_path / "differs-stabilize-lqr.webp").stat().st_size > 1000
     with pytest.raises(ValueError, match="a physics is given more than once: rk4 rk4"):
         transfer(robot="rolling", physics=("rk4", "rk4"), out=tmp_path, **about)
+
+
+@pytest.mark.parametrize(
+    ("physics", "library", "how"),
+    [("bullet", "pybullet", "pip install pybullet"), ("mujoco", "mujoco", "ballbot-gym[mujoco]")],
+)
+def test_an_engine_that_is_not_installed_is_noticed_before_any_episode(tmp_path, monkeypatch, physics, library, how):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=re.escape(how)):
+        transfer(physics=("rk4", physics), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

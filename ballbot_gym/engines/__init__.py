@@ -4,14 +4,23 @@ import warnings
 from collections.abc import Callable
 
 from ballbot_gym.engines.bullet import BulletContactSimulator, BulletSimulator
-from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, has_pybullet
+from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, has_pybullet, import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.engines.mujoco import MujocoContactSimulator, MujocoSimulator, has_mujoco
+from ballbot_gym.engines.mujoco import MujocoContactSimulator, MujocoSimulator, has_mujoco, import_mujoco
 from ballbot_gym.engines.simulator import Simulator, State
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
 
-__all__ = ["PHYSICS", "PHYSICS_NAMES", "Simulator", "State", "default_physics", "installed_physics", "make_simulator"]
+__all__ = [
+    "PHYSICS",
+    "PHYSICS_NAMES",
+    "Simulator",
+    "State",
+    "check_installed",
+    "default_physics",
+    "installed_physics",
+    "make_simulator",
+]
 
 PHYSICS: dict[str, tuple[Callable[..., Simulator], Callable[..., Simulator]]] = {
     "bullet": (BulletSimulator, BulletContactSimulator),
@@ -33,6 +42,14 @@ def installed_physics() -> list[str]:
     """The physics that this machine can run, in the order of `PHYSICS`."""
     there = {"bullet": has_pybullet(), "mujoco": has_mujoco(), "rk4": True}
     return [name for name in PHYSICS if there[name]]
+
+
+def check_installed(physics: str) -> None:
+    """Raises an ImportError that says how to get a physics that this machine cannot run."""
+    if physics == "bullet":
+        import_pybullet()
+    elif physics == "mujoco":
+        import_mujoco()
 
 
 def default_physics() -> str:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any, Literal, cast
 
-from ballbot_gym.engines import default_physics
+from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.lazy import missing
 
 try:
@@ -85,8 +85,13 @@ class LineProgress(Progress):
 
 
 def physics_or_default(physics: Physics | None) -> Physics:
-    """The physics that was typed; else the default where nothing is typed, with a line if it needs one."""
+    """The physics that was typed; else the default where nothing is typed, with a line if it needs one.
+
+    Raises:
+        ImportError: it is not installed; the message says how to get it.
+    """
     if physics is not None:
+        check_installed(physics)
         return physics
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -69,7 +69,7 @@ def transfer(
     chosen = matrix.controllers_of(tasks, controllers, made_for)
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
-    engines = list(physics) or [physics_or_default(None)]
+    engines = [physics_or_default(one) for one in physics or (None,)]
     episodes = checked_episodes(episodes, quick, few=3)
     settings = {
         "controllers": chosen,
