@@ -46,7 +46,7 @@ def drawing(playground: Playground) -> Drawing:
 
 def color(runner: Runner, i: int) -> str:
     """The colour of the `i`-th robot."""
-    return "#2e8b57" if runner.name in DRIVERS else labels.color(Path(runner.name).stem, i)
+    return labels.YOU if runner.name in DRIVERS else labels.color(Path(runner.name).stem, i)
 
 
 def colors(playground: Playground) -> dict[str, str]:
