@@ -24,7 +24,7 @@ from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_p
 from ballbot_train.policy_files import BEST, SHIPPED, shipped_policies
 from ballbot_train.report import playground
 from ballbot_train.report.javascript import javascript_function
-from ballbot_train.report.playground import SCENARIOS, engine_script, pushed, write_playground
+from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
 
 CLOSE = 1e-6  # with policies in double precision on both sides; measured: 1e-12
 FLOAT32 = 2e-5  # with Python's policy in single precision; measured: 5e-6
@@ -308,7 +308,7 @@ def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(name, fields,
 
 def test_a_push_at_rest_is_that_of_the_push_sweep(params):
     x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
-    after = casadi.Function("after", [x, p], [pushed(params, x, p)])
+    after = casadi.Function("after", [x, p], [dynamics.pushed(params, x, p)])
     inertia = [[params.total_mass, params.first_moment], [params.first_moment, params.pivot_inertia]]
     speed, lean_rate = np.linalg.solve(inertia, [90.0, 90.0 * params.com_height])
     expected = [0, 0, 0, 0, 0.6 * speed, 0.8 * speed, 0.6 * lean_rate, 0.8 * lean_rate]
@@ -317,7 +317,7 @@ def test_a_push_at_rest_is_that_of_the_push_sweep(params):
 
 def test_a_push_brings_the_energy_of_its_impulse_times_the_mean_speed_of_the_pushed_point(params, rng):
     x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
-    after = casadi.Function("after", [x, p], [pushed(params, x, p)])
+    after = casadi.Function("after", [x, p], [dynamics.pushed(params, x, p)])
     before, impulse = rng.uniform(-0.7, 0.7, 8), np.array([30.0, -50.0])
     behind = np.array(after(before, impulse)).ravel()
 

@@ -58,7 +58,7 @@ SCENARIOS = (
         "Both robots stand still and get the same push of 90 N·s. LQR is right for small leans only, and falls. "
         "The learned policy leans 45°, brakes and comes back.",
         "stabilize",
-        push=(0.6, 90.0, 0.5),
+        push=(0.6, 90.0, 0.5),  # as `ballbot play` begins
     ),
     Scenario(
         "Throw",
@@ -90,18 +90,6 @@ SCENARIOS = (
     ),
 )
 """Every scenario of the page."""
-
-
-def pushed(params: BallbotParams, x: casadi.SX, impulse: casadi.SX) -> casadi.SX:
-    """The state just after a horizontal impulse (2,), N·s, on the body's centre of mass, of CasADi columns.
-
-    M Δq̇ = Jᵀ p, with the mass matrix M and the Jacobian J of the centre of mass's horizontal position.
-    """
-    gamma, theta = x[2], x[3]
-    centre = x[:2] + params.com_height * casadi.vertcat(casadi.sin(gamma) * casadi.cos(theta), casadi.sin(theta))
-    mass = casadi.hessian(dynamics.energy(params, x), x)[0][4:, 4:]
-    slope = casadi.jacobian(centre, x)[:, :4]
-    return x + casadi.vertcat(casadi.SX.zeros(4), casadi.solve(mass, slope.T @ impulse))
 
 
 def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
@@ -142,6 +130,7 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
         "force_scale": drawing.FORCE_SCALE,
         "least_force": drawing.LEAST_FORCE,
+        "push_scale": drawing.PUSH_SCALE,
         "ghost_opacity": drawing.GHOST_OPACITY,
         "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr", 0)},
         "policies": _policies(policies),
@@ -253,7 +242,7 @@ def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> st
     substeps = dynamics.substeps_for(dt)
     parts = [
         javascript_function("step", lambda x, u: dynamics.step(params, x, u, dt, substeps), {"x": 8, "u": 2}),
-        javascript_function("push", functools.partial(pushed, params), {"x": 8, "impulse": 2}),
+        javascript_function("push", functools.partial(dynamics.pushed, params), {"x": 8, "impulse": 2}),
     ]
     models = []
     for name in TASKS:

@@ -5,7 +5,6 @@ const find = (selector) => document.querySelector(selector);
 const DEGREES = 180 / Math.PI;
 const SHOWN_SECONDS = 6; // of the tilts
 const PUSH_SHOWN = 0.5; // s of the episode, for which a push's arrow stays
-const METRES_PER_IMPULSE = 1 / 130; // of a push's arrow, m per N·s
 const STRONGEST = 250; // N·s
 const NEAR = 3.6; // m: the camera's distance from robots that are together
 const GRAB = 60; // px: how far from a robot's axis a drag still pushes it
@@ -259,7 +258,7 @@ class Playground {
       color: this.tint(this.looks[i].color),
       alpha: this.looks[i].alpha,
       u: this.everyone[i].ended ? null : this.everyone[i].force,
-      push: pull && i < 2 && !this.robots[i].ended ? pull.map((part) => part * METRES_PER_IMPULSE) : null,
+      push: pull && i < 2 && !this.robots[i].ended ? pull.map((part) => part * DATA.push_scale) : null,
     }));
     const paths = this.everyone.map((robot, i) => ({ points: robot.path, color: this.tint(this.looks[i].color), dashed: i > 0 }));
     this.scene.draw({ robots: [...robots].reverse(), paths: paths.reverse(), markers: this.scenario.markers });
@@ -523,7 +522,7 @@ class Playground {
     const from = this.drag.from ?? (this.drag.from = this.scene.unproject(this.drag.at, centre[2]));
     const to = this.scene.unproject(pixel, centre[2]);
     if (!from || !to) return this.drag.pull;
-    const impulse = [0, 1].map((i) => (to[i] - from[i]) / METRES_PER_IMPULSE);
+    const impulse = [0, 1].map((i) => (to[i] - from[i]) / DATA.push_scale);
     const size = Math.hypot(...impulse);
     if (size < 3) return null;
     const bounded = Math.min(size, STRONGEST);
