@@ -29,6 +29,7 @@ from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy_files import BEST, PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
 from ballbot_train.report.javascript import javascript_function
+from ballbot_train.report.page import scene_data
 
 LARGEST = 2_000_000
 """Bytes that the page may have."""
@@ -126,10 +127,7 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
         "reach": REACH,
-        "robot": {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")},
-        "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
-        "force_scale": drawing.FORCE_SCALE,
-        "least_force": drawing.LEAST_FORCE,
+        **scene_data(params),
         "push_scale": drawing.PUSH_SCALE,
         "ghost_opacity": drawing.GHOST_OPACITY,
         "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr", 0)},
