@@ -469,13 +469,15 @@ class Playground {
       return this.say(`This device does not tell how it is tilted: ${error.message}.`);
     }
     let level = null; // how it was held first
-    window.addEventListener("deviceorientation", ({ beta, gamma }) => {
+    window.removeEventListener("deviceorientation", this.tilted); // of an earlier press
+    this.tilted = ({ beta, gamma }) => {
       if (!Number.isFinite(beta) || !Number.isFinite(gamma) || this.drag) return;
       const turn = ((screen.orientation?.angle ?? 0) * Math.PI) / 180; // of the screen in the device
       level ??= [gamma, beta];
       const [x, y] = [(gamma - level[0]) / TILTED, (level[1] - beta) / TILTED];
       this.steer(x * Math.cos(turn) - y * Math.sin(turn), x * Math.sin(turn) + y * Math.cos(turn));
-    });
+    };
+    window.addEventListener("deviceorientation", this.tilted);
     this.say("Hold the device as is comfortable: this is the stick's centre. Tilt it to lean.");
   }
 
