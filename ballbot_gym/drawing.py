@@ -26,8 +26,8 @@ PUSH = "#1a9e5c"
 GHOST_OPACITY = 0.4
 FORCE_SCALE = 1 / 400
 """Length of the force's arrow, m/N."""
-LARGEST_PUSH_ARROW = 1.0
-"""m: longer arrows of pushes are cut."""
+PUSH_SCALE = 1 / 130
+"""Length of a push's arrow, m/(N·s)."""
 LEAST_FORCE = 2.0
 """N: smaller forces get no arrow."""
 _NEAR, _FAR = 3.0, 6.0  # m from the last robot: from where on another counts less, and from where on not at all
@@ -37,8 +37,8 @@ _NEAR, _FAR = 3.0, 6.0  # m from the last robot: from where on another counts le
 class Robot:
     """A ballbot: state x (8,), colour "#rrggbb", force u (2,), N, or None for no arrow, and opacity, less than 1 for ghosts.
 
-    `push` (2,), N, is a force from outside, drawn as an arrow at the body's top, or None. Each robot of a drawing has a name
-    of its own.
+    `push` (2,), N·s, is an impulse on the body's centre of mass, drawn as an arrow, or None. Each robot of a drawing has a
+    name of its own. `label` is what a live page writes above it.
     """
 
     x: np.ndarray
@@ -47,6 +47,7 @@ class Robot:
     alpha: float = 1.0
     name: str = "robot"
     push: np.ndarray | None = None
+    label: str = ""
 
 
 @dataclass(frozen=True)
@@ -133,9 +134,8 @@ def arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] 
 
 
 def push_arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:
-    """Start and end (3,), m, of the arrow of a push, which ends at the ball's centre; None where there is none."""
-    if robot.push is None or not (size := float(np.hypot(*robot.push))) > 0:
+    """Start and end (3,), m, of the arrow of a push at the body's centre of mass; None where there is none."""
+    if robot.push is None or not np.any(robot.push):
         return None
-    ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
-    length = min(FORCE_SCALE * size, LARGEST_PUSH_ARROW) / size
-    return ball - length * np.array([*robot.push, 0.0]), ball
+    body = pose(params, robot.x).body
+    return body, body + PUSH_SCALE * np.array([*robot.push, 0.0])

@@ -221,6 +221,26 @@ def step(params: BallbotParams, x: Vector, u: Vector, dt: Any, substeps: int = 2
     return ops.stack(parts, like=x)
 
 
+def pushed(params: BallbotParams, x: Vector, impulse: Vector) -> Vector:
+    """The state (..., 8) just after a horizontal impulse (..., 2), N·s, on the body's centre of mass in state x (..., 8).
+
+    M Δq̇ = Jᵀ p, with the mass matrix M of `energy` and the Jacobian J of the centre of mass's horizontal position.
+    """
+    px, py = ops.components(impulse)
+    *place, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)
+    a, b, d = ops.cos(gamma) * ops.cos(theta), -ops.sin(gamma) * ops.sin(theta), ops.cos(theta)  # of n, as in `energy`
+    h, mass, inertia = params.first_moment, params.moving_mass, params.pivot_inertia
+    lean_inertia = inertia * d * d + params.axial_inertia * (1 - d * d)
+    # the ball's speeds eliminated, two equations for the lean rates are left
+    lever, coupling = params.com_height - h / mass, h * h / mass
+    gg, gt, tt = lean_inertia - coupling * a * a, -coupling * a * b, inertia - coupling * (b * b + d * d)
+    torque_g, torque_t = lever * a * px, lever * (b * px + d * py)
+    determinant = gg * tt - gt * gt
+    dg, dt = (tt * torque_g - gt * torque_t) / determinant, (gg * torque_t - gt * torque_g) / determinant
+    dvx, dvy = (px - h * (a * dg + b * dt)) / mass, (py - h * d * dt) / mass
+    return ops.stack((*place, gamma, theta, vx + dvx, vy + dvy, gamma_dot + dg, theta_dot + dt), like=x)
+
+
 def substeps_for(dt: float) -> int:
     """RK4 steps per control step of dt seconds."""
     return max(1, math.ceil(dt / RK4_STEP - 1e-9))

@@ -6,6 +6,7 @@ render_mode="human" shows itself here where no window can open.
 
 import contextlib
 import io
+import json
 import logging
 import math
 import socket
@@ -33,14 +34,29 @@ _SHADOW, _SHADOW_HEIGHT = 0.3, 0.003  # opacity, and m above the floor
 _MOST_SEGMENTS = 120  # of a path
 _DASH = 2  # a dashed line shows every second segment
 _FOLLOW = 0.15  # share of the distance by which the camera follows in each drawing
+_JUMP = 4.0  # m, of a distance that it follows at once
+_LABEL_HEIGHT = 0.16  # m, between the labels of robots that are in one place
 _GRAB_REACH = 3.0  # m, the farthest that a drag counts
 
 # viser's page connects again only where it has the focus: it asks for the focus whenever it has no connection. It also begins
 # another attempt every second. After some failures Chromium delays attempts by more than that, so that none lasts.
 # Here the page waits until the server answers, and then has viser begin one attempt, by a moment of focus.
+#
+# viser moves the camera by keys that drive the robot here. Its listener for that is the document's; the one for keys of
+# commands is an element's, which hears them before. And on a phone viser covers the scene with its controls until somebody
+# folds them.
 _CONNECT_AGAIN = """
 if (window.connectsAgain) return;
 window.connectsAgain = true;
+document.documentElement.addEventListener("keydown", (event) => {
+  if (/^(Key[WASDQE]|Arrow)/.test(event.code)) event.stopPropagation();
+});
+const narrow = "(max-width: 36em)";
+const folding = setInterval(() => {
+  const heads = [...document.querySelectorAll("div")].filter((e) => !e.children.length && e.textContent === LABEL);
+  if (heads.length || !matchMedia(narrow).matches) clearInterval(folding);
+  if (matchMedia(narrow).matches) heads.at(-1)?.click();
+}, 100);
 let focus = false, busy = false;
 async function connectAgain() {
   busy = true;
@@ -101,7 +117,8 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()), guard(self._gate, self._control):
             self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self.server.gui._websock_interface.queue_message(viser._messages.RunJavascriptMessage(source=_CONNECT_AGAIN))
+        script = f"const LABEL = {json.dumps(label)};{_CONNECT_AGAIN}"
+        self.server.gui._websock_interface.queue_message(viser._messages.RunJavascriptMessage(source=script))
         self.follow = follow
         self.on_grab: Grab | None = None
         self._host = host
@@ -153,6 +170,11 @@ class Viewer:
         """Moves the scene at once so that a point of the floor (2,), m, is in the middle."""
         self._shift = np.asarray(point, np.float64).copy()
 
+    def aim(self) -> None:
+        """Turns every browser's camera to where it was first."""
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = _EYE, _AIM
+
     def close(self) -> None:
         """Stops the server; may be called again."""
         with self._lock:
@@ -166,12 +188,15 @@ class Viewer:
 
     def _draw(self, drawing: Drawing) -> None:
         goal = drawing.robots[-1].x[:2] if self.follow and drawing.robots else np.zeros(2)
-        self._shift += _FOLLOW * (goal - self._shift)
+        self._shift += (_FOLLOW if np.hypot(*(goal - self._shift)) < _JUMP else 1.0) * (goal - self._shift)
         self._world.position = (-self._shift[0], -self._shift[1], 0.0)
         shown = {"markers"}
         self._draw_markers(drawing.markers)
-        for robot in drawing.robots:
-            shown |= self._draw_robot(drawing.params, robot, grab=robot is drawing.robots[-1])
+        for i, robot in enumerate(reversed(drawing.robots)):
+            shown |= self._draw_robot(drawing.params, robot, grab=i == 0)
+            if robot.label:
+                top = pose(drawing.params, robot.x).top + (0.0, 0.0, _LABEL_HEIGHT * (i + 1))
+                shown.add(self._draw_label(f"label {robot.name}", robot.label, top))
         for path in drawing.paths:
             shown.add(self._draw_path(path))
         for key in set(self._nodes) - shown:
@@ -234,6 +259,13 @@ class Viewer:
         node.visible = ends is not None
         if ends is not None:
             node.points = np.array([ends], np.float32)
+
+    def _draw_label(self, key: str, text: str, place: np.ndarray) -> str:
+        if key not in self._nodes:
+            self._nodes[key] = [self.server.scene.add_label(f"/world/{_node_name(key)}", text, anchor="bottom-center")]
+        (node,) = self._nodes[key]
+        node.text, node.position = text, place
+        return key
 
     def _draw_path(self, path: GroundPath) -> str:
         key = f"path {path.name}"

@@ -29,7 +29,7 @@ from ballbot_train.play.simulation import Playground
 
 _LEAST_FACTOR = 0.99
 _MOST_LATE = 0.001  # of the steps
-_PUSH_EVERY, _PUSH = 5.0, 8.0  # s, N·s
+_PUSH_EVERY, _PUSH = 5.0, 40.0  # s, N·s
 _MINUTE = 60.0  # s, between two looks at memory
 
 
@@ -104,6 +104,7 @@ def measure(
     playground = Playground(task, controller, ghosts, physics, episode=0, other_process=True)
     viewer = Viewer(port=0)
     page = PlayPage(playground, viewer, out)
+    page.visitors.add(-1)  # `watch` does not say where its camera is, so viser does not count it
     watcher = multiprocessing.get_context("spawn").Process(target=watch, args=(viewer.port,), daemon=True)
     watcher.start()
     playground.settle()

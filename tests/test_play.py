@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ballbot_baselines import CONTROLLERS, find_optimum
-from ballbot_gym import certified
+from ballbot_gym import certified, dynamics
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
@@ -24,7 +24,7 @@ from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.play.tunable import Tunable, weight_names
 from ballbot_train.play.world import PLANT, randomization
-from ballbot_train.policy_files import PolicyError
+from ballbot_train.policy_files import BEST, PolicyError
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
 
@@ -79,11 +79,36 @@ def test_a_push_makes_the_robot_lean(play):
     playground = play()
     go(playground, 7.0)
     before = playground.main.samples[-1].tilt
-    playground.push(10.0, 0.0)
+    playground.push(30.0, 0.0)
     go(playground, 0.2)
     assert before < math.radians(0.5)
     assert max(sample.tilt for sample in list(playground.main.samples)[-10:]) > math.radians(5)
     assert views.drawing(playground).robots[-1].push is not None
+
+
+def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shipped_policy(play):
+    playground = play(controller=None, ghosts=["lqr"], episode="rest")
+    assert playground.main.name == BEST["stabilize"]
+    for _ in range(2):  # once more after a restart
+        go(playground, 0.9)
+        assert not any(playground.main.x)
+        go(playground, 2.5)
+        policy, lqr = playground.crew.runners
+        assert (policy.violated, lqr.violated) == ("", "tilt")
+        assert views.drawing(playground).robots[0].label == "LQR fell"
+        playground.restart()
+        playground.settle()
+
+
+@pytest.mark.parametrize("physics", ["rk4", "bullet"])
+def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
+    if physics == "bullet":
+        pytest.importorskip("pybullet")
+    playground = play(episode="rest", controller="you (force)", physics=physics)
+    playground.push(60.0, 30.0)
+    go(playground, 0.02)
+    expected = dynamics.step(params, dynamics.pushed(params, (0.0,) * 8, (60.0, 30.0)), (0.0, 0.0), 0.02)
+    assert playground.main.x == pytest.approx(expected, abs=2e-3)
 
 
 def test_ghosts_get_the_same_start_and_the_same_pushes(play):

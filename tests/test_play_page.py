@@ -136,7 +136,7 @@ def test_a_push_comes_from_the_sliders(opened, visitor):
     visitor.change("Direction, °", 90)
     visitor.change("Push")
     wait_for(lambda: opened.playground.shown_push is not None)
-    assert views.drawing(opened.playground).robots[-1].push == pytest.approx([0, 1000.0], abs=1e-9)  # N for 20 ms
+    assert views.drawing(opened.playground).robots[-1].push == pytest.approx([0, 20.0], abs=1e-9)
 
 
 def test_who_watches_changes_nothing_until_he_takes_over(opened, visitor):
@@ -160,7 +160,7 @@ def test_dragging_pushes_where_a_controller_acts_and_steers_where_a_human_drives
     for phase in ("start", "update", "end"):
         visitor.drag(phase, 0.5)
     wait_for(lambda: opened.playground.shown_push is not None)
-    assert opened.playground.shown_push == pytest.approx([5.0 / 0.02, 0.0])
+    assert opened.playground.shown_push == pytest.approx([65.0, 0.0])  # as far as its arrow reaches
     visitor.change("Controller", "you")
     wait_for(lambda: opened.playground.is_driven)
     opened.goes_on()  # the robot is drawn in another colour
@@ -180,6 +180,18 @@ def test_keys_and_held_buttons_steer_as_the_browser_looks(opened, visitor):
     visitor.send(type="GuiButtonHoldMessage", uuid=visitor.uuid("Back"), frequency=20.0)
     wait_for(lambda: opened.playground.stick.value != (0.0, 0.0))
     assert np.dot(opened.playground.stick.value, ahead / np.linalg.norm(ahead)) == pytest.approx(-1.0)
+
+
+def test_nothing_moves_while_nobody_is_there(opened):
+    with Visitor(opened.viewer.port):
+        opened.goes_on()
+    wait_for(lambda: not opened.page.visitors)
+    opened.do(lambda: None)
+    left = opened.playground.crew.steps
+    time.sleep(0.2)
+    assert opened.playground.crew.steps == left
+    with Visitor(opened.viewer.port):
+        opened.goes_on()
 
 
 def test_a_pause_holds_everything_and_a_step_moves_once(opened, visitor):
@@ -582,6 +594,32 @@ def severe(browser):
 
 
 @pytest.mark.slow
+def test_keys_drive_the_robot_and_not_the_camera_and_a_phones_panel_is_folded(opened, chromium):
+    from selenium.webdriver import ActionChains
+
+    browser = chromium()
+    browser.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride", {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    )
+    focus(browser, True)
+    browser.get(f"{opened.viewer.address}/?fixedDpr=0.1")
+    wait_for(lambda: opened.page.visitors, 60)
+    folded = "return [...document.querySelectorAll('[role=tab]')].every(tab => !tab.getBoundingClientRect().height)"
+    wait_for(lambda: browser.execute_script(folded), 60)
+    opened.do(lambda: opened.playground.set_controller("you"))
+    wait_for(lambda: opened.playground.is_driven)
+    (client,) = opened.viewer.server.get_clients().values()
+    before = np.array(client.camera.position)
+    for key in ("w", "\ue012"):  # and the arrow to the left
+        ActionChains(browser).key_down(key).perform()
+        wait_for(lambda: opened.playground.stick.value != (0.0, 0.0))
+        ActionChains(browser).pause(0.5).key_up(key).perform()
+        wait_for(lambda: opened.playground.stick.value == (0.0, 0.0))
+    np.testing.assert_allclose(client.camera.position, before, atol=1e-6)
+    assert severe(browser) == []
+
+
+@pytest.mark.slow
 def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromium, tmp_path):
     one, two = chromium(), chromium()
     port = opened.viewer.port
@@ -597,7 +635,7 @@ def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromiu
 
     # a push makes the robot lean
     push = "return [...document.querySelectorAll('button')].filter(b => b.innerText.trim() == 'Push')[0].click()"
-    opened.do(lambda: None)
+    opened.do(lambda: setattr(opened.page._controls, "_impulse", 20.0))  # which LQR survives
     two.execute_script(push)  # it watches: nothing happens
     time.sleep(1.0)
     before = max(sample.tilt for sample in list(opened.playground.main.samples)[-20:])

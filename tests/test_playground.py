@@ -1,5 +1,6 @@
-"""The playground without Python: it computes in node and in a browser what Python computes, and pushes harm nothing."""
+"""The playground without Python: it computes what Python computes, in node and a browser, and nothing from outside harms."""
 
+import base64
 import json
 import re
 import shutil
@@ -20,10 +21,10 @@ from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
-from ballbot_train.policy_files import SHIPPED, shipped_policies
+from ballbot_train.policy_files import BEST, SHIPPED, shipped_policies
 from ballbot_train.report import playground
 from ballbot_train.report.javascript import javascript_function
-from ballbot_train.report.playground import SCENARIOS, engine_script, pushed, write_playground
+from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
 
 CLOSE = 1e-6  # with policies in double precision on both sides; measured: 1e-12
 FLOAT32 = 2e-5  # with Python's policy in single precision; measured: 5e-6
@@ -71,7 +72,8 @@ def in_double(path, task, params):
 
 
 EPISODES = """
-answer(DATA.scenarios.map((scenario) => robotsOf(scenario).map((robot) => {
+const first = (scenario, i, all) => all.findIndex(({ title }) => title === scenario.title) === i;
+answer(DATA.scenarios.filter(first).map((scenario) => robotsOf(scenario).map((robot) => {
   const [xs, us] = [[robot.x], []];
   while (robot.steps < 400 && !robot.ended) { robot.advance(); xs.push(robot.x); us.push(robot.force); }
   return { xs, us, cost: robot.cost, ended: robot.ended };
@@ -83,7 +85,7 @@ def test_every_scenario_runs_as_in_python_over_an_episode(engine, tmp_path):
     found = run_in_node(engine + EPISODES, tmp_path)
     for scenario, (by_policy, by_lqr) in zip(SCENARIOS, found, strict=True):
         env = BallbotEnv(scenario.task, physics="rk4")
-        path = shipped_policies(env.task)[playground._LEARNERS[scenario.task]]
+        path = shipped_policies(env.task)[BEST[scenario.task]]
         single, double = make_controller(str(path), env.task, env.params), in_double(path, env.task, env.params)
         lqr = make_controller("lqr", env.task, env.params)
         for run, controller, close in ((by_policy, double, CLOSE), (by_policy, single, FLOAT32), (by_lqr, lqr, CLOSE)):
@@ -94,6 +96,160 @@ def test_every_scenario_runs_as_in_python_over_an_episode(engine, tmp_path):
             cost = sum(env.task.cost(tuple(a), tuple(b), c) * 0.02 for a, b in zip(x, u, strict=False))
             assert run["cost"] == pytest.approx(cost, abs=10 * close)
             assert (run["ended"] not in ("", "goal")) == episode.failure
+
+
+def test_the_optimum_drives_along_its_trajectory_and_costs_what_is_certified(engine, tmp_path):
+    script = """
+    answer(DATA.scenarios.filter((scenario) => scenario.best).map((scenario) => {
+      const optimum = new Optimum(scenario), costs = [];
+      for (; !optimum.ended; costs.push(optimum.cost)) optimum.advance();
+      return { task: scenario.task, episode: scenario.episode, x: optimum.x, costs };
+    }));
+    """
+    found = run_in_node(engine + script, tmp_path)
+    assert {task: sum(run["task"] == task for run in found) for task in TASKS} == dict.fromkeys(TASKS, 4)
+    for run in found:
+        episodes = certified.load(run["task"], "paper")
+        trajectory = episodes.trajectories[run["episode"]]
+        np.testing.assert_allclose(run["x"], trajectory.x[-1], rtol=1e-6, atol=1e-6)  # float32
+        assert len(run["costs"]) == len(trajectory.u)
+        assert run["costs"][-1] == pytest.approx(episodes.costs[run["episode"]], rel=1e-6)
+
+
+def test_who_leans_towards_the_goal_comes_to_rest_on_it(engine, tmp_path):
+    script = """
+    const driver = new Driver();
+    const thrown = DATA.scenarios.find(({ title }) => title === "Throw");
+    const [mine] = robotsOf(thrown, null, driver);
+    while (mine.steps < 400 && !mine.ended) {
+      driver.hold(...[0, 1].map((i) => -0.1 * mine.x[i] - 0.25 * mine.x[4 + i]));
+      mine.advance();
+    }
+    driver.hold(3, 4);
+    const bounded = driver.goal;
+    driver.hold(NaN, 1);
+    answer({ x: mine.x, ended: mine.ended, share: mine.cost / thrown.optimum, bounded, nothing: driver.goal });
+    """
+    found = run_in_node(engine + script, tmp_path)
+    assert found["ended"] == ""
+    assert np.abs(found["x"]).max() < 0.1  # it still creeps
+    assert 1 < found["share"] < 2
+    assert found["bounded"] == pytest.approx([0.6, 0.8])
+    assert found["nothing"] == [0, 0]
+
+
+HASHES = [
+    "",
+    "#",
+    "#turn-1",
+    "#turn-1-2",
+    "#turn-199-2.0",
+    "#dance-1-2.0",
+    "#turn-1-2.0<b>",
+    "#turn-1-NaN",
+    "#turn-01-2.0x",
+]
+
+
+def test_a_link_holds_task_episode_and_score_and_any_other_is_none(engine, tmp_path):
+    script = f"""
+    const scenario = DATA.scenarios.find(({{ task }}) => task === "turn");
+    answer([challengeText(scenario, 12.345), {json.dumps(HASHES)}.map(challengeOf), challengeOf("#turn-1-12.3")]);
+    """
+    text, others, challenge = run_in_node(engine + script, tmp_path)
+    assert text == "turn-1-12.3"
+    assert others == [None] * len(HASHES)
+    assert challenge["regret"] == 12.3
+
+
+# --- policies from ONNX files ---
+
+
+def network_file(path, activation, steps=("Gemm",)):
+    """An ONNX file as other tools write it: two layers, of Gemm, or of MatMul and Add."""
+    onnx = pytest.importorskip("onnx")
+    rng = np.random.default_rng(0)
+    nodes, weights, value = [], [], "o"
+    for layer, (rows, columns) in enumerate(((8, 16), (16, 2))):
+        numbers = {f"w{layer}": rng.normal(size=(rows, columns)), f"b{layer}": rng.normal(size=columns)}
+        weights += [onnx.numpy_helper.from_array(array.astype(np.float32), name) for name, array in numbers.items()]
+        for step in steps:
+            takes = {
+                "Gemm": [value, f"w{layer}", f"b{layer}"],
+                "MatMul": [value, f"w{layer}"],
+                "Add": [value, f"b{layer}"],
+            }
+            nodes.append(onnx.helper.make_node(step, takes[step], [f"{step}{layer}"]))
+            value = f"{step}{layer}"
+        kind = activation if layer == 0 else "Tanh"
+        nodes.append(onnx.helper.make_node(kind, [value], [f"a{layer}"]))
+        value = f"a{layer}"
+    row = [onnx.helper.make_tensor_value_info(name, 1, ["batch", size]) for name, size in (("o", 8), ("a1", 2))]
+    graph = onnx.helper.make_graph(nodes, "network", row[:1], row[1:], weights)
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 14)], ir_version=7)
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A shipped policy as `ballbot export` writes it."""
+    pytest.importorskip("onnxscript")
+    from ballbot_train.onnx_export import export_onnx
+
+    path = tmp_path_factory.mktemp("onnx") / "mine.onnx"
+    return export_onnx(SHIPPED / "stabilize-shac.json", path, make_task("stabilize"))
+
+
+def read_onnx(engine, tmp_path, files, use):
+    """What a JavaScript expression of `policy` gives for each file, or the error's message."""
+    texts = [base64.b64encode(content).decode() for content in files]
+    script = f"""
+    answer({json.dumps(texts)}.map((text) => {{
+      try {{
+        const policy = new OnnxPolicy(unpacked(text, Uint8Array));
+        return {use};
+      }} catch (error) {{ return error.message; }}
+    }}));
+    """
+    return run_in_node(engine + script, tmp_path)
+
+
+def test_policies_from_onnx_files_act_as_in_onnxruntime(engine, exported, tmp_path, rng):
+    runtime = pytest.importorskip("onnxruntime")
+    paths = [exported, *(network_file(tmp_path / f"{kind}.onnx", kind) for kind in ("Relu", "Elu", "Sigmoid"))]
+    paths += [network_file(tmp_path / "sums.onnx", "Tanh", ("MatMul", "Add"))]
+    observations = rng.normal(size=(5, 8)).astype(np.float32)
+    use = f"{json.dumps(observations.tolist())}.map((observation) => policy.run(observation))"
+    found = read_onnx(engine, tmp_path, [path.read_bytes() for path in paths], use)
+    for path, actions in zip(paths, found, strict=True):
+        session = runtime.InferenceSession(str(path))
+        (expected,) = session.run(None, {session.get_inputs()[0].name: observations})
+        np.testing.assert_allclose(actions, expected, atol=1e-5, err_msg=path.name)  # float32
+
+
+def test_an_onnx_file_that_the_page_cannot_run_is_refused_with_the_reason(engine, tmp_path):
+    good = network_file(tmp_path / "good.onnx", "Relu").read_bytes()
+    changed = [good.replace(b"Relu", name) for name in (b"Sqrt", b"<i>!")] + [good.replace(b"w1", b"w9", 1)]
+    found = read_onnx(engine, tmp_path, [b"", b"\xff" * 50, b"GIF89a", *changed], "policy.task")
+    assert all("ONNX file" in message for message in found[:3])
+    assert found[3].startswith("it needs Sqrt, and this page computes Gemm, MatMul, Add")
+    assert "it needs <i>!" in found[4]
+    assert "nothing before it gives" in found[5]
+
+
+def test_damaged_onnx_files_are_refused_or_act_with_two_numbers(engine, tmp_path, rng):
+    good = network_file(tmp_path / "good.onnx", "Relu").read_bytes()
+    damaged = [good[:size] for size in range(0, len(good), 7)]
+    for _ in range(300):
+        changed = bytearray(good)
+        for place in rng.integers(0, len(good), 3):
+            changed[place] = rng.integers(0, 256)
+        damaged.append(bytes(changed))
+    use = "policy.run(new Array(policy.observations).fill(1)).length"
+    found = read_onnx(engine, tmp_path, damaged, use)
+    assert all(answer == 2 or isinstance(answer, str) for answer in found)
+    assert not [answer for answer in found if isinstance(answer, str) and "undefined" in answer]
 
 
 def test_every_function_of_every_task_is_what_python_computes(engine, tmp_path, rng):
@@ -152,7 +308,7 @@ def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(name, fields,
 
 def test_a_push_at_rest_is_that_of_the_push_sweep(params):
     x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
-    after = casadi.Function("after", [x, p], [pushed(params, x, p)])
+    after = casadi.Function("after", [x, p], [dynamics.pushed(params, x, p)])
     inertia = [[params.total_mass, params.first_moment], [params.first_moment, params.pivot_inertia]]
     speed, lean_rate = np.linalg.solve(inertia, [90.0, 90.0 * params.com_height])
     expected = [0, 0, 0, 0, 0.6 * speed, 0.8 * speed, 0.6 * lean_rate, 0.8 * lean_rate]
@@ -161,7 +317,7 @@ def test_a_push_at_rest_is_that_of_the_push_sweep(params):
 
 def test_a_push_brings_the_energy_of_its_impulse_times_the_mean_speed_of_the_pushed_point(params, rng):
     x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
-    after = casadi.Function("after", [x, p], [pushed(params, x, p)])
+    after = casadi.Function("after", [x, p], [dynamics.pushed(params, x, p)])
     before, impulse = rng.uniform(-0.7, 0.7, 8), np.array([30.0, -50.0])
     behind = np.array(after(before, impulse)).ravel()
 
@@ -241,7 +397,7 @@ def test_in_the_browser_lqr_falls_from_the_first_push_and_the_policy_leans_and_c
     assert policy != lqr
     _, ended, cells = advance(opened, 200)
     assert ended == ["", "tilt"]
-    assert cells[0][0] == "SAC policy"
+    assert cells[0][0] == "SHAC policy"
     assert 40 < float(cells[0][2].rstrip("°")) < 50  # its largest tilt
     assert float(cells[0][1].rstrip("°")) < 5
     assert cells[1][5] == "fell"
@@ -249,9 +405,12 @@ def test_in_the_browser_lqr_falls_from_the_first_push_and_the_policy_leans_and_c
 
 def test_in_the_browser_an_episode_is_that_of_python_and_shows_its_regret(opened):
     opened.execute_script("playground.open(1); playground.setPlaying(false)")
-    (by_policy, _), _, cells = advance(opened, 400)
+    so_far = advance(opened, 50)[2]
+    assert re.fullmatch(r"[+−]\d+ % so far", so_far[0][5])
+    assert so_far[2][0] == "optimum"
+    (by_policy, _), _, cells = advance(opened, 350)
     env = BallbotEnv("stabilize", physics="rk4")
-    path = shipped_policies(env.task)["sac"]
+    path = shipped_policies(env.task)[BEST["stabilize"]]
     options = certified.load(env.task, "paper").options(SCENARIOS[1].episode)
     episode = rollout(env, in_double(path, env.task, env.params), options=options)
     np.testing.assert_allclose(by_policy, episode.trajectory.x[-1], atol=CLOSE)
@@ -330,7 +489,123 @@ def test_time_passes_by_itself_while_it_plays_and_stands_still_while_it_does_not
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("width", [420, 800])
+def drive(browser):
+    """Drives the open episode to its end, as somebody who looks where the goal is."""
+    browser.execute_script(
+        "const [mine] = playground.robots;"
+        "while (!playground.isOver(mine)) {"
+        "  playground.driver.hold(...[0, 1].map(i => -0.1 * mine.x[i] - 0.25 * mine.x[4 + i]));"
+        "  playground.advance();"
+        "} playground.draw(0.1)"
+    )
+
+
+def said(browser):
+    return browser.find_element("css selector", ".said").text
+
+
+def test_who_drives_an_episode_gets_a_regret_and_a_link_that_invites_others(opened):
+    opened.find_element("css selector", ".drive").click()  # from Push, which has no optimum, to Throw
+    opened.execute_script("playground.setPlaying(false)")
+    drive(opened)
+    regret = float(re.fullmatch(r"Your regret is ([\d.]+) %. The policy's: [\d.]+ %.", said(opened))[1])
+    assert regret > 0
+    opened.find_element("css selector", ".share").click()
+    link = opened.find_element("css selector", ".link").get_property("value")
+    assert link.endswith(f"#stabilize-7-{regret:.1f}")
+    opened.get("about:blank")
+    opened.get(link)
+    assert said(opened) == f"Somebody drove this episode with a regret of {regret:.1f} %. Press Play and beat it."
+    assert opened.execute_script("return playground.driver !== null && !playground.playing")
+
+
+def test_a_strangers_link_is_text_that_is_thrown_away(browser, page):
+    browser.get("about:blank")
+    browser.get(page.as_uri() + "#turn-1-2.0<img src=x onerror=document.title='x'>")
+    assert said(browser) == "This link names no episode of this page."
+    assert browser.execute_script("return document.querySelectorAll('img').length") == 0
+
+
+STEERED = """
+playground.open(1, true); playground.setPlaying(false); playground.draw(1);
+const view = document.querySelector(".view"), { driver, scene } = playground, found = [];
+view.setPointerCapture = () => {};
+const events = [
+  [new KeyboardEvent("keydown", { key: "ArrowRight" })], [new KeyboardEvent("keyup", { key: "ArrowRight" })],
+  [new KeyboardEvent("keydown", { key: "d" })], [new KeyboardEvent("keyup", { key: "d" })],
+  ["down", "move"].map((kind, i) => new PointerEvent(`pointer${kind}`, { clientX: 300 + 90 * i, clientY: 300 })),
+  [new PointerEvent("pointerup")],
+];
+for (const group of events) {
+  for (const event of group) view.dispatchEvent(event);
+  found.push([0, 1].reduce((sum, i) => sum + driver.goal[i] * scene.right[i], 0), Math.hypot(...driver.goal));
+}
+return found
+"""
+
+
+def test_keys_and_a_drag_hold_the_stick_as_long_as_they_are_held(opened):
+    assert opened.execute_script(STEERED) == pytest.approx([1, 1, 0, 0] * 3, abs=1e-6)
+
+
+TILTED = """
+playground.open(1, true); playground.setPlaying(false); playground.draw(1);
+const done = arguments[0];
+const tilt = (beta, gamma) => window.dispatchEvent(new DeviceOrientationEvent("deviceorientation", { beta, gamma }));
+playground.askForTilt().then(() => {
+  const { driver, scene } = playground, along = () => [0, 1].reduce((sum, i) => sum + driver.goal[i] * scene.right[i], 0);
+  const found = [[40, 5], [40, 35], [40, -7.5], [null, 35]].map((held) => { tilt(...held); return along(); });
+  done(found);
+});
+"""
+
+
+def test_a_tilted_device_is_the_stick(opened):
+    found = opened.execute_async_script(TILTED)
+    assert found == pytest.approx([0, 1, -0.5, -0.5], abs=1e-6)  # what is no number changes nothing
+
+
+def test_a_policy_of_ones_own_controls_the_robot_and_a_wrong_file_is_named(opened, exported, tmp_path):
+    chosen = opened.find_element("css selector", ".file")
+    (tmp_path / "wrong.onnx").write_bytes(b"wrong")
+    chosen.send_keys(str(tmp_path / "wrong.onnx"))
+    wait_for(opened, lambda: "wrong.onnx cannot be used: it is cut off" in said(opened))
+    chosen.send_keys(str(exported))
+    wait_for(opened, lambda: "mine.onnx controls the robot in stabilize" in said(opened))
+    opened.execute_script("playground.open(1); playground.setPlaying(false)")
+    (x, _), _, cells = advance(opened, 400)
+    assert cells[0][0] == "mine.onnx"
+    opened.execute_script("playground.own = {}; playground.open(1); playground.setPlaying(false)")
+    np.testing.assert_allclose(x, advance(opened, 400)[0][0], atol=FLOAT32)  # the same policy, from its weights
+
+
+def wait_for(browser, condition, seconds=20):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, said(browser)
+        time.sleep(0.05)
+
+
+def test_the_page_is_dark_where_the_reader_likes_it_dark(opened):
+    ground = "return getComputedStyle(document.body).backgroundColor"
+    light = opened.execute_script(ground)
+    opened.find_element("css selector", ".theme").click()
+    assert opened.execute_script(ground) != light
+    assert opened.find_element("css selector", ".theme").get_attribute("aria-pressed") == "true"
+    opened.find_element("css selector", ".theme").click()
+    assert opened.execute_script(ground) == light
+
+
+def test_everything_that_can_be_used_has_a_name(opened):
+    unnamed = """
+    return [...document.querySelectorAll("button, input, select, canvas")].filter((control) =>
+      !(control.textContent.trim() || control.getAttribute("aria-label") || control.labels?.[0]?.textContent.trim()))
+      .map((control) => control.className)
+    """
+    assert opened.execute_script(unnamed) == []
+
+
+@pytest.mark.parametrize("width", [390, 1400])
 def test_the_page_fits_its_window(browser, page, width):
     size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)

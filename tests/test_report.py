@@ -219,7 +219,17 @@ def tilts(browser):
     return browser.execute_script("return [...document.querySelectorAll('.tilt')].map(e => e.textContent)")
 
 
-TOPS = "return [...document.querySelectorAll('.view')].map(view => Math.max(...view.data[0].z))"
+PICTURES = """
+const { replay } = document.querySelector(".replay");
+replay.draw();
+return replay.episode.takes.map((_, n) => {
+  const { gl, canvas } = replay.stages[n].scene, pixels = new Uint8Array(4 * canvas.width * canvas.height);
+  gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  const colors = new Uint32Array(pixels.buffer);
+  return [new Set(colors).size, colors.reduce((sum, color, i) => (sum + (i % 997) * (color % 1009)) % 1e9, 0)];
+})
+"""
+"""How many colours the picture of each take has, and a sum that tells pictures apart."""
 
 
 def test_the_table_sorts_by_numbers_and_keeps_what_is_missing_last(opened):
@@ -242,14 +252,12 @@ def test_the_table_filters_by_task(opened):
 
 def test_scrubbing_moves_every_robot_and_the_cursors_of_its_traces(opened):
     assert tilts(opened) == ["0°", "0°"]
-    upright = opened.execute_script(TOPS)
-    assert upright == pytest.approx([1.2, 1.2])  # m: ball's centre at 0.1, body up to 1.1 above it
+    before = opened.execute_script(PICTURES)
     scrub(opened, 0.8)
     wait_for(opened, "return document.querySelector('.forces').layout.shapes[0].x0 === 0.8")
     assert tilts(opened) == ["57°", "14°"]  # the first has ended, at 1 rad
-    fallen, leaned = opened.execute_script(TOPS)
-    assert fallen == pytest.approx(0.1 + 1.1 * np.cos(1.0) + 0.1 * np.sin(1.0), abs=0.01)
-    assert fallen < leaned < 1.2
+    after = opened.execute_script(PICTURES)
+    assert all(a[1] != b[1] for a, b in zip(before, after, strict=True))
     assert opened.execute_script("return document.querySelector('.tilts').layout.shapes[0].x1") == 0.8
 
 
@@ -269,17 +277,13 @@ def test_playing_moves_until_the_end_and_pauses_where_it_is_told(opened):
     wait_for(opened, "return document.querySelector('.play').textContent === 'Play'")
 
 
-def test_linked_cameras_turn_together_and_others_do_not(opened):
-    turn = """
-        const [eye, done] = arguments;
-        const [first, second] = document.querySelectorAll(".view");
-        const turned = Plotly.relayout(first, { "scene.camera": { eye } });
-        turned.then(() => setTimeout(() => done(second.layout.scene.camera.eye), 500));
-    """
-    eye = {"x": 1.5, "y": 0.5, "z": 0.5}
-    assert opened.execute_async_script(turn, eye) == eye
-    opened.execute_script("document.querySelector('.link').click()")
-    assert opened.execute_async_script(turn, {"x": -1, "y": 1, "z": 1}) == eye
+def test_a_drag_turns_every_camera(opened):
+    from selenium.webdriver import ActionChains
+
+    yaws = "return document.querySelector('.replay').replay.stages.map(stage => stage.scene.camera.yaw)"
+    before = opened.execute_script(yaws)
+    ActionChains(opened).drag_and_drop_by_offset(opened.find_element("css selector", ".view"), 50, 0).perform()
+    assert opened.execute_script(yaws) == pytest.approx([yaw - 0.4 for yaw in before])
 
 
 def test_another_episode_has_its_own_scenes(opened):
@@ -290,13 +294,7 @@ def test_another_episode_has_its_own_scenes(opened):
 
 
 def test_a_scene_shows_robot_floor_and_obstacles(opened):
-    kinds = "return document.querySelector('.view').data.map(trace => trace.type)"
-    assert opened.execute_script(kinds).count("mesh3d") == 3  # robot, floor, obstacle
-    picture = opened.execute_async_script(
-        "const done = arguments[0];"
-        "Plotly.toImage(document.querySelector('.view'), {format: 'png', width: 200, height: 200}).then(done)"
-    )
-    assert len(picture) > 5000  # a blank one has less than 1 kB
+    assert all(colors > 200 for colors, _ in opened.execute_script(PICTURES))  # a blank one has one
 
 
 @pytest.mark.parametrize("width", [360, 800, 1600])

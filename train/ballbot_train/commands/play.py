@@ -4,6 +4,7 @@ import signal
 from pathlib import Path
 from typing import Literal
 
+from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER
 from ballbot_gym.viewer import HOST, PORT, Viewer, import_viser
 from ballbot_train.console import RobotName, console
@@ -15,10 +16,10 @@ from ballbot_train.play.simulation import Playground
 def play(
     task: str | None = None,
     /,
-    controller: str = "nmpc",
+    controller: str | None = None,
     ghosts: tuple[str, ...] = ("lqr",),
     policies: tuple[str, ...] = (),
-    episode: int | None = 0,
+    episode: int | Literal["rest", "random"] | None = None,
     physics: Literal["bullet", "mujoco", "rk4"] | None = None,
     robot: RobotName = PAPER,
     seed: int = 0,
@@ -31,10 +32,11 @@ def play(
     Args:
         task: name of a task; default the one that the controller's file names or whose observations fit, or else stabilize.
         controller: of the robot: an expert, a policy that comes with the package, a policy file, a model saved by
-            Stable-Baselines3 (.zip) or rsl_rl (.pt), "you" or "you (force)".
+            Stable-Baselines3 (.zip) or rsl_rl (.pt), "you" or "you (force)"; default, the best shipped policy.
         ghosts: controllers that get the same start and the same pushes beside it.
         policies: more policy files and saved models, which the page offers in the tasks that they are made for.
-        episode: index of the certified episode it starts with; None for a random start.
+        episode: index of the certified episode it starts with, a random start, or at rest until a push that fells LQR;
+            default, at rest where all episodes of the task differ in their start alone, and else 0.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         robot: name of a robot.
         seed: of random starts, noise and pushes.
@@ -42,9 +44,12 @@ def play(
         port: where the page is; the next free one, if it is taken.
         out: folder of saved files.
     """
-    task = task_name(controller, task, robot)
+    task = task_name(controller or "", task, robot)
     import_viser()
-    playground = Playground(task, controller, ghosts, physics, episode, seed, robot, policies, other_process=True)
+    if episode is None:
+        episode = 0 if make_task(task, robot).constant_names else "rest"
+    start = None if episode == "random" else episode
+    playground = Playground(task, controller, ghosts, physics, start, seed, robot, policies, other_process=True)
     viewer = Viewer(host, port, "ballbot play")
     page = PlayPage(playground, viewer, out)
     signal.signal(signal.SIGTERM, lambda *_: page.stop())

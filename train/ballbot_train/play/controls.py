@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ballbot_gym.drawing import PUSH_SCALE
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import is_file
@@ -30,7 +31,7 @@ _FILMS = {"Film (WebP)": ".webp", "Film (MP4)": ".mp4"}
 _FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip) or rsl_rl (.pt), where the simulation runs"
 
 
-_IMPULSE_PER_METRE = 10.0  # N·s of a push by dragging the robot
+_IMPULSE_PER_METRE = 1 / PUSH_SCALE  # N·s of a push by dragging the robot, so that the arrow ends where the drag does
 _STICK_METRES = 1.0  # of a drag that puts the stick fully out
 _HELD = 0.25  # s, after which a button of the pad counts as let go
 _KEY_HELD = 0.6  # s, the same for a key: keyboards repeat a held key only after half a second
@@ -57,7 +58,7 @@ class Controls:
         self._task_controls: list[Any] = []
         self._task_shown = ("", "")
         self._episode_typed = self._playground.episode or 0
-        self._impulse, self._bearing = 10.0, 0.0  # N·s and degrees
+        self._impulse, self._bearing = 90.0, 0.0  # N·s and degrees
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Play"):
             self._build_choices()
@@ -133,6 +134,7 @@ class Controls:
             starts = {
                 "Certified": lambda: self._start_certified(self._shown_episode()),
                 "Random": playground.start_random,
+                "At rest": playground.start_at_rest,
             }
             self._button_group("Start", starts, hint="key: N for a random one")
             self._bind_attribute(gui.add_dropdown("At the end", AT_END), playground, "at_end")
@@ -142,7 +144,7 @@ class Controls:
 
     def _build_push(self) -> None:
         with self._gui.add_folder("Push"):
-            self._bind_attribute(self._gui.add_slider("N·s", 0.0, LARGEST_PUSH, 0.5, 10.0), self, "_impulse")
+            self._bind_attribute(self._gui.add_slider("N·s", 0.0, LARGEST_PUSH, 5.0, 90.0), self, "_impulse")
             slider = self._gui.add_slider("Direction, °", 0.0, 360.0, 5.0, 0.0, hint="from the x axis")
             self._bind_attribute(slider, self, "_bearing")
             self._button("Push", lambda _: self._push(), hint="key: P; or drag the robot and let go")
@@ -198,6 +200,7 @@ class Controls:
                 )
         self._episode.max = max(0, playground.world.episodes - 1)
         self._page.clock.dt = playground.world.task.control_dt
+        self._page.viewer.aim()
 
     # --- what they do ---
 

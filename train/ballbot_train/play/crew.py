@@ -138,15 +138,17 @@ class Crew:
                 self.order(runner)
         self._order_optimum()
 
-    def step(self, noise: tuple[float, ...], push: tuple[float, float], seconds_left: float) -> None:
-        """Moves all robots by one control step, under a push (2,), N, with that many seconds of the episode left after it."""
+    def step(
+        self, noise: tuple[float, ...], push: tuple[float, float], outside: tuple[float, float], seconds_left: float
+    ) -> None:
+        """Moves all robots by one control step, with that many seconds of the episode left after it; see `Runner.step`."""
         for runner in self.runners:
             if not runner.stands_still:
                 try:
                     command = runner.act(self.steps, noise)
                 except Exception as error:  # a controller of any kind, such as a policy: the others go on
                     self.notice, command = f"{labels.label(runner.wanted)}: {error}", (0.0, 0.0)
-                runner.step(self.steps, command, push, self._c, seconds_left)
+                runner.step(self.steps, command, push, outside, self._c, seconds_left)
         self.steps += 1
 
     def weigh_again(self, c: tuple[float, ...]) -> None:

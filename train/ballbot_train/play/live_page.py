@@ -4,6 +4,7 @@ viser calls back in a thread of its own. What a browser asks for goes into a que
 between two steps. So the playground itself needs no locks.
 """
 
+import contextlib
 import gc
 import math
 import queue
@@ -28,11 +29,10 @@ _DRAW_HZ, _PLOT_HZ, _TEXT_HZ = 30.0, 5.0, 4.0
 _STARVED = 0.25  # s, after which a moment is drawn even if steps are due
 _MOST_STEPS = 10  # between two looks at the requests
 _IDLE = 0.02  # s, between two looks while nothing moves
-_NARROW = 600  # px, of a phone's page, whose lower part viser covers with the controls
-_NARROW_EYE, _NARROW_AIM = (-3.4, -2.4, 2.4), (-1.55, -1.1, 0.0)  # m: the robot is in the upper part
+_LONGEST_REST = 3600.0  # s, between two looks while nobody is there
 _SCORES_SHOWN = 8
 _NOTICE_LENGTH = 300
-_HELP = "Drag the robot and let go to push it."
+_HELP = "Drag the robot and let go: every robot gets the same push."
 
 
 class PlayPage:
@@ -53,7 +53,8 @@ class PlayPage:
         """To do in a pause."""
         self.driver: int | None = None
         """Id of the browser that drives; the next that touches anything, if None."""
-        self._open_pages: set[int] = set()
+        self.visitors: set[int] = set()
+        """Ids of the browsers that show the page. While there are none, time stands still and nothing is computed."""
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stopped = self._moving = False
         gui = viewer.server.gui
@@ -75,7 +76,11 @@ class PlayPage:
         end = time.perf_counter() + seconds
         next_draw = next_plot = next_text = drawn = 0.0
         while not self._stopped and (now := time.perf_counter()) < end:
-            self._do_requests()
+            self._do_requests(0.0 if self.visitors else min(_LONGEST_REST, end - now))
+            if not self.visitors:
+                self.clock.stop()
+                self._moving = False
+                continue
             stood, self._moving = not self._moving, self._steps_due()
             if stood and self._moving:
                 self._collect_garbage()
@@ -95,6 +100,7 @@ class PlayPage:
     def stop(self) -> None:
         """Ends `run`; from any thread."""
         self._stopped = True
+        self.request(lambda: None)
 
     def request(self, action: Callable[[], object]) -> None:
         """Has the loop do something between two steps; from any thread."""
@@ -102,7 +108,7 @@ class PlayPage:
 
     def close(self) -> None:
         """Ends `run`, and gives up a film that is not finished."""
-        self._stopped = True
+        self.stop()
         self.saver.close()
 
     def _collect_garbage(self) -> None:
@@ -128,14 +134,13 @@ class PlayPage:
                 return False
         return True
 
-    def _do_requests(self) -> None:
-        """Does what was asked for until now. Whatever a browser sends, the simulation goes on."""
-        count = self._requests.qsize()
-        for action in [
-            *(self._requests.get() for _ in range(count)),
-            *[self._controls.refresh] * (count > 0),
-            self.saver.poll,
-        ]:
+    def _do_requests(self, patience: float) -> None:
+        """Does what was asked for until now, or within `patience`, s. Whatever a browser sends, the simulation goes on."""
+        asked: list[Callable[[], object]] = []
+        with contextlib.suppress(queue.Empty):
+            asked = [self._requests.get(timeout=patience)] if patience > 0 else []
+        asked += [self._requests.get() for _ in range(self._requests.qsize())]
+        for action in [*asked, *[self._controls.refresh] * (len(asked) > 0), self.saver.poll]:
             try:
                 action()
             except Exception as error:
@@ -167,14 +172,13 @@ class PlayPage:
         return self.driver == client_id
 
     async def _on_connect(self, client: Any) -> None:
-        self._open_pages.add(client.client_id)
+        self.visitors.add(client.client_id)
         self.drives(client.client_id)
-        if client.camera.image_width < _NARROW:
-            client.camera.position, client.camera.look_at = _NARROW_EYE, _NARROW_AIM
+        self.request(lambda: None)
         self._show_roles()
 
     async def _on_disconnect(self, client: Any) -> None:
-        self._open_pages.discard(client.client_id)
+        self.visitors.discard(client.client_id)
         if self.driver == client.client_id:
             self.driver = None
         self._show_roles()
@@ -185,7 +189,7 @@ class PlayPage:
     def _show_roles(self) -> None:
         if self._stopped:
             return
-        count = len(self._open_pages)
+        count = len(self.visitors)
         self._role_text.content = f"{count} browsers show this page. One drives, the others watch."
         self._role_text.visible = self._role_button.visible = count > 1
 

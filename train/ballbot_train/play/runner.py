@@ -153,21 +153,26 @@ class Runner:
         step: int,
         command: tuple[float, float],
         push: tuple[float, float],
+        outside: tuple[float, float],
         c: tuple[float, ...],
         seconds_left: float,
     ) -> None:
-        """Holds a command, N, for one control step, in which a push (2,), N, acts too.
+        """Holds a command, N, for one control step, after a push.
 
         Args:
             step: counted from the opening of the playground.
             command: (2,) N.
-            push: (2,) N.
+            push: (2,) N·s, an impulse on the body's centre of mass.
+            outside: (2,) N, a force on the ball during the step.
             c: constants of the tunable task.
             seconds_left: s, of the episode after this step: what a failure costs.
         """
         task, dt = self._task, self._task.control_dt
+        if any(push):
+            self.x = self._states[-1] = tuple(map(float, dynamics.pushed(self.true, self.x, push)))
+            self._simulator.reset(self.x)
         self.force = self._disturbance.actuate(command)
-        total = (self.force[0] + push[0], self.force[1] + push[1])
+        total = (self.force[0] + outside[0], self.force[1] + outside[1])
         kept = -1.0 if self._slips(total) else 0.0
         x = self._simulator.step(total)
         did = outcome(task, self.x, self.force, x, c, step + 1, (kept,))

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from ballbot_gym.engines import default_physics
+from ballbot_gym.params import default_params
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.trajectory import Trajectory
@@ -25,8 +26,12 @@ AtEnd = Literal["go on", "again", "next", "stop"]
 
 AT_END: tuple[AtEnd, ...] = get_args(AtEnd)
 
-LARGEST_PUSH = 30.0
+LARGEST_PUSH = 250.0
 """N·s, of a push; larger ones are cut to this length."""
+
+FIRST_PUSH = (79.0, 43.1)
+"""N·s: the push with which an episode at rest begins fells LQR. Its length is 90 N·s, as on the page of `ballbot page`."""
+_FIRST_PUSH_AFTER = 1.0  # s
 
 _PAUSE = 1.5  # s, between the end of an episode and the next
 _PUSH_SHOWN = 0.3  # s, for which a push is drawn
@@ -68,10 +73,10 @@ class Playground:
     def __init__(
         self,
         task: str = "stabilize",
-        controller: str = "nmpc",
+        controller: str | None = None,
         ghosts: Sequence[str] = (),
         physics: str | None = None,
-        episode: int | None = 0,
+        episode: int | Literal["rest"] | None = 0,
         seed: int = 0,
         robot: str = PAPER,
         policies: Sequence[str] = (),
@@ -82,10 +87,10 @@ class Playground:
         Args:
             task: name of a task.
             controller: of the main robot: an expert, a policy that comes with the package, the path of a policy file or of a
-                model that Stable-Baselines3 or rsl_rl saved, or one of `DRIVERS`.
+                model that Stable-Baselines3 or rsl_rl saved, or one of `DRIVERS`; default, `World.best`.
             ghosts: controllers of the ghosts.
             physics: "bullet", "mujoco" or "rk4"; default, as for environments.
-            episode: index of a certified episode; None for a random start.
+            episode: index of a certified episode; "rest" for standing at the origin; None for a random start.
             seed: of random starts, sensor noise and random pushes.
             robot: name in `robots.ROBOTS`.
             policies: paths of more policies that can be chosen in the tasks that they are made for.
@@ -97,6 +102,7 @@ class Playground:
             PolicyError: one of `policies` is missing or damaged.
         """
         world = World(task, robot, policies)
+        controller = world.best if controller is None else controller
         world.check_controllers(controller, *ghosts)
         self.stick = Stick()
         self.at_end: AtEnd = "go on"
@@ -150,7 +156,7 @@ class Playground:
 
     @property
     def shown_push(self) -> np.ndarray | None:
-        """(2,) the push that is drawn, N; None if there was none lately."""
+        """(2,) the push that is drawn, N·s; None if there was none lately."""
         return self._push if self.crew.steps < self._push_until else None
 
     def trajectory(self) -> Trajectory:
@@ -179,9 +185,15 @@ class Playground:
         if self.crew.preparing:
             return False
         noise = tuple(self._rng.random(Randomization.NOISE_DRAWS).tolist())
-        push = self._take_push()
         task = self.world.task
-        self.crew.step(noise, push, (task.steps - self.elapsed - 1) * task.control_dt)
+        if self.elapsed == self._first_push_at:
+            self._first_push_at = -1
+            self.push(*(part * self.world.params.total_mass / default_params().total_mass for part in FIRST_PUSH))
+        push, outside = self._take_push(), (0.0, 0.0)
+        if self._randomization.pushes:
+            z = tuple(self._rng.random(Randomization.PUSH_DRAWS).tolist())
+            outside = self._randomization.push(z, task.control_dt)
+        self.crew.step(noise, push, outside, (task.steps - self.elapsed - 1) * task.control_dt)
         self.elapsed += 1
         self._after_step()
         return True
@@ -199,7 +211,7 @@ class Playground:
     # --- what a user does ---
 
     def push(self, x: float, y: float) -> None:
-        """Pushes every robot's ball by an impulse along x and y, N·s, in the next control step."""
+        """Pushes every robot by an impulse along x and y, N·s, on its body's centre of mass, before the next control step."""
         length = math.hypot(x, y)
         if not math.isfinite(length):
             self.crew.notice = "a push must be finite numbers"
@@ -243,7 +255,7 @@ class Playground:
 
     def restart(self) -> None:
         """Begins the same episode again."""
-        self._begin(self.start, self.episode)
+        self._begin(self.start, self.episode, self._at_rest)
 
     def start_certified(self, episode: int) -> None:
         """Begins a certified episode."""
@@ -253,6 +265,10 @@ class Playground:
         """Begins an episode with a random start."""
         self._begin(self.world.base.sample(self._rng, self.world.params), None)
 
+    def start_at_rest(self) -> None:
+        """Begins an episode that stands at the origin until it is pushed, which happens by itself."""
+        self._begin((np.zeros(8), self.world.base.sample(self._rng, self.world.params)[1]), None, True)
+
     # --- inside ---
 
     def _change(self, task: str, robot: str) -> None:
@@ -260,22 +276,25 @@ class Playground:
         world = World(task, robot)
         world.offer(*self.world.policies)
         ghosts = [ghost for ghost in self.crew.ghosts if ghost in world.controllers]
-        self._open(world, self.main.wanted if self.main.wanted in world.controllers else "nmpc", ghosts, 0)
+        self._open(world, self.main.wanted if self.main.wanted in world.controllers else world.best, ghosts, 0)
 
-    def _open(self, world: World, controller: str, ghosts: Sequence[str], episode: int | None) -> None:
-        start = None if episode is None or world.certified is None else world.certified_start(episode)
+    def _open(self, world: World, controller: str, ghosts: Sequence[str], episode: int | str | None) -> None:
+        start = world.certified_start(episode) if isinstance(episode, int) and world.certified is not None else None
         self.world = world
         self.crew.open(world, [controller, *ghosts])
-        if start is None:
+        if episode == "rest":
+            self.start_at_rest()
+        elif start is None:
             self.start_random()
         else:
-            self._begin(start, episode)
+            self._begin(start, int(episode or 0))
 
-    def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: int | None) -> None:
+    def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: int | None, at_rest: bool = False) -> None:
         """Starts an episode; the robots wait for their controllers."""
-        self.start, self.episode = start, episode
+        self.start, self.episode, self._at_rest = start, episode, at_rest
         self.elapsed = self._pause_left = self._push_until = 0
         self._pending_push = self._push = np.zeros(2)
+        self._first_push_at = -1 if not at_rest else round(_FIRST_PUSH_AFTER / self.world.task.control_dt)
         self.crew.begin(tuple(map(float, start[0])), self.world.constants(start[1]))
 
     def _after_step(self) -> None:
@@ -294,6 +313,7 @@ class Playground:
         self.scores = [*self.scores, score][-_EPISODES_KEPT:]
         if goes_on:
             self.start, self.episode, self.elapsed = (np.array(main.x), self.start[1]), None, 0
+            self._at_rest = False
             self.crew.go_on()
         else:
             self._pause_left = round(_PAUSE / task.control_dt)
@@ -309,12 +329,9 @@ class Playground:
             self.restart()
 
     def _take_push(self) -> tuple[float, float]:
-        """The push of this control step, N, drawn and asked for."""
-        dt = self.world.task.control_dt
-        push, self._pending_push = self._pending_push / dt, np.zeros(2)
-        if self._randomization.pushes:
-            z = tuple(self._rng.random(Randomization.PUSH_DRAWS).tolist())
-            push = push + np.array(self._randomization.push(z, dt), np.float64)
+        """The push that was asked for, N·s."""
+        push, self._pending_push = self._pending_push, np.zeros(2)
         if push.any():
-            self._push, self._push_until = push, self.crew.steps + round(_PUSH_SHOWN / dt)
+            self._push = push
+            self._push_until = self.crew.steps + round(_PUSH_SHOWN / self.world.task.control_dt)
         return float(push[0]), float(push[1])

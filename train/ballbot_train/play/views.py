@@ -1,10 +1,12 @@
 """What there is to see of a playground, and what is kept of it."""
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from ballbot_gym import dynamics
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_train.play.driving import DRIVERS
 from ballbot_train.play.runner import Runner, Sample, failure_word
@@ -35,7 +37,9 @@ def drawing(playground: Playground) -> Drawing:
         name, tint = f"ghost {i}" if i else "robot", color(runner, i)
         force = np.array(runner.force) if runner is main and not main.violated else None
         alpha = GHOST_OPACITY if i else 1.0
-        robots.append(Robot(np.array(runner.x), tint, force, alpha, name, push if runner is main else None))
+        x, pushed = np.array(runner.x), push if runner is main else None
+        said = failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
+        robots.append(Robot(x, tint, force, alpha, name, pushed, f"{labels.label(runner.name)} {said}"))
         if len(runner.trace) > 1:
             paths.append(GroundPath(np.array(runner.trace), tint, name=name))
     if (planned := _plan(playground)) is not None:
@@ -46,7 +50,7 @@ def drawing(playground: Playground) -> Drawing:
 
 def color(runner: Runner, i: int) -> str:
     """The colour of the `i`-th robot."""
-    return "#2e8b57" if runner.name in DRIVERS else labels.color(Path(runner.name).stem, i)
+    return labels.YOU if runner.name in DRIVERS else labels.color(Path(runner.name).stem, i)
 
 
 def colors(playground: Playground) -> dict[str, str]:

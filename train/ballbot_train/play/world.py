@@ -20,7 +20,7 @@ from ballbot_train.evaluation.controllers import is_expert, is_made_for, is_save
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play.driving import DRIVERS
 from ballbot_train.play.tunable import Tunable, weight_names
-from ballbot_train.policy_files import PolicyError
+from ballbot_train.policy_files import BEST, PolicyError, shipped_policies
 
 WEIGHT_FACTOR = 100.0
 """How far a weight may be from the task's own, as a factor, up and down."""
@@ -41,7 +41,7 @@ PLANT: dict[str, Span] = {
     "delay": Span("Delay, ms", 0.0, 120.0, 20.0),
     "lag": Span("Lag, ms", 0.0, 100.0, 5.0),
     "noise": Span("Sensor noise, ×", 0.0, 5.0, 0.25),
-    "push": Span("Random pushes, N·s", 0.0, 12.0, 0.5),
+    "push": Span("Random pushes on the ball, N·s", 0.0, 12.0, 0.5),
 }
 """What the controllers do not know, by the name of the stress in `robustness.STRESSES`. 0 is nothing."""
 
@@ -76,6 +76,12 @@ class World:
     def episodes(self) -> int:
         """How many certified episodes there are."""
         return 0 if self.certified is None else len(self.certified)
+
+    @property
+    def best(self) -> str:
+        """The controller to begin with: the shipped policy with the least regret, or else NMPC."""
+        name = BEST.get(self.task_name, "")
+        return name if name in shipped_policies(self.base, self.robot) else "nmpc"
 
     def offer(self, *policies: str) -> None:
         """Has more policy files be chosen, if they are made for the task and the robot."""

@@ -24,6 +24,10 @@ LABELS = {
     "sac": "SAC",
     "shac": "SHAC",
 }
+YOU = "#e8590c"
+"""The colour of a human."""
+OPTIMUM = "#d4a017"
+"""The colour of a robot that drives along the optimum."""
 _OTHER_COLORS = ("#6b8e23", "#b9770e", "#5d6d7e", "#d35479")
 
 

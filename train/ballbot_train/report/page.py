@@ -11,7 +11,7 @@ import functools
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,8 +19,8 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from ballbot_gym import files
-from ballbot_gym.tasks.marker import Marker
+from ballbot_gym import drawing, files
+from ballbot_gym.params import BallbotParams
 from ballbot_train.escaping import plotly_text
 from ballbot_train.report.replay import Replay, Take
 
@@ -128,13 +128,18 @@ def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Sec
     replays = [replay for replay in replays if replay.takes]
     if not replays:
         return None
-    robot = replays[0].params
-    sizes = ("ball_radius", "body_radius", "body_length", "com_height")
-    data = {
-        "robot": {name: getattr(robot, name) for name in sizes},
-        "episodes": [_replay_data(replay) for replay in replays],
+    data = scene_data(replays[0].params) | {"episodes": [_replay_data(replay) for replay in replays]}
+    return Section(title, _render("replay.html.j2", data=data), lead, ("plotly", "scene.js", "replay.js"))
+
+
+def scene_data(params: BallbotParams) -> dict[str, object]:
+    """How scene.js draws a robot."""
+    return {
+        "robot": {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")},
+        "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
+        "force_scale": drawing.FORCE_SCALE,
+        "least_force": drawing.LEAST_FORCE,
     }
-    return Section(title, _render("replay.html.j2", data=data), lead, ("plotly", "replay.js"))
 
 
 @functools.cache
@@ -220,20 +225,8 @@ def _replay_data(replay: Replay) -> dict[str, object]:
     return {
         "title": replay.title,
         "dt": _REPLAY_DT,
-        "markers": [_marker_data(marker) for marker in replay.markers],
+        "markers": [asdict(marker) for marker in replay.markers],
         "takes": [_take_data(take) for take in replay.takes],
-    }
-
-
-def _marker_data(marker: Marker) -> dict[str, object]:
-    red, green, blue, alpha = marker.color
-    return {
-        "x": round(marker.position[0], 4),
-        "y": round(marker.position[1], 4),
-        "radius": round(marker.radius, 4),
-        "height": marker.height,
-        "ring": marker.ring,
-        "color": f"rgba({round(255 * red)},{round(255 * green)},{round(255 * blue)},{alpha})",
     }
 
 

@@ -1,4 +1,5 @@
-"""The playground without Python: one HTML page in which a learned policy and LQR balance, and the reader pushes them.
+"""The playground without Python: one HTML page in which a learned policy and LQR balance beside the optimum, and the reader
+pushes them, drives an episode, or drops a policy of their own.
 
 Everything is in the page: the closed-form model, the tasks' costs, limits and observations, LQR's gains and the policies'
 weights. The model and the tasks are printed as JavaScript from the lines that Python runs; see `javascript`.
@@ -8,7 +9,7 @@ import base64
 import functools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +26,15 @@ from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.evaluation.controllers import policy_path, task_name
-from ballbot_train.policy_files import PolicySpec, paths_of, read_description, shipped_policies
+from ballbot_train.policy_files import BEST, PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
 from ballbot_train.report.javascript import javascript_function
+from ballbot_train.report.page import scene_data
 
-LARGEST = 1_500_000
+LARGEST = 2_000_000
 """Bytes that the page may have."""
 
 _ASSETS = Path(__file__).parent / "assets"
-_LEARNERS = {"stabilize": "sac", "turn": "dagger", "orbit": "dagger", "weave": "dagger"}
-"""The shipped policy of each task that the page shows: the one with the least regret."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,8 @@ class Scenario:
     """The certified episode that it is; None is standing at rest at the origin."""
     push: tuple[float, float, float] | None = None
     """A push that comes by itself: time, s, impulse, N·s, and bearing, rad."""
+    others: tuple[int, ...] = ()
+    """More certified episodes that can be chosen."""
 
 
 SCENARIOS = (
@@ -57,31 +59,38 @@ SCENARIOS = (
         "Both robots stand still and get the same push of 90 N·s. LQR is right for small leans only, and falls. "
         "The learned policy leans 45°, brakes and comes back.",
         "stabilize",
-        push=(0.6, 90.0, 0.5),
+        push=(0.6, 90.0, 0.5),  # as `ballbot play` begins
     ),
     Scenario(
         "Throw",
-        "Both start fast and leaning, and are to come to rest on the green spot. Braking takes a lean of 40°.",
+        "All start fast and leaning, and are to come to rest on the green spot. Braking takes a lean of 40°.",
         "stabilize",
         7,
+        others=(0, 3, 5),
     ),
-    Scenario("Orbit", "From rest onto a circle at 5.5 m/s, which takes a steady lean of 43°.", "orbit", 17),
-    Scenario("Turn", "A right-angled turn through the gate at 6.8 m/s, with as little force as possible.", "turn", 1),
-    Scenario("Weave", "Round five obstacles, and to rest behind them. LQR does not know of obstacles.", "weave", 12),
+    Scenario(
+        "Orbit",
+        "From rest onto a circle at 5.5 m/s, which takes a steady lean of 43°.",
+        "orbit",
+        17,
+        others=(1, 2, 3),
+    ),
+    Scenario(
+        "Turn",
+        "A right-angled turn through the gate at 6.8 m/s, with as little force as possible.",
+        "turn",
+        1,
+        others=(2, 3, 5),
+    ),
+    Scenario(
+        "Weave",
+        "Round five obstacles, and to rest behind them. LQR does not know of obstacles.",
+        "weave",
+        12,
+        others=(0, 1, 3),
+    ),
 )
 """Every scenario of the page."""
-
-
-def pushed(params: BallbotParams, x: casadi.SX, impulse: casadi.SX) -> casadi.SX:
-    """The state just after a horizontal impulse (2,), N·s, on the body's centre of mass, of CasADi columns.
-
-    M Δq̇ = Jᵀ p, with the mass matrix M and the Jacobian J of the centre of mass's horizontal position.
-    """
-    gamma, theta = x[2], x[3]
-    centre = x[:2] + params.com_height * casadi.vertcat(casadi.sin(gamma) * casadi.cos(theta), casadi.sin(theta))
-    mass = casadi.hessian(dynamics.energy(params, x), x)[0][4:, 4:]
-    slope = casadi.jacobian(centre, x)[:, :4]
-    return x + casadi.vertcat(casadi.SX.zeros(4), casadi.solve(mass, slope.T @ impulse))
 
 
 def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
@@ -118,19 +127,29 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
         "reach": REACH,
-        "robot": {name: getattr(params, name) for name in ("ball_radius", "body_radius", "body_length", "com_height")},
-        "colors": {"ball": drawing.BALL, "force": drawing.FORCE, "push": drawing.PUSH},
-        "force_scale": drawing.FORCE_SCALE,
-        "least_force": drawing.LEAST_FORCE,
+        **scene_data(params),
+        "push_scale": drawing.PUSH_SCALE,
         "ghost_opacity": drawing.GHOST_OPACITY,
         "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr", 0)},
         "policies": _policies(policies),
-        "scenarios": [_scenario_data(scenario, params) for scenario in SCENARIOS],
+        "you": {"label": "you", "color": labels.YOU},
+        "best": {"label": "optimum", "color": labels.OPTIMUM},
+        "tasks": {
+            name: {"id": task.id, "observations": len(task.observation_scale)}
+            for name, task in ((name, make_task(name)) for name in TASKS)
+        },
+        "scenarios": [_scenario_data(episode, params) for scenario in SCENARIOS for episode in _episodes(scenario)],
     }
     # Within a script, "<" could end it.
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     specs = {name: policy["frame"] for name, policy in data["policies"].items()}
-    return "\n".join([_model_script(params, specs), f"const DATA = {text};", _asset("engine.js")])
+    return "\n".join([_model_script(params, specs), f"const DATA = {text};", _asset("engine.js"), _asset("onnx.js")])
+
+
+def _episodes(scenario: Scenario) -> list[Scenario]:
+    """A scenario in each of its episodes."""
+    text = "Another start of the same task."
+    return [scenario, *(replace(scenario, text=text, episode=episode, others=()) for episode in scenario.others)]
 
 
 def _policies(given: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -142,7 +161,7 @@ def _policies(given: Sequence[str]) -> dict[str, dict[str, Any]]:
             raise ValueError(f"{paths[task]} and {policy} are both policies for {task}; give one")
         paths[task] = policy_path(str(policy), make_task(task))
         _check_policy(paths[task], make_task(task))
-    shipped = {task: shipped_policies(make_task(task))[learner] for task, learner in _LEARNERS.items()}
+    shipped = {task: shipped_policies(make_task(task))[learner] for task, learner in BEST.items()}
     return {task: _policy_data(paths.get(task, path), make_task(task)) for task, path in shipped.items()}
 
 
@@ -185,21 +204,25 @@ def _layer(weights: Mapping[str, np.ndarray], name: str) -> dict[str, str | None
 
 def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
     task = make_task(scenario.task)
-    state, constants, optimum = np.zeros(8), np.zeros(0), None
+    state, constants, optimum, best = np.zeros(8), np.zeros(0), None, None
     if scenario.episode is not None:
         episodes = certified.load(task, params)
         state, constants = episodes.states[scenario.episode], episodes.constants[scenario.episode]
         optimum = float(episodes.costs[scenario.episode])
+        trajectory = episodes.trajectories[scenario.episode]
+        best = {"x": _packed(trajectory.x, np.float32), "u": _packed(trajectory.u, np.float32)}
     lqr = LqrController(task, params)
     lqr.reset(0.0, state, constants)
     return {
         "title": scenario.title,
         "text": scenario.text,
         "task": scenario.task,
+        "episode": scenario.episode,
         "state": state.tolist(),
         "constants": constants.tolist(),
         "duration": task.duration,
         "optimum": optimum,
+        "best": best,
         "push": scenario.push,
         "markers": [asdict(marker) for marker in task.markers(constants)],
         "lqr": {
@@ -217,7 +240,7 @@ def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> st
     substeps = dynamics.substeps_for(dt)
     parts = [
         javascript_function("step", lambda x, u: dynamics.step(params, x, u, dt, substeps), {"x": 8, "u": 2}),
-        javascript_function("push", functools.partial(pushed, params), {"x": 8, "impulse": 2}),
+        javascript_function("push", functools.partial(dynamics.pushed, params), {"x": 8, "impulse": 2}),
     ]
     models = []
     for name in TASKS:

@@ -138,7 +138,7 @@ class Robot {
     this.steps = 0;
     this.cost = 0;
     this.peak = this.tilt;
-    this.ended = ""; // the limit that it violated, or "goal"
+    this.ended = ""; // the limit that it violated, "goal", "force" without a finite one, or "over"
     this.path = [[this.x[0], this.x[1]]];
   }
 
@@ -147,24 +147,33 @@ class Robot {
   }
 
   get failed() {
-    return this.ended !== "" && this.ended !== "goal";
+    return !["", "goal", "over"].includes(this.ended);
   }
 
   /** Holds a force for one control step. */
   advance() {
     this.before = this.x;
     if (this.ended) return;
-    const c = this.scenario.constants;
     const limit = DATA.force_limit;
-    this.force = this.controller.act(this.steps, this.x, c).map((f) => Math.min(Math.max(f, -limit), limit));
-    const { optimum, duration } = this.scenario;
+    const force = this.controller.act(this.steps, this.x, this.scenario.constants);
+    if (!force.every(Number.isFinite)) {
+      this.ended = "force";
+      return;
+    }
+    const held = force.map((f) => Math.min(Math.max(f, -limit), limit));
+    this.move(held, step(this.x, held));
+    this.judge();
+  }
+
+  /** Counts a control step under a force, to the next state. */
+  move(force, next) {
+    const { optimum, duration, constants } = this.scenario;
     const counts = optimum === null || this.steps * DATA.dt < duration - 1e-9; // an episode's cost ends with it
-    if (counts) this.cost += this.model.cost(this.x, this.force, c)[0] * DATA.dt;
-    this.x = step(this.x, this.force);
+    if (counts) this.cost += this.model.cost(this.x, force, constants)[0] * DATA.dt;
+    [this.x, this.force] = [next, force];
     this.steps += 1;
     this.peak = Math.max(this.peak, this.tilt);
     this.path.push([this.x[0], this.x[1]]);
-    this.judge();
   }
 
   /** A horizontal impulse on the body's centre of mass, N·s. */
@@ -181,8 +190,68 @@ class Robot {
   }
 }
 
-/** The robots of a scenario: the policy's, then LQR's. */
-function robotsOf(scenario) {
-  const model = MODELS[scenario.task];
-  return [new Robot(new Policy(DATA.policies[scenario.task], model), scenario), new Robot(new Lqr(scenario.lqr), scenario)];
+/** The optimum of a certified episode, which drives along its trajectory. */
+class Optimum extends Robot {
+  constructor(scenario) {
+    super(null, scenario);
+    [this.states, this.forces] = [scenario.best.x, scenario.best.u].map((part) => unpacked(part, Float32Array));
+  }
+
+  advance() {
+    this.before = this.x;
+    if (this.ended) return;
+    const k = this.steps;
+    this.move(Array.from(this.forces.slice(2 * k, 2 * k + 2)), Array.from(this.states.slice(8 * k + 8, 8 * k + 16)));
+    if (2 * this.steps >= this.forces.length) this.ended = "over";
+  }
+}
+
+const STEEPEST = 0.7; // rad, the lean that a stick commands that is fully out
+const STIFFNESS = 60; // 1/s², how a lean is brought to the commanded one
+const DAMPING = 14; // 1/s
+const SMOOTHING = 0.15; // share of the way to its goal that the stick goes in a control step: keys know no half way
+
+/** A human, whose stick commands the lean. The force that gives it follows from one step of the model, linear in the force. */
+class Driver {
+  constructor() {
+    this.stick = [0, 0]; // along x and y; at most 1 long
+    this.goal = [0, 0]; // where the human holds it
+  }
+
+  /** Holds the stick; more than a length of 1 counts as 1, and what is not finite as 0. */
+  hold(x, y) {
+    const length = Math.max(Math.hypot(x, y), 1);
+    this.goal = Number.isFinite(length) ? [x / length, y / length] : [0, 0];
+  }
+
+  act(k, x) {
+    this.stick = this.stick.map((value, i) => value + SMOOTHING * (this.goal[i] - value));
+    const [none, first, second] = [[0, 0], [100, 0], [0, 100]].map((force) => step(x, force).slice(6));
+    const [p, q] = this.stick.map((value, i) => {
+      const wanted = STIFFNESS * (STEEPEST * value - x[2 + i]) - DAMPING * x[6 + i];
+      return x[6 + i] + DATA.dt * wanted - none[i];
+    });
+    const [a, b, c, d] = [first[0] - none[0], second[0] - none[0], first[1] - none[1], second[1] - none[1]];
+    return [(d * p - b * q) / (a * d - b * c), (a * q - c * p) / (a * d - b * c)].map((share) => 100 * share);
+  }
+}
+
+/** The robots of a scenario: the policy's, then LQR's; where a human drives, the human's, then the policy's. */
+function robotsOf(scenario, policy = null, driver = null) {
+  const learned = policy ?? new Policy(DATA.policies[scenario.task], MODELS[scenario.task]);
+  const controllers = driver ? [driver, learned] : [learned, new Lqr(scenario.lqr)];
+  return controllers.map((controller) => new Robot(controller, scenario));
+}
+
+/** What a link to an episode holds after its "#": task, certified episode and regret, %. */
+function challengeText({ task, episode }, regret) {
+  return `${task}-${episode}-${regret.toFixed(1)}`;
+}
+
+/** The scenario and the regret of such a link; null for anything else. Links are strangers', so only known values pass. */
+function challengeOf(hash) {
+  const found = /^#([a-z]{1,20})-(\d{1,3})-(\d{1,6}\.\d)$/.exec(hash);
+  if (!found) return null;
+  const index = DATA.scenarios.findIndex(({ task, episode }) => task === found[1] && episode === Number(found[2]));
+  return index < 0 ? null : { index, regret: Number(found[3]) };
 }

@@ -1,14 +1,16 @@
-// The playground's page: scenarios, pushes by button, key and drag, pictures and readouts.
+// The playground's page: scenarios, pushes and driving, policies of the reader's own, pictures and readouts.
 "use strict";
 
 const find = (selector) => document.querySelector(selector);
 const DEGREES = 180 / Math.PI;
 const SHOWN_SECONDS = 6; // of the tilts
 const PUSH_SHOWN = 0.5; // s of the episode, for which a push's arrow stays
-const METRES_PER_IMPULSE = 1 / 130; // of a push's arrow, m per N·s
 const STRONGEST = 250; // N·s
 const NEAR = 3.6; // m: the camera's distance from robots that are together
 const GRAB = 60; // px: how far from a robot's axis a drag still pushes it
+const THUMB = 70; // px of a drag that holds the stick fully out
+const TILTED = 25; // degrees of a device that do the same
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], a: [-1, 0], d: [1, 0], w: [0, 1], s: [0, -1] };
 
 class Playground {
   constructor() {
@@ -21,36 +23,98 @@ class Playground {
     [this.playing, this.last] = [true, null];
     [this.distance, this.zoom] = [NEAR, 1];
     this.wake();
-    DATA.scenarios.forEach((scenario, i) => {
+    this.own = {}; // policies of the reader's own, by task
+    for (const title of new Set(DATA.scenarios.map((scenario) => scenario.title))) {
       const chip = document.createElement("button");
       chip.type = "button";
-      chip.textContent = scenario.title;
-      chip.onclick = () => this.open(i);
+      chip.textContent = title;
+      chip.onclick = () => this.open(DATA.scenarios.findIndex((scenario) => scenario.title === title));
       find(".chips").append(chip);
-    });
+    }
     find(".play").onclick = () => this.setPlaying(!this.playing);
-    find(".reset").onclick = () => this.open(this.index);
+    find(".reset").onclick = () => this.open(this.index, this.driver !== null);
+    find(".episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
+    find(".drive").onclick = () => this.open(this.index, this.driver === null);
+    find(".tilt").onclick = () => this.askForTilt();
+    find(".share").onclick = () => this.share();
+    find(".theme").onclick = () => this.setTheme(!this.dark);
+    const night = matchMedia("(prefers-color-scheme: dark)");
+    night.onchange = () => this.setTheme(night.matches);
+    this.setTheme(night.matches);
     find(".impulse").oninput = () => (find(".strength output").textContent = `${this.impulse} N·s`);
     for (const button of document.querySelectorAll(".pushes button")) {
       button.onclick = () => this.pushOnScreen(Number(button.dataset.x), Number(button.dataset.y));
     }
     this.listen();
-    this.open(0);
+    this.openLink();
+    window.addEventListener("hashchange", () => this.openLink());
     requestAnimationFrame((now) => this.tick(now));
+  }
+
+  /** Opens what the page's address names: an episode that somebody has driven. */
+  openLink() {
+    const challenge = challengeOf(location.hash);
+    if (!challenge) {
+      this.open(0);
+      if (location.hash.length > 1) this.say("This link names no episode of this page.");
+      return;
+    }
+    this.open(challenge.index, true);
+    this.say(`Somebody drove this episode with a regret of ${challenge.regret.toFixed(1)} %. Press Play and beat it.`);
+    this.setPlaying(false);
+  }
+
+  say(text) {
+    find(".said").textContent = text;
+  }
+
+  setTheme(dark) {
+    this.dark = dark;
+    document.documentElement.dataset.theme = dark ? "dark" : "light";
+    find(".theme").setAttribute("aria-pressed", dark);
+    if (this.scene) this.scene.theme = THEMES[dark ? "dark" : "light"];
+    this.wake();
+  }
+
+  /** A robot's colour, which is lighter in the dark. */
+  tint(color) {
+    if (!this.dark) return color;
+    return "#" + rgb(color).map((part) => Math.round(255 * (0.35 + 0.65 * part)).toString(16).padStart(2, "0")).join("");
   }
 
   get impulse() {
     return Number(find(".impulse").value);
   }
 
-  open(index) {
+  /** Opens a scenario; where the reader drives, in an episode whose optimum is known. */
+  open(index, driven = false) {
+    if (driven && DATA.scenarios[index].optimum === null) index = DATA.scenarios.findIndex((scenario) => scenario.optimum !== null);
     this.index = index;
     this.scenario = DATA.scenarios[index];
-    [...find(".chips").children].forEach((chip, i) => chip.setAttribute("aria-pressed", i === index));
-    find(".text").textContent = this.scenario.text;
-    this.robots = robotsOf(this.scenario);
-    const { label, color } = DATA.policies[this.scenario.task];
-    this.looks = [{ label: `${label} policy`, color, alpha: 1 }, { ...DATA.lqr, alpha: DATA.ghost_opacity + 0.15 }];
+    const { title, task } = this.scenario;
+    for (const chip of find(".chips").children) chip.setAttribute("aria-pressed", chip.textContent === title);
+    const same = [...DATA.scenarios.entries()].filter(([, scenario]) => scenario.title === title);
+    find(".episode").replaceChildren(...same.map(([i, { episode }]) => new Option(episode ?? "at rest", i, false, i === index)));
+    find(".text").textContent = driven
+      ? "You drive against the optimum: the stick is the robot's lean. Arrow keys or W A S D, or drag in the picture."
+      : this.scenario.text;
+    this.say("");
+    find(".share").hidden = find(".link").hidden = true;
+    find(".drive").setAttribute("aria-pressed", driven);
+    find(".pushes").hidden = find(".strength").hidden = driven;
+    find(".tilt").hidden = !driven || typeof DeviceOrientationEvent === "undefined";
+    find(".hint").textContent = driven ? "Drag anywhere: that is your stick." : "Drag a robot to push it. Drag the floor to look around.";
+    find(".hint").hidden = false;
+    this.driver = driven ? new Driver() : null;
+    this.held = new Set(); // keys
+    const mine = this.own[task];
+    this.robots = robotsOf(this.scenario, mine?.policy, this.driver);
+    this.best = this.scenario.best && new Optimum(this.scenario);
+    const { label, color } = DATA.policies[task];
+    const learned = { label: mine?.label ?? `${label} policy`, color: mine ? DATA.you.color : color, alpha: 1 };
+    const ghost = DATA.ghost_opacity + 0.15;
+    this.looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, color, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
+    if (this.best) this.looks.push({ ...DATA.best, alpha: DATA.ghost_opacity });
     this.due = this.scenario.push; // the push that comes by itself
     this.restart(this.scenario.state);
     find(".readouts tbody").replaceChildren(
@@ -58,18 +122,10 @@ class Playground {
         const row = document.createElement("tr");
         for (let i = 0; i < 6; i++) row.append(document.createElement("td"));
         row.cells[0].textContent = look.label;
-        row.cells[0].style.color = look.color;
         return row;
       }),
-      ...(this.scenario.optimum ? [this.optimumRow()] : []),
     );
-    find(".names").replaceChildren(
-      ...this.looks.map((look) => {
-        const name = document.createElement("div");
-        name.style.color = look.color;
-        return name;
-      }),
-    );
+    find(".names").replaceChildren(...this.looks.map(() => document.createElement("div")));
     if (this.scene) {
       const [x, y] = this.scenario.state;
       this.scene.camera.target = [x, y, 0.5];
@@ -77,24 +133,20 @@ class Playground {
     this.setPlaying(true);
   }
 
-  optimumRow() {
-    const row = document.createElement("tr");
-    for (let i = 0; i < 6; i++) row.append(document.createElement("td"));
-    row.cells[0].textContent = "best possible";
-    row.cells[4].textContent = this.scenario.optimum.toFixed(1);
-    row.cells[5].textContent = `in ${this.scenario.duration} s`;
-    return row;
+  /** The robots, and the optimum beside them. */
+  get everyone() {
+    return this.best ? [...this.robots, this.best] : this.robots;
   }
 
   /** All robots in one state, at time 0. */
   restart(state) {
     this.wake();
-    for (const robot of this.robots) robot.reset(state);
+    for (const robot of this.everyone) robot.reset(state);
     this.disturbed = false; // a regret is that of an episode that nobody disturbs
     this.time = 0;
     this.late = 0; // s of the episode that are not computed yet
     this.shown = null; // the push whose arrow is shown: {impulse, until}
-    this.tilts = this.robots.map(() => []);
+    this.tilts = this.everyone.map(() => []);
   }
 
   /** Draws for a while even if time stands still: what is shown has changed, and the camera comes after it. */
@@ -116,12 +168,42 @@ class Playground {
       this.due = null;
       this.hit([impulse * Math.cos(bearing), impulse * Math.sin(bearing)]);
     }
-    this.robots.forEach((robot, i) => {
+    this.everyone.forEach((robot, i) => {
       robot.advance();
       this.tilts[i].push([this.time, robot.tilt * DEGREES]);
       if (this.tilts[i].length > SHOWN_SECONDS / DATA.dt) this.tilts[i].shift();
     });
     this.time += DATA.dt;
+    if (this.driver && this.isOver(this.robots[0])) this.finish();
+  }
+
+  /** Whether a robot's episode is over: it failed or arrived, or the time is up. */
+  isOver(robot) {
+    return robot.ended !== "" || (this.scenario.optimum !== null && robot.steps * DATA.dt >= this.scenario.duration - 1e-9);
+  }
+
+  /** The end of an episode that the reader has driven. */
+  finish() {
+    this.setPlaying(false);
+    const [mine] = this.robots;
+    if (mine.failed) return this.say(`You ${verdict(mine)} after ${(mine.steps * DATA.dt).toFixed(1)} s. Restart to try again.`);
+    const policy = this.regret(this.robots[1]);
+    this.say(`Your regret is ${this.share100(mine).toFixed(1)} %.${policy ? ` The policy's: ${policy.replace("regret ", "")}.` : ""}`);
+    find(".share").hidden = false;
+  }
+
+  /** Shows a link to this episode and its score, and hands it to the device or the clipboard. */
+  async share() {
+    const address = `${location.href.split("#")[0]}#${challengeText(this.scenario, this.share100(this.robots[0]))}`;
+    find(".link").value = address;
+    find(".link").hidden = false;
+    find(".link").select();
+    try {
+      if (navigator.share) await navigator.share({ title: document.title, url: address });
+      else await navigator.clipboard.writeText(address);
+    } catch {
+      this.say("Copy the link below."); // the browser does not let the page share or copy
+    }
   }
 
   /** A push for everyone. Where somebody has fallen, all start again first. */
@@ -165,7 +247,7 @@ class Playground {
   }
 
   draw(elapsed) {
-    const states = this.robots.map((robot) => this.between(robot));
+    const states = this.everyone.map((robot) => this.between(robot));
     this.showNumbers();
     this.drawTilts();
     if (!this.scene) return;
@@ -173,22 +255,22 @@ class Playground {
     const pull = this.drag?.pull ?? (this.shown && this.time < this.shown.until ? this.shown.impulse : null);
     const robots = states.map((x, i) => ({
       x,
-      color: this.looks[i].color,
+      color: this.tint(this.looks[i].color),
       alpha: this.looks[i].alpha,
-      u: this.robots[i].ended ? null : this.robots[i].force,
-      push: pull && !this.robots[i].ended ? pull.map((part) => part * METRES_PER_IMPULSE) : null,
+      u: this.everyone[i].ended ? null : this.everyone[i].force,
+      push: pull && i < 2 && !this.robots[i].ended ? pull.map((part) => part * DATA.push_scale) : null,
     }));
-    const paths = this.robots.map((robot, i) => ({ points: robot.path, color: this.looks[i].color, dashed: i > 0 }));
+    const paths = this.everyone.map((robot, i) => ({ points: robot.path, color: this.tint(this.looks[i].color), dashed: i > 0 }));
     this.scene.draw({ robots: [...robots].reverse(), paths: paths.reverse(), markers: this.scenario.markers });
     this.showNames(states);
   }
 
-  /** The camera follows the policy's robot, and for a while the one that falls. */
+  /** The camera follows the first robot, and for a while the one that falls. */
   follow(states, elapsed) {
     const camera = this.scene.camera;
     const [own, other] = states;
     const apart = Math.hypot(own[0] - other[0], own[1] - other[1]);
-    const share = apart > 4 || this.robots[1].ended ? 0 : 0.5; // who is far behind or has ended is left there
+    const share = this.driver || apart > 4 || this.robots[1].ended ? 0 : 0.5; // who is far behind or has ended is left there
     const wanted = [own[0] + share * (other[0] - own[0]), own[1] + share * (other[1] - own[1]), 0.5];
     const blend = 1 - Math.exp(-4 * elapsed);
     camera.target = camera.target.map((value, i) => value + blend * (wanted[i] - value));
@@ -199,16 +281,18 @@ class Playground {
   showNames(states) {
     const height = DATA.robot.ball_radius + DATA.robot.com_height + DATA.robot.body_length / 2 + 0.1;
     const places = states.map((x) => this.scene.project(Vector.plus([x[0], x[1], 0], bodyFrame(x)[2], height)));
-    if (places[0] && places[1] && Math.abs(places[0][1] - places[1][1]) < 24 && Math.abs(places[0][0] - places[1][0]) < 110) {
-      places[1][1] = Math.min(places[0][1], places[1][1]) - 12;
-      places[0][1] = places[1][1] + 24;
-    }
+    places.forEach((place, i) => {
+      const near = (other) => place && other && Math.abs(other[1] - place[1]) < 24 && Math.abs(other[0] - place[0]) < 110;
+      for (let clash; (clash = places.slice(0, i).find(near)); ) place[1] = clash[1] - 24;
+    });
     [...find(".names").children].forEach((name, i) => {
       name.hidden = !places[i];
       if (!places[i]) return;
-      const robot = this.robots[i];
+      const robot = this.everyone[i];
+      name.style.borderColor = this.tint(this.looks[i].color);
       name.textContent = `${this.looks[i].label} ${verdict(robot) || `${(robot.tilt * DEGREES).toFixed(0)}°`}`;
-      const x = Math.min(Math.max(places[i][0], 50), this.scene.canvas.clientWidth - 50);
+      const half = name.offsetWidth / 2;
+      const x = Math.min(Math.max(places[i][0], half), this.scene.canvas.clientWidth - half);
       const y = Math.min(Math.max(places[i][1], 26), this.scene.canvas.clientHeight - 10);
       name.style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
     });
@@ -216,26 +300,33 @@ class Playground {
 
   showNumbers() {
     const rows = find(".readouts tbody").rows;
-    this.robots.forEach((robot, i) => {
+    this.everyone.forEach((robot, i) => {
       const force = robot.ended ? 0 : Math.hypot(...robot.force);
       const cells = [
         `${(robot.tilt * DEGREES).toFixed(0)}°`,
         `${(robot.peak * DEGREES).toFixed(0)}°`,
         `${force.toFixed(0)} N`,
         robot.cost.toFixed(1),
-        verdict(robot) === "arrived" ? this.regret(robot) : verdict(robot) || this.regret(robot),
+        robot === this.best ? `of ${this.scenario.optimum.toFixed(1)}` : robot.failed ? verdict(robot) : this.regret(robot),
       ];
       cells.forEach((text, k) => (rows[i].cells[k + 1].textContent = text));
-      rows[i].cells[5].style.color = robot.failed ? "#c01818" : "#1a7f4b";
+      rows[i].cells[0].style.borderLeftColor = this.tint(this.looks[i].color);
+      rows[i].cells[5].className = robot.failed ? "bad" : this.isOver(robot) ? "good" : "";
     });
   }
 
-  /** How much more than the best possible an undisturbed episode has cost, once it is over; "" before. */
+  /** How much more than the optimum an undisturbed robot has cost so far, or in all once its episode is over. */
   regret(robot) {
-    const { optimum, duration } = this.scenario;
-    if (optimum === null || this.disturbed || robot.failed) return "";
-    if (robot.ended !== "goal" && robot.steps * DATA.dt < duration - 1e-9) return "";
-    return `regret ${Math.max(0, 100 * (robot.cost / optimum - 1)).toFixed(1)} %`;
+    if (!this.best || this.disturbed || robot.failed || !(this.best.cost > 0)) return "";
+    const share = this.share100(robot);
+    return this.isOver(robot) ? `regret ${share.toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
+  }
+
+  /** The same as a number, %; nothing costs less than the optimum over a whole episode. */
+  share100(robot) {
+    const over = this.isOver(robot);
+    const share = 100 * (robot.cost / (over ? this.scenario.optimum : this.best.cost) - 1);
+    return over ? Math.max(0, share) : share;
   }
 
   drawTilts() {
@@ -252,13 +343,13 @@ class Playground {
     pen.font = "11px system-ui, sans-serif";
     pen.textBaseline = "middle";
     for (const tilt of [0, 30, 60, 90]) {
-      pen.fillStyle = "#667085";
+      pen.fillStyle = this.dark ? "#98a2b3" : "#667085";
       pen.fillText(String(tilt), 4, up(tilt));
-      pen.fillStyle = "#e4e7ec";
+      pen.fillStyle = this.dark ? "#2d3543" : "#e4e7ec";
       pen.fillRect(26, up(tilt), width - 30, 1);
     }
     this.tilts.forEach((line, i) => {
-      pen.strokeStyle = this.looks[i].color;
+      pen.strokeStyle = this.tint(this.looks[i].color);
       pen.lineWidth = 2;
       pen.beginPath();
       line.forEach(([t, tilt], k) => (k ? pen.lineTo(across(t), up(tilt)) : pen.moveTo(across(t), up(tilt))));
@@ -273,19 +364,25 @@ class Playground {
     window.addEventListener("resize", () => this.wake());
     view.onpointerdown = (event) => {
       if (!this.scene) return;
-      const robot = this.robotAt(place(event));
+      const robot = this.driver ? null : this.robotAt(place(event));
       this.drag = { at: place(event), robot, pull: null };
       view.setPointerCapture(event.pointerId);
       find(".hint").hidden = true;
+      if (this.driver) this.showStick(this.drag.at, [0, 0]);
     };
     view.onpointermove = (event) => {
       if (!this.scene?.matrix) return;
       if (!this.drag) {
-        view.classList.toggle("over", this.robotAt(place(event)) !== null);
+        view.classList.toggle("over", !this.driver && this.robotAt(place(event)) !== null);
         return;
       }
       const [x, y] = place(event);
-      if (this.drag.robot) this.drag.pull = this.pullTo([x, y]);
+      if (this.driver) {
+        const out = Vector.times(Vector.minus([x, y], this.drag.at), 1 / THUMB);
+        const held = Vector.times(out, 1 / Math.max(Math.hypot(...out), 1));
+        this.showStick(this.drag.at, held);
+        this.steer(held[0], -held[1]);
+      } else if (this.drag.robot) this.drag.pull = this.pullTo([x, y]);
       else {
         const camera = this.scene.camera;
         camera.yaw -= (x - this.drag.at[0]) * 0.008;
@@ -294,12 +391,11 @@ class Playground {
       }
     };
     view.onpointerup = () => {
-      this.wake();
       const pull = this.drag?.pull;
-      this.drag = null;
+      this.letGo();
       if (pull) this.hit(pull);
     };
-    view.onpointercancel = () => (this.drag = null);
+    view.onpointercancel = () => this.letGo();
     view.addEventListener(
       "wheel",
       (event) => {
@@ -310,13 +406,98 @@ class Playground {
       },
       { passive: false },
     );
-    const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     view.onkeydown = (event) => {
-      if (arrows[event.key]) this.pushOnScreen(...arrows[event.key]);
+      const along = event.ctrlKey || event.altKey || event.metaKey ? null : ARROWS[event.key];
+      if (along && this.driver) {
+        this.held.add(event.key);
+        this.steerByKeys();
+      } else if (along && event.key.length > 1) this.pushOnScreen(...along);
       else if (event.key === " ") this.setPlaying(!this.playing);
       else return;
       event.preventDefault();
     };
+    view.onkeyup = (event) => {
+      if (this.held.delete(event.key)) this.steerByKeys();
+    };
+    view.onblur = () => {
+      if (this.held.size) this.steerByKeys(this.held.clear());
+    };
+    find(".file").onchange = (event) => {
+      this.take(event.target.files[0]);
+      event.target.value = ""; // so that the same file can be chosen again
+    };
+    window.addEventListener("dragover", (event) => event.preventDefault());
+    window.addEventListener("drop", (event) => {
+      event.preventDefault();
+      this.take(event.dataTransfer.files[0]);
+    });
+  }
+
+  letGo() {
+    this.wake();
+    this.drag = null;
+    find(".stick").hidden = true;
+    if (this.driver) this.steer(0, 0);
+  }
+
+  showStick([x, y], [dx, dy]) {
+    find(".stick").hidden = false;
+    find(".stick").style.transform = `translate(${x}px, ${y}px)`;
+    find(".stick i").style.transform = `translate(${THUMB * dx}px, ${THUMB * dy}px)`;
+  }
+
+  /** Holds the driver's stick along the screen: x to the right, y away from the camera. */
+  steer(x, y) {
+    if (!this.driver) return;
+    const [right, back] = this.scene?.right ? [this.scene.right, this.scene.back] : [[1, 0], [0, -1]];
+    const away = Math.hypot(back[0], back[1]);
+    this.driver.hold(...[0, 1].map((i) => x * right[i] - (y * back[i]) / away));
+    if (!this.playing && (x || y) && !this.isOver(this.robots[0])) this.setPlaying(true);
+  }
+
+  steerByKeys() {
+    const sum = [...this.held].map((key) => ARROWS[key]).reduce((total, along) => Vector.plus(total, along), [0, 0]);
+    this.steer(...sum);
+  }
+
+  /** Lets the device be the stick. iOS asks the reader first, and only where a press asks for it. */
+  async askForTilt() {
+    try {
+      const answer = await (DeviceOrientationEvent.requestPermission?.() ?? "granted");
+      if (answer !== "granted") throw new Error("the browser was told not to");
+    } catch (error) {
+      return this.say(`This device does not tell how it is tilted: ${error.message}.`);
+    }
+    let level = null; // how it was held first
+    window.removeEventListener("deviceorientation", this.tilted); // of an earlier press
+    this.tilted = ({ beta, gamma }) => {
+      if (!Number.isFinite(beta) || !Number.isFinite(gamma) || this.drag) return;
+      const turn = ((screen.orientation?.angle ?? 0) * Math.PI) / 180; // of the screen in the device
+      level ??= [gamma, beta];
+      const [x, y] = [(gamma - level[0]) / TILTED, (level[1] - beta) / TILTED];
+      this.steer(x * Math.cos(turn) - y * Math.sin(turn), x * Math.sin(turn) + y * Math.cos(turn));
+    };
+    window.addEventListener("deviceorientation", this.tilted);
+    this.say("Hold the device as is comfortable: this is the stick's centre. Tilt it to lean.");
+  }
+
+  /** Takes a policy from an ONNX file, in the task that it is made for. */
+  async take(file) {
+    if (!file) return;
+    try {
+      if (file.size > LARGEST_FILE) throw new Error(`it is larger than ${LARGEST_FILE / 2 ** 20} MiB`);
+      const policy = new OnnxPolicy(new Uint8Array(await file.arrayBuffer()));
+      const fitting = Object.keys(DATA.tasks).filter((task) => DATA.tasks[task].observations === policy.observations);
+      const named = fitting.find((task) => DATA.tasks[task].id === policy.task);
+      const task = named ?? fitting.find((name) => name === this.scenario.task) ?? fitting[0];
+      if (!task) throw new Error(`it observes ${policy.observations} numbers, and the tasks give ${Object.entries(DATA.tasks).map(([name, { observations }]) => `${observations} (${name})`).join(", ")}`);
+      policy.model = MODELS[task];
+      this.own[task] = { policy, label: file.name.slice(0, 24) };
+      this.open(task === this.scenario.task ? this.index : DATA.scenarios.findIndex((scenario) => scenario.task === task), this.driver !== null);
+      this.say(`${file.name.slice(0, 60)} controls the robot in ${task}.`);
+    } catch (error) {
+      this.say(`${file.name.slice(0, 60)} cannot be used: ${error.message}.`);
+    }
   }
 
   /** The robot near a pixel of the canvas, or null. */
@@ -343,7 +524,7 @@ class Playground {
     const from = this.drag.from ?? (this.drag.from = this.scene.unproject(this.drag.at, centre[2]));
     const to = this.scene.unproject(pixel, centre[2]);
     if (!from || !to) return this.drag.pull;
-    const impulse = [0, 1].map((i) => (to[i] - from[i]) / METRES_PER_IMPULSE);
+    const impulse = [0, 1].map((i) => (to[i] - from[i]) / DATA.push_scale);
     const size = Math.hypot(...impulse);
     if (size < 3) return null;
     const bounded = Math.min(size, STRONGEST);
@@ -357,7 +538,8 @@ function verdict(robot) {
   if (robot.ended === "goal") return "arrived";
   if (robot.ended === "tilt") return "fell";
   if (robot.ended === "arena") return "ran away";
-  return robot.ended ? "touched" : "";
+  if (robot.ended === "force") return "gave no number";
+  return robot.failed ? "touched" : "";
 }
 
 const playground = new Playground();

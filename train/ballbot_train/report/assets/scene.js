@@ -4,7 +4,11 @@
 
 const FIELD_OF_VIEW = 0.7; // rad, vertical
 const LIGHT = [-0.36, -0.44, 0.82]; // towards it, of length 1
-const SKY = [0.933, 0.949, 0.973];
+/** Colours of sky, bright and dark squares. */
+const THEMES = {
+  light: { sky: [0.933, 0.949, 0.973], bright: [0.985, 0.985, 0.985], dim: [0.83, 0.86, 0.905] },
+  dark: { sky: [0.075, 0.09, 0.12], bright: [0.27, 0.3, 0.35], dim: [0.2, 0.225, 0.27] },
+};
 
 const SOLID_VERTEX = `#version 300 es
 in vec3 position; in vec3 normal;
@@ -30,7 +34,7 @@ void main() {
 const FLOOR_FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 at, up;
-uniform vec3 eye, sky; uniform vec4 color; uniform vec3 light; uniform float lit;
+uniform vec3 eye, sky, bright, dim; uniform vec4 color; uniform vec3 light; uniform float lit;
 out vec4 pixel;
 void main() {
   vec2 wide = max(fwidth(at.xy), 1e-4), p = at.xy;
@@ -38,7 +42,7 @@ void main() {
   vec2 wave = 2.0 * (abs(fract((p - 0.5 * wide) * 0.5) - 0.5) - abs(fract((p + 0.5 * wide) * 0.5) - 0.5)) / wide;
   float dark = 0.5 - 0.5 * wave.x * wave.y;
   float far = smoothstep(5.0, 26.0, distance(at.xy, eye.xy));
-  pixel = vec4(mix(mix(vec3(0.985), vec3(0.83, 0.86, 0.905), dark), sky, far), 1.0);
+  pixel = vec4(mix(mix(bright, dim, dark), sky, far), 1.0);
 }`;
 
 /** 4×4 matrices as arrays in columns. */
@@ -134,6 +138,7 @@ class Scene {
     this.canvas = canvas;
     this.robot = robot;
     this.look = look;
+    this.theme = THEMES.light;
     const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true }));
     if (!gl) throw new Error("no WebGL 2");
     this.solid = this.program(SOLID_VERTEX, SOLID_FRAGMENT);
@@ -157,7 +162,7 @@ class Scene {
     gl.bindAttribLocation(program, 1, "normal");
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-    const names = ["place", "camera", "color", "eye", "light", "lit", "sky"];
+    const names = ["place", "camera", "color", "eye", "light", "lit", "sky", "bright", "dim"];
     return { program, at: Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)])) };
   }
 
@@ -218,7 +223,7 @@ class Scene {
   draw({ robots, paths, markers }) {
     const gl = this.gl;
     this.aim();
-    gl.clearColor(...SKY, 1);
+    gl.clearColor(...this.theme.sky, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
@@ -256,7 +261,7 @@ class Scene {
     gl.uniformMatrix4fv(at.camera, false, this.matrix);
     gl.uniform3fv(at.eye, this.eye);
     gl.uniform3fv(at.light, LIGHT);
-    gl.uniform3fv(at.sky, SKY);
+    for (const [name, value] of Object.entries(this.theme)) gl.uniform3fv(at[name], value);
     gl.uniform1f(at.lit, 1);
   }
 
