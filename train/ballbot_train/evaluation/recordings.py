@@ -1,0 +1,165 @@
+"""What a controller did in the certified episodes, as one small file: states and actions at every control step.
+
+States are whole multiples of `GRID`, actions of `ACTION_GRID`. Whole numbers are the same on every machine, and the second
+differences of smooth motions are small, so that 200 episodes of 400 control steps take 0.4 to 2 MB.
+
+An .npz file holds
+
+| array | shape | meaning |
+|---|---|---|
+| about | (bytes,) uint8 | JSON: what ran, see `Recording.about` |
+| lengths | (n,) uint32 | control steps of episodes 0 to n − 1; 0 where the controller found no plan |
+| states | (4, 8, steps + n) uint8 | all states in turn, see `_packed` |
+| actions | (4, 2, steps) uint8 | all actions in turn |
+"""
+
+import base64
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import file_name, robot_name
+from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.provenance import provenance
+
+GRID = 1e-7
+"""Of states, SI units. Stepping a rounded state misses the next rounded one by up to 3e-7."""
+ACTION_GRID = 2.0**-23
+"""Of actions, which are fractions of the force limit: as fine as float32 is near 1."""
+FOLDER = "recordings"
+"""Of a results folder."""
+LARGEST_FILE = 4 * 2**20  # bytes
+_LARGEST_UNPACKED = 2**26  # bytes, as of one that holds 200 episodes of 8,000 control steps
+_ABOUT_LIMIT = 2**14  # bytes
+_ARRAYS = {"about", "lengths", "states", "actions"}
+_MOST = 2**31 - 1
+
+Motion = tuple[np.ndarray, np.ndarray]
+"""States (n+1, 8) and actions (n, 2) of an episode, both int32, in units of the grids; (0, 8) and (0, 2) without a plan."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A file's content: states (steps + n, 8) m, rad and per second, actions (steps, 2), and each episode's control steps."""
+
+    about: dict[str, Any]
+    """"task" (a name), "problem" (`Task.problem`), "robot", "physics", "controller", "policy" (the digest of its weights, or
+    ""), "versions"; of a submission "name" and "link" too."""
+    lengths: np.ndarray
+    states: np.ndarray
+    actions: np.ndarray
+
+
+def rounded(trajectory: Trajectory | None, params: BallbotParams) -> Motion:
+    """The motion of an episode on the grids. What no whole number holds, as of a simulation that exploded, is cut off."""
+    if trajectory is None:
+        return np.zeros((0, 8), np.int32), np.zeros((0, 2), np.int32)
+    parts = trajectory.x / GRID, trajectory.u / params.force_limit / ACTION_GRID
+    states, actions = (np.rint(np.clip(part, -_MOST, _MOST)).astype(np.int32) for part in parts)
+    return states, actions
+
+
+def to_text(motion: Motion) -> str:
+    """A motion as text, for what holds JSON."""
+    return base64.b64encode(zlib.compress(b"".join(part.astype("<i4").tobytes() for part in motion))).decode()
+
+
+def from_text(text: str) -> Motion:
+    """The motion of what `to_text` gave."""
+    numbers = np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i4")
+    steps = len(numbers) // 10
+    states = 8 * (steps + 1) if len(numbers) else 0
+    return numbers[:states].reshape(-1, 8), numbers[states:].reshape(-1, 2)
+
+
+def about(
+    task: Task, name: str, robot: BallbotParams, physics: str, controller: str, policy: str = ""
+) -> dict[str, Any]:
+    """`Recording.about` of a run; `name` is the task's, `policy` the digest of its weights."""
+    made_by = provenance()
+    return {
+        "task": name,
+        "problem": task.problem(),
+        "robot": robot_name(robot),
+        "physics": physics,
+        "controller": controller,
+        "policy": policy,
+        "versions": {key: str(made_by[key]) for key in ("version", "commit", "python", "numpy")},
+    }
+
+
+def path_in(out: Path, about: Mapping[str, Any]) -> Path:
+    """Where a results folder keeps the recording of a task and a controller."""
+    slug = "".join(sign if sign.isalnum() else "-" for sign in Path(about["controller"]).name)
+    return out / FOLDER / f"{file_name(about['task'], about['robot'])}-{slug}.npz"
+
+
+def write(path: Path, about: Mapping[str, Any], motions: Sequence[Motion]) -> Path:
+    """Writes a recording of the first certified episodes, in order."""
+    states, actions = (np.concatenate(parts) for parts in zip(*motions, strict=True))
+    return write_arrays(path, about, np.array([len(part) for _, part in motions]), states, actions)
+
+
+def write_arrays(path: Path, about: Mapping[str, Any], lengths: np.ndarray, *whole: np.ndarray) -> Path:
+    """As `write`, of states and actions in turn, in units of their grids or as a `Recording` holds them."""
+    states, actions = (
+        part if part.dtype.kind == "i" else np.rint(part / grid).astype(np.int32)
+        for part, grid in zip(whole, (GRID, ACTION_GRID), strict=True)
+    )
+    text = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    arrays = {"about": text, "lengths": lengths.astype(np.uint32)}
+    return files.write_npz(path, arrays | {"states": _packed(states), "actions": _packed(actions)})
+
+
+def read(path: str | Path) -> Recording:
+    """What `write` wrote. Sizes are checked before anything is unpacked, and nothing in the file is executed.
+
+    Raises:
+        FileError: it is missing, damaged, too large, or no recording.
+    """
+    arrays = files.arrays_of(files.read(path, LARGEST_FILE), path, _LARGEST_UNPACKED)
+    if unknown := arrays.keys() - _ARRAYS:
+        raise files.FileError(f"{path} holds {', '.join(sorted(unknown))}, which no recording has: costs are computed")
+    if missing := _ARRAYS - arrays.keys():
+        raise files.FileError(f"{path} is no recording: it has no array {', '.join(sorted(missing))}")
+    lengths, text = arrays["lengths"], arrays["about"]
+    if lengths.dtype != np.uint32 or lengths.ndim != 1 or text.dtype != np.uint8 or text.ndim != 1:
+        raise files.FileError(f"{path} is no recording: lengths must be uint32 and about uint8, each of one axis")
+    steps = int(lengths.sum(dtype=np.int64))
+    shapes = {"states": (4, 8, steps + int(np.count_nonzero(lengths))), "actions": (4, 2, steps)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape or arrays[name].dtype != np.uint8:
+            raise files.FileError(f"{path}: {name} has the shape {arrays[name].shape}, and not {shape} of uint8")
+    facts = files.json_of(text.tobytes(), path, _ABOUT_LIMIT)
+    if not isinstance(facts, dict):
+        raise files.FileError(f"{path} is no recording: about holds no object")
+    return Recording(
+        facts,
+        lengths.astype(np.int64),
+        GRID * _unpacked(arrays["states"]),
+        ACTION_GRID * _unpacked(arrays["actions"]),
+    )
+
+
+def _packed(whole: np.ndarray) -> np.ndarray:
+    """The second differences of int32 (n, m) along n, modulo 2**32, small if they are near 0, as planes of their bytes."""
+    differences = np.diff(whole.astype(np.int64), 2, axis=0, prepend=np.zeros((2, whole.shape[1]), np.int64)).astype(
+        np.int32
+    )
+    zigzag = ((differences << 1) ^ (differences >> 31)).astype("<u4")
+    return np.ascontiguousarray(zigzag.T).view(np.uint8).reshape(whole.shape[1], -1, 4).transpose(2, 0, 1)
+
+
+def _unpacked(planes: np.ndarray) -> np.ndarray:
+    """(n, m) int32 of what `_packed` gave."""
+    zigzag = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<u4")[..., 0].astype(np.int64)
+    differences = (zigzag >> 1) ^ -(zigzag & 1)
+    return np.cumsum(np.cumsum(differences, 1), 1).astype(np.int32).T
