@@ -174,7 +174,7 @@ def benchmark(
             digest = registry.policy_digest(name, make_task(task, robot), robot)
             about = recordings.about(make_task(task, robot), task, named_robot(robot), physics, name, digest)
             done = [m for r, m in zip(results, motions, strict=True) if (r.task, r.controller) == (task, name)]
-            recordings.write(recordings.path_in(out, about), about, done)
+            recordings.write_in(out, about, done)
     return results
 
 

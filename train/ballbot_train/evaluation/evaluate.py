@@ -139,7 +139,7 @@ def evaluate(
             if indices == list(range(len(indices))) and not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
                 about = recordings.about(env.task, named[1], env.params, env.physics, named[0], digest)
-                recordings.write(recordings.path_in(Path(out), about), about, motions)
+                recordings.write_in(Path(out), about, motions)
         return row
     finally:
         env.close()

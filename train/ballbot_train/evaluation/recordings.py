@@ -15,6 +15,7 @@ An .npz file holds
 
 import base64
 import json
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -96,26 +97,27 @@ def about(
     }
 
 
-def path_in(out: Path, about: Mapping[str, Any]) -> Path:
-    """Where a results folder keeps the recording of a task and a controller."""
-    slug = "".join(sign if sign.isalnum() else "-" for sign in Path(about["controller"]).name)
-    return out / FOLDER / f"{file_name(about['task'], about['robot'])}-{slug}.npz"
+def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
+    """Name of the file of what a controller did in a task."""
+    return f"{file_name(task, robot)}-{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-')}{ending}"
 
 
-def write(path: Path, about: Mapping[str, Any], motions: Sequence[Motion]) -> Path:
-    """Writes a recording of the first certified episodes, in order."""
+def write_in(out: Path, about: Mapping[str, Any], motions: Sequence[Motion]) -> Path:
+    """Writes what was done in the first certified episodes, in order, into a results folder."""
     states, actions = (np.concatenate(parts) for parts in zip(*motions, strict=True))
-    return write_arrays(path, about, np.array([len(part) for _, part in motions]), states, actions)
+    lengths = np.array([len(part) for _, part in motions])
+    path = out / FOLDER / file_of(about["task"], about["robot"], Path(about["controller"]).stem)
+    return write(path, about, Recording({}, lengths, GRID * states, ACTION_GRID * actions))
 
 
-def write_arrays(path: Path, about: Mapping[str, Any], lengths: np.ndarray, *whole: np.ndarray) -> Path:
-    """As `write`, of states and actions in turn, in units of their grids or as a `Recording` holds them."""
+def write(path: Path, about: Mapping[str, Any], recording: Recording) -> Path:
+    """Writes a recording, with other words about it."""
     states, actions = (
-        part if part.dtype.kind == "i" else np.rint(part / grid).astype(np.int32)
-        for part, grid in zip(whole, (GRID, ACTION_GRID), strict=True)
+        np.rint(part / grid).astype(np.int32)
+        for part, grid in ((recording.states, GRID), (recording.actions, ACTION_GRID))
     )
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    arrays = {"about": text, "lengths": lengths.astype(np.uint32)}
+    arrays = {"about": text, "lengths": recording.lengths.astype(np.uint32)}
     return files.write_npz(path, arrays | {"states": _packed(states), "actions": _packed(actions)})
 
 
