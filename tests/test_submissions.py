@@ -92,7 +92,7 @@ def test_a_teleport_of_a_millimetre_is_refused(forge, submitted):
 
 def test_a_changed_start_and_mixed_up_episodes_are_refused(forge, submitted):
     honest = recordings.read(submitted()[1])
-    start = changed(honest.states, (0, 0), honest.states[0, 0] + 2e-7)
+    start = changed(honest.states, (0, 0), honest.states[0, 0] + 2e-8)
     with pytest.raises(SubmissionError, match=r"episode 0, step 0: it does not begin at its certified start$"):
         forge(states=start)
     first = honest.lengths[0]
@@ -110,7 +110,7 @@ def test_another_action_and_one_beyond_its_limit_are_refused(forge, submitted):
     with pytest.raises(SubmissionError, match=r"episode 0, step 4: the action \[1\.25, .*\] is beyond its limit of 1"):
         forge(actions=changed(actions, (3, 0), 1.25))
     with pytest.raises(SubmissionError, match="episode 0, step 4: the next state does not follow"):
-        forge(actions=changed(actions, (3, 0), actions[3, 0] + 1e-5))
+        forge(actions=changed(actions, (3, 0), actions[3, 0] + 2e-6))
 
 
 def test_an_end_that_is_none_is_refused(forge, submitted):
@@ -199,8 +199,8 @@ def test_motions_survive_the_way_through_text_and_file(rng, tmp_path):
     lengths = [3, 0, 5]
     motions = [
         (
-            rng.integers(-(2**31) + 1, 2**31, (n + 1 if n else 0, 8)).astype(np.int32),
-            rng.integers(-(2**23), 2**23, (n, 2)).astype(np.int32),
+            rng.integers(-(2**36), 2**36, (n + 1 if n else 0, 8)),
+            rng.integers(-(2**28), 2**28, (n, 2)),
         )
         for n in lengths
     ]

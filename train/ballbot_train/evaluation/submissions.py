@@ -29,10 +29,10 @@ from ballbot_train.evaluation.results import Result, read_results, summarize, to
 
 TOLERANCE = 1e-6
 """Largest difference of a recorded state from the one that follows, m, rad and per second, where the state is all that
-decides. Rounding to the grids makes 3e-7 of it. As a force it is 1e-4 N, so nobody can steer with it."""
-CONTACT_TOLERANCE = 1e-5
-"""The same where an engine simulates the contact of a rolling ball. Each step then starts with a ball that rolls without
-slipping, which honest motions in grip keep within 2e-6. A ball that slips has a spin that no recording holds."""
+decides. Rounding to the grids makes at most 1.2e-7 of it. As a force it is 1e-4 N, so nobody can steer with it."""
+CONTACT_TOLERANCE = 1e-4
+"""The same where an engine simulates the contact of a rolling ball; as a force 0.01 N. Each step then starts with a ball that
+rolls without slipping, which honest motions in grip keep within 1e-5. A ball that slips has a spin that none holds."""
 
 _IN_WHEEL = Path(ballbot_train.__file__).parent / "leaderboard"
 LEADERBOARD = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_WHEEL.parents[2] / "leaderboard"
