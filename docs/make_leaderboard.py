@@ -15,7 +15,7 @@ from ballbot_train.evaluation.submissions import Entry, read_entries
 
 PAGE = Path(__file__).parent / "leaderboard.md"
 _TABLES = re.compile(r"(<!-- tables -->\n).*(<!-- end of tables -->)", flags=re.DOTALL)
-_HEADER = ["controller", "mean regret, 95 %", "failed", "group", "best", "worst"]
+_HEADER = ["controller", "regret, 95 %", "failed", "group", "best", "worst"]
 
 
 def page() -> str:
