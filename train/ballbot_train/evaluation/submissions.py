@@ -124,9 +124,13 @@ def read_entries(folder: Path = LEADERBOARD) -> list[Entry]:
     entries = []
     for path in sorted(folder.glob("*.json")):
         try:
-            entries.append(Entry(**files.read_json(path)))
+            entry = Entry(**files.read_json(path))
+            wrong = _wrong_name(entry.name, entry.link)
         except TypeError as error:
             raise files.FileError(f"{path} holds no row of a leaderboard: {error}") from error
+        if wrong:
+            raise files.FileError(f"{path}: {wrong}")
+        entries.append(entry)
     return entries
 
 
@@ -228,16 +232,8 @@ def _checked_facts(about: Mapping[str, Any], path: str | Path) -> dict[str, Any]
     for key, length in _LENGTHS.items():
         if not isinstance(about[key], str) or len(about[key]) > length:
             refuse(f"{key} must be text of at most {length} characters")
-    if not _NAME.fullmatch(about["name"]):
-        refuse(f"name must be of letters, digits, spaces and . + ( ) - _, not {about['name']!r}")
-    if about["link"]:
-        try:
-            parts = urlsplit(about["link"])
-            right = parts.scheme in ("http", "https") and parts.hostname and re.fullmatch(r"[!#-;=?-~]+", about["link"])
-        except ValueError:
-            right = False
-        if not right:
-            refuse(f"link must be an address that begins with https:// or http://, not {about['link']!r}")
+    if wrong := _wrong_name(about["name"], about["link"]):
+        refuse(wrong)
     if not re.fullmatch(r"([0-9a-f]{64})?", about["policy"]):
         refuse("policy must be a SHA-256, or empty")
     for key, names in (("task", TASKS), ("robot", ROBOTS), ("physics", PHYSICS)):
@@ -249,6 +245,18 @@ def _checked_facts(about: Mapping[str, Any], path: str | Path) -> dict[str, Any]
     if not all(isinstance(part, str) and _VERSION.fullmatch(part) for pair in versions.items() for part in pair):
         refuse("versions must be short words by name")
     return dict(about)
+
+
+def _wrong_name(name: str, link: str) -> str:
+    """What is wrong with a row's name or link; pages show both."""
+    if not _NAME.fullmatch(name):
+        return f"name must be of letters, digits, spaces and . + ( ) - _, not {name!r}"
+    try:
+        parts = urlsplit(link)
+        right = parts.scheme in ("http", "https") and parts.hostname and re.fullmatch(r"[!#-\'*-;=?-~]+", link)
+    except ValueError:
+        right = False
+    return "" if right or not link else f"link must be an address that begins with https:// or http://, not {link!r}"
 
 
 class _Steps:
