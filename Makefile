@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 # imports anew: one that trains takes 6 s to start in place of 2.5.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types pytest test-slow bench soak faults fuzz docs pictures certify clients pythons ray clean
+.PHONY: demo test types pytest test-slow verify bench soak faults fuzz docs pictures certify clients pythons ray clean
 
 demo: $(VENV)/runs
 	$(BIN)/ballbot benchmark --episodes 10 --out runs/demo
@@ -28,6 +28,10 @@ pytest: $(VENV)/installed
 
 test-slow: $(VENV)/installed
 	$(BIN)/pytest -m slow
+
+# the submissions that lie beside rows of the leaderboard
+verify: $(VENV)/installed
+	$(BIN)/pytest tests/test_submissions.py -k "beside or row"
 
 # one page with all figures of speed, beside those of the last page of another commit
 bench: $(VENV)/installed

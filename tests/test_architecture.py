@@ -180,10 +180,10 @@ def test_no_file_names_a_place_on_the_developers_machine():
     assert relative(path for path in ALL_FILES if places.search(path.read_text())) == []
 
 
-def test_urdf_travels_with_the_package():
+def test_urdfs_and_the_leaderboard_travel_with_the_package():
     assert URDF_PATH.is_file()
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert wheel["force-include"] == {"urdf": "ballbot_gym/urdf"}
+    assert wheel["force-include"] == {"urdf": "ballbot_gym/urdf", "leaderboard": "ballbot_train/leaderboard"}
 
 
 def test_the_cubic_hermite_basis_and_the_angle_of_tilt_each_have_one_place():

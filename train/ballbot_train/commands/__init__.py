@@ -11,6 +11,8 @@ COMMANDS: dict[str, str] = {
     "benchmark": "ballbot_train.commands.benchmark:benchmark",
     "evaluate": "ballbot_train.commands.evaluate:evaluate",
     "compare": "ballbot_train.commands.compare:compare",
+    "submit": "ballbot_train.commands.submit:submit",
+    "verify": "ballbot_train.commands.verify:verify",
     "robustness": "ballbot_train.commands.robustness:robustness",
     "transfer": "ballbot_train.commands.transfer:transfer",
     "basins": "ballbot_train.commands.basins:basins",

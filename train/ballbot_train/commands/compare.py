@@ -7,7 +7,8 @@ from typing import Any
 from ballbot_gym import files
 from ballbot_train.console import console, print_table
 from ballbot_train.evaluation import comparison
-from ballbot_train.evaluation.results import read_results, to_json
+from ballbot_train.evaluation.results import to_json
+from ballbot_train.evaluation.submissions import read_run
 
 
 def compare(
@@ -22,18 +23,18 @@ def compare(
     """Says for every task and controller whether B is better than A, worse, or that the episodes cannot tell.
 
     Args:
-        a: folder of a benchmark, its leaderboard.json or its episodes.csv.
+        a: folder of a benchmark, its leaderboard.json or its episodes.csv; or the name of a row of the leaderboard, as lqr.
         b: the other.
         match: a controller of A and one of B, to compare controllers of different names.
         margin: differences of success and regret up to this decide nothing; 0.001 is 0.1 %.
         training_margin: the same between policies with different weights, which the seed of their training makes differ.
         out: file for the same as JSON.
     """
-    runs = read_results(a), read_results(b)
+    runs = read_run(a), read_run(b)
     compared = comparison.compare(runs[0], runs[1], match, margin, training_margin)
-    for key in sorted(runs[0][0].keys() | runs[1][0].keys()):
+    for key in sorted(runs[0][0].keys() & runs[1][0].keys()):
         first, second = (run[0].get(key) for run in runs)
-        if runs[0][0] and runs[1][0] and first != second and key not in ("policies", "load_start", "load_end"):
+        if first != second and key not in ("policies", "load_start", "load_end"):
             console.print(f"{key}: {first} in A, {second} in B")
     header = ["task", "controller", "B is", "episodes", "success B − A", "regret B − A", "because"]
     print_table(f"A: {a}\nB: {b}", header, [_cells(entry) for entry in compared])

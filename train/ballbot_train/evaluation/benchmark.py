@@ -18,11 +18,11 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, check_some
 from ballbot_train.evaluation import controllers as registry
-from ballbot_train.evaluation import optima
+from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import iterate_episodes
 from ballbot_train.evaluation.results import Result
 from ballbot_train.executors import Workers
-from ballbot_train.policy_files import paths_of, shipped_policies
+from ballbot_train.policy_files import paths_of
 from ballbot_train.provenance import provenance
 
 _CHUNK = 5  # episodes of a job
@@ -75,13 +75,12 @@ def _identity(name: str) -> str:
 
 def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
     """SHA-256 of the weights of every learned policy among controllers by task, under "TASK/NAME"."""
-    digests = {}
-    for task, group in controllers.items():
-        shipped = shipped_policies(make_task(task, robot), robot)
-        for name in group:
-            if not registry.is_expert(name):
-                digests[f"{task}/{name}"] = registry.digest_of(str(shipped.get(name, name)))
-    return digests
+    return {
+        f"{task}/{name}": registry.policy_digest(name, make_task(task, robot), robot)
+        for task, group in controllers.items()
+        for name in group
+        if not registry.is_expert(name)
+    }
 
 
 def open_run(
@@ -147,7 +146,9 @@ def benchmark(
     seed: int = 0,
     robot: str = PAPER,
 ) -> list[Result]:
-    """Runs the controllers of every task, in parallel processes; what an interrupted run finished is not run again.
+    """Runs the controllers of every task, in parallel processes, and records what they do for `ballbot submit`.
+
+    What an interrupted run finished is not run again.
 
     Args:
         controllers: names by task, as `controllers_of` gives.
@@ -160,12 +161,21 @@ def benchmark(
         robot: by name.
     """
     work = [
-        episode_job(task, name, physics, range(start, min(start + _CHUNK, episodes)), seed, robot=robot)
+        episode_job(task, name, physics, range(start, min(start + _CHUNK, episodes)), seed, robot=robot, record=True)
         for task, group in controllers.items()
         for name in group
         for start in range(0, episodes, _CHUNK)
     ]
-    return [Result(**entry) for entries in jobs.run(work, out, workers, on_progress) for entry in entries]
+    entries = [entry for done in jobs.run(work, out, workers, on_progress) for entry in done]
+    motions = [recordings.from_text(entry.pop("motion")) for entry in entries]
+    results = [Result(**entry) for entry in entries]
+    for task, group in controllers.items():
+        for name in group:
+            digest = registry.policy_digest(name, make_task(task, robot), robot)
+            about = recordings.about(make_task(task, robot), task, named_robot(robot), physics, name, digest)
+            done = [m for r, m in zip(results, motions, strict=True) if (r.task, r.controller) == (task, name)]
+            recordings.write_in(out, about, done)
+    return results
 
 
 def episode_job(
@@ -180,12 +190,13 @@ def episode_job(
     robot: str = PAPER,
     made_for: str | None = None,
     variant: BallbotParams | None = None,
+    record: bool = False,
 ) -> jobs.Job:
     """Some certified episodes of a robot under a controller by name, as a job whose entries are the fields of Results.
 
     The controller is made for the robot, or for another one by name. A variant of the robot may run in its place; regret is
     over the robot's own optimum then too. The label tells jobs apart that differ in their randomization or robots; progress
-    counts for the group, or else the task.
+    counts for the group, or else the task. With record each entry also has the "motion" as `recordings.to_text` gives it.
     """
     what, packed = f"{task}-{controller}-{physics}-{label}", registry.packed(controller)
     # the optima go along, because workers on other machines do not have this user's cache
@@ -194,7 +205,7 @@ def episode_job(
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(task, controller, packed, physics, seed, randomization, robot, made_for, variant, known),
+        arguments=(task, controller, packed, physics, seed, randomization, robot, made_for, variant, known, record),
         items=tuple(episodes),
         group=group or task,
     )
@@ -211,11 +222,15 @@ def _episode_entries(
     made_for: str | None,
     variant: BallbotParams | None,
     known: certified.EvaluationSet,
+    record: bool,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=variant or robot)
     believed = (env.task, env.params) if made_for is None else (make_task(task, made_for), named_robot(made_for))
     made = registry.make_packed(controller, packed, *believed)
-    for result in iterate_episodes(env, made, controller, task, episodes, seed, known):
-        yield asdict(result)
+    motions: list[recordings.Motion] = []
+    for result in iterate_episodes(
+        env, made, controller, task, episodes, seed, known, motions.append if record else None
+    ):
+        yield asdict(result) | ({"motion": recordings.to_text(motions.pop())} if record else {})
     env.close()

@@ -76,6 +76,14 @@ def digest_of(name: str) -> str:
     return weights_digest(name)
 
 
+def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> str:
+    """`digest_of` of a policy by name or file; "" of an expert."""
+    if is_expert(name):
+        return ""
+    robot = robot if isinstance(robot, str) else robot_name(robot)
+    return digest_of(str(shipped_policies(task, robot).get(name, name)))
+
+
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
     """The task that is named, or the registered one that a policy file names, or stabilize.
 

@@ -20,8 +20,8 @@ from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER
 from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation import optima, recordings
+from ballbot_train.evaluation.controllers import make_controller, policy_digest
 from ballbot_train.evaluation.results import Result, Row, summarize, write_leaderboard
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import PolicyError
@@ -113,7 +113,7 @@ def evaluate(
         robot: a name in `ROBOTS`, or any BallbotParams.
         workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
             does: what it does must be under `if __name__ == "__main__"`.
-        out: folder for the results, as `ballbot benchmark` writes them and `ballbot compare` reads them.
+        out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
 
     Raises:
         TypeError, ValueError: no such policy, task, physics or episodes.
@@ -125,7 +125,9 @@ def evaluate(
         controller = as_controller(policy, env.task, env.params)
         known = optima.known(env.task, env.params, indices, workers)
         named = name or _name(policy), task_name(env.task)
-        results = list(iterate_episodes(env, controller, *named, indices, 0, known))
+        motions: list[recordings.Motion] = []
+        keep = None if out is None else motions.append
+        results = list(iterate_episodes(env, controller, *named, indices, 0, known, keep))
         row = summarize(results)
         if out is not None:
             facts = provenance() | {
@@ -134,6 +136,10 @@ def evaluate(
                 "robot": repr(env.params),
             }
             write_leaderboard([row], results, facts, Path(out))
+            if indices == list(range(len(indices))) and not env.randomization.active:
+                digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
+                about = recordings.about(env.task, named[1], env.params, env.physics, named[0], digest)
+                recordings.write_in(Path(out), about, motions)
         return row
     finally:
         env.close()
@@ -216,8 +222,9 @@ def iterate_episodes(
     episodes: Iterable[int],
     seed: int,
     episode_set: certified.EvaluationSet,
+    keep: Callable[[recordings.Motion], None] | None = None,
 ) -> Iterator[Result]:
-    """As `run_episodes`, one by one, compared with the optima of any set."""
+    """As `run_episodes`, one by one, compared with the optima of any set; `keep` gets what was done in each."""
     for i in episodes:
         optimum = float(episode_set.costs[i])
         common: dict[str, Any] = {
@@ -227,6 +234,7 @@ def iterate_episodes(
             "physics": env.physics,
             "optimum": optimum,
         }
+        run = None
         try:
             run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=episode_set.options(i))
         except PlanError as error:
@@ -249,4 +257,6 @@ def iterate_episodes(
                 "step_seconds": run.act_seconds,
                 "effort": float(np.hypot(*run.trajectory.u.T).mean()),
             }
+        if keep is not None:
+            keep(recordings.rounded(None if run is None else run.trajectory, env.params))
         yield Result(**common, **outcome, **measures)

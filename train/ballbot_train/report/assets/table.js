@@ -43,10 +43,21 @@ function addFilter(table) {
   table.parentElement.before(bar);
 }
 
-for (const table of document.querySelectorAll("table.sortable")) {
-  addFilter(table);
+function makeSortable(table) {
   for (const [column, head] of [...table.tHead.rows[0].cells].entries()) {
-    head.querySelector("button").onclick = () =>
-      sortTable(table, column, head.getAttribute("aria-sort") === "ascending");
+    let button = head.querySelector("button");
+    if (!button) {
+      button = document.createElement("button");
+      button.type = "button";
+      button.append(...head.childNodes);
+      head.append(button);
+    }
+    button.onclick = () => sortTable(table, column, head.getAttribute("aria-sort") === "ascending");
   }
 }
+
+for (const table of document.querySelectorAll("table.sortable")) {
+  addFilter(table);
+  makeSortable(table);
+}
+for (const table of document.querySelectorAll(".md-typeset table")) makeSortable(table); // of the documentation's site

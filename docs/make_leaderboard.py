@@ -1,0 +1,79 @@
+"""Writes the tables of leaderboard.md from the rows in leaderboard/: python docs/make_leaderboard.py."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from ballbot_gym import files
+from ballbot_gym.engines import PHYSICS_NAMES
+from ballbot_gym.robots import PAPER
+from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.verify import regret
+from ballbot_train.console import markdown
+from ballbot_train.evaluation import comparison
+from ballbot_train.evaluation.submissions import Entry, read_entries
+
+PAGE = Path(__file__).parent / "leaderboard.md"
+_TABLES = re.compile(r"(<!-- tables -->\n).*(<!-- end of tables -->)", flags=re.DOTALL)
+_HEADER = ["controller", "regret, 95 %", "failed", "group", "best", "worst"]
+
+
+def page() -> str:
+    """The page as the rows make it."""
+    boards: dict[tuple[str, str, str], list[Entry]] = {}
+    for entry in read_entries():
+        boards.setdefault((entry.task, entry.robot, entry.physics), []).append(entry)
+    tasks = list(TASKS)
+    order = sorted(boards, key=lambda board: (board[1] != PAPER, *board[1:], tasks.index(board[0])))
+    text = "\n".join(f"## {_title(*board)}\n\n{_table(boards[board])}" for board in order)
+    return _TABLES.sub(lambda match: f"{match[1]}\n{text}\n{match[2]}", PAGE.read_text(encoding="utf-8"))
+
+
+def _title(task: str, robot: str, physics: str) -> str:
+    return task.capitalize() + (f", {robot}" if robot != PAPER else "") + f", in {PHYSICS_NAMES[physics]}"
+
+
+def _table(entries: Sequence[Entry]) -> str:
+    """Fewer failures first, then less regret."""
+    ranked = sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
+    lines = [
+        [
+            entry.name,
+            regret(entry),
+            f"{round(len(entry.costs) * (1 - entry.success))}",
+            str(group),
+            *map(str, _extremes(entry)),
+        ]
+        for entry, group in zip(ranked, _groups(ranked), strict=True)
+    ]
+    table = markdown(_HEADER, lines)
+    for entry in entries:
+        if entry.link:
+            table = table.replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |")
+    return table
+
+
+def _groups(ranked: Sequence[Entry]) -> list[int]:
+    """A new group begins with each row that is worse than the first of the group before, by the paired episodes."""
+    groups, leader = [1], ranked[0]
+    for entry in ranked[1:]:
+        (compared,) = comparison.compare(
+            ({}, leader.results()),
+            ({}, entry.results()),
+            match=(leader.name, entry.name),
+            training_margin=comparison.MARGIN,  # a row is one policy, and not its method
+        )
+        worse = compared.verdict == "worse"
+        groups.append(groups[-1] + worse)
+        leader = entry if worse else leader
+    return groups
+
+
+def _extremes(entry: Entry) -> tuple[int, int]:
+    """The episodes that are nearest to and farthest from their optima, the price of failures included."""
+    ratios = [result.cost / result.optimum for result in entry.results()]
+    return ratios.index(min(ratios)), ratios.index(max(ratios))
+
+
+if __name__ == "__main__":
+    files.write(PAGE, page())

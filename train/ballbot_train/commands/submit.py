@@ -1,0 +1,31 @@
+"""`ballbot submit`: what a controller did in the certified episodes, as files for the leaderboard."""
+
+from pathlib import Path
+
+from ballbot_train.commands.verify import print_entries
+from ballbot_train.console import console
+from ballbot_train.evaluation import submissions
+
+
+def submit(
+    results: Path, /, *, name: str, link: str = "", controller: str = "", out: Path = Path("submissions")
+) -> None:
+    """Makes the submissions of a results folder, one small file per task, and verifies them.
+
+    Args:
+        results: folder that evaluate(out=...), `ballbot evaluate --episodes 200` or `ballbot benchmark` wrote.
+        name: of the leaderboard's row.
+        link: where one reads about the controller; an address that begins with https://.
+        controller: which one, where the folder has several.
+        out: folder of the submissions.
+    """
+    paths = submissions.submit(results, name, link, out, controller)
+    try:
+        entries = [submissions.verify(path) for path in paths]
+    except ValueError:
+        for path in paths:
+            path.unlink()
+        raise
+    print_entries(entries)
+    for path in paths:
+        console.print(f"submission: {path}, {path.stat().st_size / 2**20:.2f} MiB")

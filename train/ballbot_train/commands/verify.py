@@ -1,0 +1,60 @@
+"""`ballbot verify`: the leaderboard row of a submission, computed from its motion alone."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from ballbot_train.console import console, print_table
+from ballbot_train.evaluation import submissions
+
+
+def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:
+    """Verifies submissions to the leaderboard without policy or trust, and prints the row of each.
+
+    Args:
+        files: of `ballbot submit`.
+        write: folder into which each row is written as JSON, such as leaderboard.
+    """
+    if not files:
+        raise ValueError("give at least one submission")
+    entries, refused = [], []
+    for path in files:
+        try:
+            entries.append(submissions.verify(path))
+        except ValueError as error:
+            refused.append(f"refused: {error}")
+    print_entries(entries)
+    for entry in entries if write is not None else ():
+        console.print(f"row: {entry.write(write)}")
+    if refused:
+        raise submissions.SubmissionError("\n".join(refused))
+
+
+def print_entries(entries: Sequence[submissions.Entry]) -> None:
+    """Prints rows of the leaderboard as a table."""
+    header = ["task", "name", "robot", "physics", "success", "falls", "regret mean"]
+    rows = [
+        [
+            entry.task,
+            entry.name,
+            entry.robot,
+            entry.physics,
+            f"{entry.success:.1%}",
+            f"{entry.falls}/{len(entry.costs)}",
+            regret(entry),
+        ]
+        for entry in entries
+    ]
+    if rows:
+        print_table("verified", header, rows)
+
+
+def regret(entry: submissions.Entry) -> str:
+    """The mean regret of a row with its interval, %; a dash where every episode failed."""
+    numbers = [
+        math.nan if value is None else 100 * value for value in (entry.regret_mean, entry.regret_low, entry.regret_high)
+    ]
+    mean, low, high = numbers
+    if not math.isfinite(mean):
+        return "–"
+    return f"{mean:.2f} %" + (f" ({low:.2f} to {high:.2f})" if math.isfinite(low) else "")

@@ -1,0 +1,167 @@
+"""What a controller did in the certified episodes, as one small file: states and actions at every control step.
+
+States are whole multiples of `GRID`, actions of `ACTION_GRID`. Whole numbers are the same on every machine, and the second
+differences of smooth motions are small, so that 200 episodes of 400 control steps take 0.5 to 2 MB.
+
+An .npz file holds
+
+| array | shape | meaning |
+|---|---|---|
+| about | (bytes,) uint8 | JSON: what ran, see `Recording.about` |
+| lengths | (n,) uint32 | control steps of episodes 0 to n − 1; 0 where the controller found no plan |
+| states | (5, 8, steps + n) uint8 | all states in turn, see `_packed` |
+| actions | (5, 2, steps) uint8 | all actions in turn |
+"""
+
+import base64
+import json
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import file_name, robot_name
+from ballbot_gym.tasks import Task
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.provenance import provenance
+
+GRID = 1e-8
+"""Of states, SI units. A step from a rounded state ends up to 12 times as far from the next one, in a violent fall."""
+ACTION_GRID = 2.0**-28
+"""Of actions, which are fractions of the force limit."""
+FOLDER = "recordings"
+"""Of a results folder."""
+LARGEST_FILE = 4 * 2**20  # bytes
+_LARGEST_UNPACKED = 2**26  # bytes, as of one that holds 200 episodes of 8,000 control steps
+_ABOUT_LIMIT = 2**14  # bytes
+_ARRAYS = {"about", "lengths", "states", "actions"}
+_BYTES = 5  # of a second difference
+_MOST = 2**36  # grid units, of which no second difference needs more
+
+Motion = tuple[np.ndarray, np.ndarray]
+"""States (n+1, 8) and actions (n, 2) of an episode, both int64, in units of the grids; (0, 8) and (0, 2) without a plan."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A file's content: states (steps + n, 8) m, rad and per second, actions (steps, 2), and each episode's control steps."""
+
+    about: dict[str, Any]
+    """"task" (a name), "problem" (`Task.problem`), "robot", "physics", "controller", "policy" (the digest of its weights, or
+    ""), "versions"; of a submission "name" and "link" too."""
+    lengths: np.ndarray
+    states: np.ndarray
+    actions: np.ndarray
+
+
+def rounded(trajectory: Trajectory | None, params: BallbotParams) -> Motion:
+    """The motion of an episode on the grids. What no whole number holds, as of a simulation that exploded, is cut off."""
+    if trajectory is None:
+        return np.zeros((0, 8), np.int64), np.zeros((0, 2), np.int64)
+    parts = trajectory.x / GRID, trajectory.u / params.force_limit / ACTION_GRID
+    states, actions = (np.rint(np.clip(part, -_MOST, _MOST)).astype(np.int64) for part in parts)
+    return states, actions
+
+
+def to_text(motion: Motion) -> str:
+    """A motion as text, for what holds JSON."""
+    return base64.b64encode(zlib.compress(b"".join(part.astype("<i8").tobytes() for part in motion))).decode()
+
+
+def from_text(text: str) -> Motion:
+    """The motion of what `to_text` gave."""
+    numbers = np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i8")
+    steps = len(numbers) // 10
+    states = 8 * (steps + 1) if len(numbers) else 0
+    return numbers[:states].reshape(-1, 8), numbers[states:].reshape(-1, 2)
+
+
+def about(
+    task: Task, name: str, robot: BallbotParams, physics: str, controller: str, policy: str = ""
+) -> dict[str, Any]:
+    """`Recording.about` of a run; `name` is the task's, `policy` the digest of its weights."""
+    made_by = provenance()
+    return {
+        "task": name,
+        "problem": task.problem(),
+        "robot": robot_name(robot),
+        "physics": physics,
+        "controller": controller,
+        "policy": policy,
+        "versions": {key: str(made_by[key]) for key in ("version", "commit", "python", "numpy")},
+    }
+
+
+def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
+    """Name of the file of what a controller did in a task."""
+    return f"{file_name(task, robot)}-{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-')}{ending}"
+
+
+def write_in(out: Path, about: Mapping[str, Any], motions: Sequence[Motion]) -> Path:
+    """Writes what was done in the first certified episodes, in order, into a results folder."""
+    states, actions = (np.concatenate(parts) for parts in zip(*motions, strict=True))
+    lengths = np.array([len(part) for _, part in motions])
+    path = out / FOLDER / file_of(about["task"], about["robot"], Path(about["controller"]).stem)
+    return write(path, about, Recording({}, lengths, GRID * states, ACTION_GRID * actions))
+
+
+def write(path: Path, about: Mapping[str, Any], recording: Recording) -> Path:
+    """Writes a recording, with other words about it."""
+    states, actions = (
+        np.rint(part / grid).astype(np.int64)
+        for part, grid in ((recording.states, GRID), (recording.actions, ACTION_GRID))
+    )
+    text = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    arrays = {"about": text, "lengths": recording.lengths.astype(np.uint32)}
+    return files.write_npz(path, arrays | {"states": _packed(states), "actions": _packed(actions)})
+
+
+def read(path: str | Path) -> Recording:
+    """What `write` wrote. Sizes are checked before anything is unpacked, and nothing in the file is executed.
+
+    Raises:
+        FileError: it is missing, damaged, too large, or no recording.
+    """
+    arrays = files.arrays_of(files.read(path, LARGEST_FILE), path, _LARGEST_UNPACKED)
+    if unknown := arrays.keys() - _ARRAYS:
+        raise files.FileError(f"{path} holds {', '.join(sorted(unknown))}, which no recording has: costs are computed")
+    if missing := _ARRAYS - arrays.keys():
+        raise files.FileError(f"{path} is no recording: it has no array {', '.join(sorted(missing))}")
+    lengths, text = arrays["lengths"], arrays["about"]
+    if lengths.dtype != np.uint32 or lengths.ndim != 1 or text.dtype != np.uint8 or text.ndim != 1:
+        raise files.FileError(f"{path} is no recording: lengths must be uint32 and about uint8, each of one axis")
+    steps = int(lengths.sum(dtype=np.int64))
+    shapes = {"states": (_BYTES, 8, steps + int(np.count_nonzero(lengths))), "actions": (_BYTES, 2, steps)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape or arrays[name].dtype != np.uint8:
+            raise files.FileError(f"{path}: {name} has the shape {arrays[name].shape}, and not {shape} of uint8")
+    facts = files.json_of(text.tobytes(), path, _ABOUT_LIMIT)
+    if not isinstance(facts, dict):
+        raise files.FileError(f"{path} is no recording: about holds no object")
+    return Recording(
+        facts,
+        lengths.astype(np.int64),
+        GRID * _unpacked(arrays["states"]),
+        ACTION_GRID * _unpacked(arrays["actions"]),
+    )
+
+
+def _packed(whole: np.ndarray) -> np.ndarray:
+    """The second differences of int64 (n, m) along n, as planes of their bytes (5, m, n); small numbers have zeros there."""
+    differences = np.diff(whole, 2, axis=0, prepend=np.zeros((2, whole.shape[1]), np.int64))
+    zigzag = np.ascontiguousarray(((differences << 1) ^ (differences >> 63)).T.astype("<u8"))
+    return zigzag.view(np.uint8).reshape(whole.shape[1], -1, 8).transpose(2, 0, 1)[:_BYTES]
+
+
+def _unpacked(planes: np.ndarray) -> np.ndarray:
+    """(n, m) int64 of what `_packed` gave."""
+    zigzag = np.zeros((*planes.shape[1:], 8), np.uint8)
+    zigzag[..., :_BYTES] = planes.transpose(1, 2, 0)
+    whole = zigzag.view("<u8")[..., 0].astype(np.int64)
+    return np.cumsum(np.cumsum((whole >> 1) ^ -(whole & 1), 1), 1).T
