@@ -31,6 +31,7 @@ from ballbot_gym.lazy import load
 from ballbot_train import cli
 from ballbot_train.commands import COMMANDS as COMMAND_ENTRIES
 from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.policy_files import SHIPPED
 
 _TIMES = {"plan_seconds", "step_seconds"}  # columns that no two runs share
 _LIMIT = 900.0  # s, after which a command hangs
@@ -72,7 +73,7 @@ def _sets(out: Path) -> Made:
 
 def _dataset(out: Path) -> Made:
     from ballbot_gym.env import make_task
-    from ballbot_train.learning.demonstrations import load_demos
+    from ballbot_train.learning.datasets import load_demos
 
     return dict(vars(load_demos(out, make_task("turn"))))
 
@@ -94,7 +95,7 @@ def _policy(out: Path) -> Made:
 
 
 _NET = "--task turn --resume --hidden 8 --evaluations 1 --seed 1"
-_RL = "--rl-iterations 6 --num-envs 4 --num-steps 8 --batch-size 16"
+_RL = "--iterations 6 --num-envs 4 --num-steps 8 --batch-size 16"
 
 
 def _command(words: str, read: Callable[[Path], Made], workers: bool = True) -> Command:
@@ -118,7 +119,7 @@ COMMANDS = {
     "transfer": _command(
         "transfer --tasks turn --controllers lqr --made-for paper rolling --episodes 8 --physics rk4", _episodes
     ),
-    "tune": _command("tune rsl_ppo --task turn --trials 3 --seeds 1 --env-steps 8192 --evaluations 2", _search),
+    "tune": _command("tune ppo --task turn --trials 3 --seeds 1 --env-steps 8192 --evaluations 2", _search),
     "demos": _command("demos --task turn --expert lqr --episodes 12 --physics rk4", _dataset),
     "bc": _train("dagger", "--iterations 6 --gathering-iterations 0 --gradient-steps 20 --demos {demos}"),
     "dagger": _train(
@@ -127,12 +128,7 @@ COMMANDS = {
         "--tracked-rollouts-per-plan 1 --gradient-steps 20",
     ),
     "ppo": _train("ppo", _RL),
-    "ppo from demonstrations": _train(
-        "ppo", f"{_RL} --demos {{demos}} --clone-iterations 2 --clone-gradient-steps 20 --critic-warmup-iterations 1"
-    ),
-    "rsl_ppo": _train(
-        "rsl_ppo", "--total-iterations 6 --num-envs 16 --num-steps 8 --num-mini-batches 2 --critic-hidden 8"
-    ),
+    "ppo from a policy": _train("ppo", f"{_RL} --start {SHIPPED / 'turn-dagger.json'}"),
     "sac": _train("sac", _RL),
     "shac": _train("shac", "--iterations 8 --num-envs 4 --horizon 3"),
 }

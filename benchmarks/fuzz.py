@@ -220,7 +220,8 @@ def _entries(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, .
 
 def _demos(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_gym.env import make_task
-    from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+    from ballbot_train.learning.datasets import load_demos
+    from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
     out = write_demos(DemoConfig("turn", "lqr", 2, "rk4"), folder / "tiny-v0", 1, lambda count: None)
     paths = [out / "data" / "metadata.json", out / "data" / "main_data.hdf5"]

@@ -36,7 +36,8 @@ from ballbot_train import jobs
 from ballbot_train.commands.certify import certify
 from ballbot_train.evaluation.benchmark import benchmark
 from ballbot_train.executors import Workers
-from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+from ballbot_train.learning.datasets import load_demos
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
 _NODE = {"object_store_memory": 100 * 2**20}
 _LOOPS = 1_000_000  # of a computing item, some tenths of a second

@@ -1,15 +1,23 @@
 """What mkdocs does for the site besides its pages.
 
-`<!-- file: README.md -->` in a page stands for that file of the repository's root. The playground's page is written anew.
-The script that sorts the report's tables sorts the site's too.
+`<!-- file: README.md -->` in a page stands for that file of the repository's root, and `<!-- settings -->` for the tables of
+the learners' settings. The playground's page is written anew. The script that sorts the report's tables sorts the site's too.
 """
 
+import ast
+import importlib
+import inspect
+import itertools
 import re
+import textwrap
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File
 
+from ballbot_gym.tasks import TASKS
+from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.report.playground import write_playground
 
 _ROOT = Path(__file__).parent.parent
@@ -24,6 +32,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     Raises:
         FileNotFoundError: a page names a file that does not exist.
     """
+    markdown = markdown.replace("<!-- settings -->", settings_tables()) if "<!-- settings -->" in markdown else markdown
     return _FILE.sub(lambda match: _with_links_of_the_site((_ROOT / match[1]).read_text(encoding="utf-8")), markdown)
 
 
@@ -36,6 +45,42 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
 def on_post_build(config: Any, **_: Any) -> None:
     """Called by mkdocs after the pages: writes the playground that docs/playground.md shows."""
     write_playground(Path(config["site_dir"]) / "playground" / "page.html")
+
+
+def settings_tables() -> str:
+    """A table per learner, and one more of settings after a warm start, of every setting, its meaning and its values."""
+    parts = []
+    for (name, algorithm), warm in itertools.product(LEARNERS.items(), (False, True)):
+        columns = {task: algorithm.settings(task, warm) for task in TASKS}
+        if warm and columns == {task: algorithm.settings(task) for task in TASKS}:
+            continue
+        rows = [f"| setting | meaning | {' | '.join(columns)} |", f"|---|---|{'---|' * len(columns)}"]
+        meanings = _meanings(getattr(importlib.import_module(algorithm.module), algorithm.config))
+        for field in fields(columns["turn"]):
+            values = " | ".join(_shown(getattr(settings, field.name)) for settings in columns.values())
+            rows.append(f"| `{field.name}` | {meanings[field.name]} | {values} |")
+        title = f"`{name}`, from demonstrations or a policy" if warm else f"`{name}`"
+        parts.append(f"## {title}\n\n" + "\n".join(rows))
+    return "\n\n".join(parts)
+
+
+def _meanings(config: type) -> dict[str, str]:
+    """What the docstrings under the fields of a dataclass and its bases say, by field."""
+    found: dict[str, str] = {}
+    for kind in reversed(config.__mro__[:-1]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
+        for field, after in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
+                found[field.target.id] = " ".join(ast.literal_eval(after.value).split())
+    return found
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if is_dataclass(value):
+        return ", ".join(f"{field.name} {getattr(value, field.name):g}" for field in fields(value))
+    return " ".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
 
 
 def _with_links_of_the_site(text: str) -> str:

@@ -36,7 +36,8 @@ from ballbot_train.cli import _run
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.results import leaderboard, read_results, write_leaderboard
 from ballbot_train.learning import training
-from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+from ballbot_train.learning.datasets import load_demos
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS, check_settings
 from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy
 
@@ -697,28 +698,21 @@ LEARNING = [
     (settings("shac", learning_rate=math.nan), "learning_rate must be finite and positive, not nan"),
     (settings("shac", learning_rate=-1e-3), "learning_rate must be finite and positive"),
     (settings("shac", learning_rate=0.0), "learning_rate must be finite and positive"),
-    (settings("sac", tau=2.0), "tau must be 0 to 1, not 2.0"),
     (settings("shac", horizon=10**9), "horizon must be 0 to 100000"),
     (settings("shac", horizon=10**4, num_envs=10**5), "1000000000 env steps per iteration, and at most 100000000"),
-    (settings("rsl_ppo", std=0.0), "std must be finite and positive, not 0.0"),
-    (settings("rsl_ppo", final_std=0.0), "final_std must be finite and positive"),
-    (settings("rsl_ppo", final_learning_rate=0.0), "final_learning_rate must be finite and positive"),
-    (settings("rsl_ppo", gamma=1.5), "gamma must be 0 to 1, not 1.5"),
-    (settings("rsl_ppo", gamma=-0.5), "gamma must be 0 to 1"),
-    (settings("rsl_ppo", gae_lambda=math.nan), "gae_lambda must be 0 to 1, not nan"),
-    (settings("rsl_ppo", num_envs=10**8), "num_envs must be 1 to 1048576"),
-    (settings("rsl_ppo", hidden=(10**6, 10**6)), "hidden must be 1 to 16384"),
-    (
-        settings("rsl_ppo", num_envs=3, num_steps=2, num_mini_batches=7),
-        "num_mini_batches 7 is more than the 6 env steps",
-    ),
-    (settings("rsl_ppo", clip_range=math.inf), "clip_range must be finite"),
-    (settings("ppo", reward_scale=0.0), "reward_scale must be finite and positive"),
-    (settings("sac", tau=-0.1), "tau must be 0 to 1"),
+    (settings("ppo", std=0.0), "std must be finite and positive, not 0.0"),
+    (settings("ppo", final_std=0.0), "final_std must be finite and positive"),
+    (settings("ppo", gamma=1.5), "gamma must be 0 to 1, not 1.5"),
+    (settings("ppo", gamma=-0.5), "gamma must be 0 to 1"),
+    (settings("ppo", gae_lambda=math.nan), "gae_lambda must be 0 to 1, not nan"),
+    (settings("ppo", num_envs=10**8), "num_envs must be 1 to 1048576"),
+    (settings("ppo", hidden=(10**6, 10**6)), "hidden must be 1 to 16384"),
+    (settings("ppo", short_episodes=1.5), "short_episodes must be 0 to 1, not 1.5"),
+    (settings("ppo", imitation_weight=math.inf), "imitation_weight must be finite"),
     (settings("dagger", hidden=(0,)), "hidden must be 1 to"),
     (settings("dagger", batch_size=0), "batch_size must be 1 to"),
     (settings("ppo", gamma=math.inf), "gamma must be 0 to 1, not inf"),
-    (settings("sac", rl_iterations=0), "rl_iterations must be 1 to"),
+    (settings("sac", iterations=0), "iterations must be 1 to"),
     (settings("dagger", gathering_iterations=-1), "gathering_iterations must be 0 to"),
 ]
 
@@ -901,19 +895,13 @@ TYPED = [
     ("evaluate /dev/zero", "unknown controller /dev/zero"),
     ("benchmark --tasks", "give at least one task"),
     ("benchmark --tasks turn --controllers lqr --physics rk4 --out /dev/null", "/dev/null cannot be a folder"),
-    ("train rsl_ppo --std 0", "std must be finite and positive, not 0.0"),
-    ("train rsl_ppo --gamma 2", "gamma must be 0 to 1, not 2.0"),
-    ("train rsl_ppo --num-envs 100000000", "num_envs must be 1 to 1048576"),
-    ("train rsl_ppo --num-envs 0", "num_envs must be 1 to"),
-    (
-        "train rsl_ppo --num-mini-batches 7 --num-envs 3 --num-steps 2",
-        "num_mini_batches 7 is more than the 6 env steps",
-    ),
-    ("train rsl_ppo --task stabilize --symmetry frame", "has no frame"),
-    ("train rsl_ppo --symmetry dance", "invalid choice 'dance'"),
-    ("train rsl_ppo --episode-seconds 0.013", "is not a whole number of control steps"),
-    ("train rsl_ppo --episode-seconds 1e9", "must be 1 to 1,000,000 control steps"),
-    ("train rsl_ppo --hidden 1000000000", "hidden must be 1 to 16384"),
+    ("train ppo --std 0", "std must be finite and positive, not 0.0"),
+    ("train ppo --gamma 2", "gamma must be 0 to 1, not 2.0"),
+    ("train ppo --num-envs 100000000", "num_envs must be 1 to 1048576"),
+    ("train ppo --num-envs 0", "num_envs must be 1 to"),
+    ("train ppo --symmetry dance", "invalid choice 'dance'"),
+    ("train ppo --episode-seconds 1e9", "must be 1 to 1,000,000 control steps"),
+    ("train ppo --hidden 1000000000", "hidden must be 1 to 16384"),
     ("trian", "did you mean train?"),
     ("train ppo --task stabilize --symmetry frame", "has no frame"),
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),

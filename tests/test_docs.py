@@ -16,6 +16,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.submissions import read_entries
 from ballbot_train.executors import Workers
 from ballbot_train.learning import training
+from ballbot_train.learning.learners import model_free
 from ballbot_train.policy import SHIPPED
 
 ROOT = Path(__file__).parent.parent
@@ -23,7 +24,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 CLIENTS = ROOT / "docs" / "clients.md"  # whose code test_clients.py runs where the clients are installed
 SHORTER = {  # a training that a page calls `# minutes` runs with these too
     "dagger": "--iterations 1 --episodes-per-iteration 4 --candidate-episodes 4 --batch-episodes 0 --gradient-steps 5",
-    "ppo": "--rl-iterations 1 --num-envs 64 --num-steps 48 --clone-iterations 1 --critic-warmup-iterations 0",
+    "ppo": "--iterations 1 --num-envs 64 --num-steps 48",
     "shac": "--iterations 1 --num-envs 8 --horizon 4",
 }
 MEASURED = "--evaluations 1 --test-episodes 2 --validation-episodes 2"
@@ -63,6 +64,7 @@ def test_the_task_that_is_added_can_be_certified(interpreted):
 def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: MEASURED_AS)
+    monkeypatch.setattr(model_free, "_CLONE_ITERATIONS", 1)
     monkeypatch.setattr("ballbot_train.commands.benchmark.checked_episodes", lambda *given, few: 2)
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():

@@ -13,7 +13,8 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import routing, training
-from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+from ballbot_train.learning.datasets import load_demos
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS, dagger
 
 CLONING = dagger.DaggerConfig(iterations=4, gathering_iterations=0, gradient_steps=20, batch_size=128, hidden=(16,))

@@ -2,12 +2,11 @@
 
 import io
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import PPO, SAC
 
 from ballbot_gym import dynamics
 from ballbot_gym.env import BallbotEnv, make_task
@@ -15,41 +14,56 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, cost_to_go, relative_advantages, value_of_living
-from ballbot_train.learning.curricula import Curriculum
-from ballbot_train.learning.demonstrations import DemoConfig, Demos, load_demos, write_demos
+from ballbot_train.learning.curricula import FAILURE_PRICE, CurriculumBatch
+from ballbot_train.learning.datasets import Demos, load_demos
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.frames import demos_in_frame
-from ballbot_train.learning.learners import LEARNERS, ppo, sac
+from ballbot_train.learning.learners import LEARNERS, model_free, ppo, sac
 from ballbot_train.learning.learners.model_free import ScopedRng, TrainingEnv
-from ballbot_train.policy import load_network, save_policy, shipped_policies
+from ballbot_train.policy import PolicyNetwork, load_network, save_policy, shipped_policies
 
-IMITATING = {"clone_iterations": 2, "clone_gradient_steps": 5, "clone_batch_size": 32, "critic_warmup_iterations": 1}
 TINY = {
     "ppo": ppo.PpoConfig(
-        rl_iterations=3,
+        iterations=3,
         num_envs=4,
         num_steps=16,
+        gamma=0.995,
         final_gamma=0.999,
         episode_seconds=0.4,
         hidden=(16, 8),
         batch_size=32,
-        demo_batch_size=32,
-        update_epochs=2,
-        **IMITATING,
+        gae_lambda=0.95,
+        relative_costs=False,
     ),
     "sac": sac.SacConfig(
         products=True,
+        gamma=0.995,
         final_gamma=0.999,
-        learning_rate_schedule="geometric",
-        rl_iterations=3,
+        iterations=3,
         num_envs=4,
         num_steps=8,
         gradient_steps=2,
         episode_seconds=0.2,
         hidden=(16, 8),
         batch_size=16,
-        **IMITATING,
+        n_steps=1,
     ),
 }
+CLONED = 2  # iterations
+SCALE = model_free._REWARD_SCALE
+
+
+@pytest.fixture(autouse=True)
+def little_imitation(monkeypatch):
+    for constant, value in {
+        "CLONE_ITERATIONS": CLONED,
+        "CLONE_STEPS": 5,
+        "CLONE_BATCH": 32,
+        "WARMUP_ITERATIONS": 1,
+    }.items():
+        monkeypatch.setattr(model_free, f"_{constant}", value)
+    monkeypatch.setattr(sac, "_CONTROL_DT", None)  # as in the task
+    monkeypatch.setattr(ppo, "UPDATE_EPOCHS", 2)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +122,7 @@ def test_a_learner_goes_on_from_its_state_as_if_never_stopped(name, demonstrated
 
 
 def test_the_policy_acts_as_the_actor_does(name, tmp_path):
-    task, learner = make_task("stabilize"), make(name, products=True)
+    task, learner = make_task("stabilize"), make(name)
     run(learner, 1)
     observation = np.random.default_rng(0).normal(size=(100, 8)).astype(np.float32)
     save_policy(tmp_path / "policy", learner.network, {})
@@ -118,9 +132,9 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
     np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_the_policy_is_a_running_average_of_the_actor(name):
-    learner = make(name, averaged_iterations=2)
+def test_the_policy_is_a_running_average_of_the_actor(name, monkeypatch):
+    monkeypatch.setattr(model_free, "_AVERAGED_ITERATIONS", 2)
+    learner = make(name)
     seen, last = [], parameters(learner)
     for _ in range(3):
         learner.iterate()
@@ -140,7 +154,7 @@ def test_the_discount_of_ppo_rises_and_takes_all_values_with_it():
         before = policy.predict_values(seen)
         learner._raise_gamma(0.999)
         after = policy.predict_values(seen)
-    task, scale = make_task("stabilize"), learner.config.reward_scale
+    task, scale = make_task("stabilize"), SCALE
     change = value_of_living(task, scale, 0.999) - value_of_living(task, scale, 0.99)
     torch.testing.assert_close(after, before + change)
     learner._raise_gamma(0.99)
@@ -159,7 +173,7 @@ def test_the_discount_of_sac_rises_and_takes_all_values_with_it(products):
         after = learner._model.critic(seen, acted)
         highest = learner._highest()
         learner._raise_gamma(0.99)
-    task, scale = make_task("stabilize"), learner.config.reward_scale
+    task, scale = make_task("stabilize"), SCALE
     change = value_of_living(task, scale, 0.999) - value_of_living(task, scale, 0.99)
     for ours, value in zip(after, before, strict=True):
         torch.testing.assert_close(ours, value + change)
@@ -169,17 +183,23 @@ def test_the_discount_of_sac_rises_and_takes_all_values_with_it(products):
     assert learner._replay.gamma == learner._env.batch.gamma == learner._model.gamma
 
 
-@pytest.mark.parametrize(("schedule", "second"), [("linear", 0.7), ("geometric", 0.1 ** (1 / 3))])
-def test_the_learning_rate_falls_as_its_schedule_says(name, schedule, second):
-    learner = make(name, learning_rate=1e-3, final_learning_rate_fraction=0.1, learning_rate_schedule=schedule)
+def test_learning_rate_and_deviation_fall_as_they_are_set(name):
+    learner = make(name, learning_rate=1e-3, final_learning_rate_fraction=0.1)
     rates = [learner.iterate()["train/learning_rate"] for _ in range(2)]
-    assert rates == pytest.approx([1e-3, 1e-3 * second], rel=1e-3)
+    assert rates == pytest.approx([1e-3, 7e-4], rel=1e-3)
+    if name == "ppo":
+        learner = make(name, std=0.2, final_std=0.025)
+        assert [learner.iterate()["train/std"] for _ in range(3)] == pytest.approx([0.2, 0.1, 0.05])
 
 
-def test_schedules_wait_until_the_task_is_its_own(name):
-    settings = {"rl_iterations": 8, "gamma": 0.9, "final_gamma": 0.99, "curriculum_progress": 0.25}
-    settings |= {"learning_rate": 1e-3, "final_learning_rate_fraction": 0.1, "last_learning_rate": 4e-4}
-    learner = make(name, **settings, learning_rate_schedule="linear", curriculum=Curriculum(goal_factor=2.0))
+def test_schedules_wait_until_the_task_is_its_own(monkeypatch):
+    monkeypatch.setattr(model_free, "_WAITING_PROGRESS", 0.25)
+    monkeypatch.setattr(model_free, "_SETTLED_LEARNING_RATE", 4e-4)
+    settings = {"iterations": 8, "gamma": 0.9, "final_gamma": 0.99, "backwards": True, "symmetry": "none"}
+    settings |= {"learning_rate": 1e-3, "final_learning_rate_fraction": 0.1}
+
+    def turn():
+        return LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], **settings), 0)
 
     def gone(whole):  # shares of the schedule of the discount, by iteration
         figures = [whole.iterate() for _ in range(4)]
@@ -187,50 +207,46 @@ def test_schedules_wait_until_the_task_is_its_own(name):
             each["train/learning_rate"] for each in figures
         ]
 
+    monkeypatch.setattr(CurriculumBatch, "_start_on_optima", lambda batch, ended: None)
+    learner = turn()
     shares, rates = gone(learner)
     assert shares == pytest.approx([0, 0.125, 0.25, 0.25])
     assert rates == pytest.approx([1e-3, 1e-3 * (1 - 0.9 / 8), 1e-3 * (1 - 0.9 / 4), 1e-3 * (1 - 0.9 / 4)])
-    learner._env.batch._goal_factor = 1.0
-    resumed = make(name, **settings, learning_rate_schedule="linear", curriculum=Curriculum(goal_factor=2.0))
+    batch = learner._env.batch
+    batch._goal_factor, batch._ramp["max_speed"], batch._has_settled = 1.0, batch._own.max_speed, True
+    resumed = turn()
     resumed.load_state_dict(learner.state_dict())
     shares, rates = gone(resumed)
     assert shares == pytest.approx([0.25, 0.4375, 0.625, 0.8125])
     assert rates == pytest.approx([4e-4 - 3e-4 * k / 4 for k in range(4)])
 
 
-def test_demonstrations_have_their_own_learning_rate_to_the_end(name, demos):
-    settings = {"clone_iterations": 0, "critic_warmup_iterations": 0, "learning_rate": 1e-4, "last_learning_rate": 1e-3}
-    learner = make(name, demos, **settings)
-    assert learner.iterate()["train/learning_rate"] == pytest.approx(1e-4)
-
-
-@pytest.mark.parametrize("waits", [0.25, 1.0])
-def test_schedules_do_not_wait_without_a_curriculum(name, waits):
-    learner = make(name, gamma=0.9, final_gamma=0.99, curriculum_progress=waits)
-    logged = [1 - learner.iterate()["train/gamma"] for _ in range(3)]
-    assert logged == pytest.approx([0.1 * 10 ** (-k / 3) for k in range(3)])
+@pytest.mark.parametrize("setting", ["gamma", "final_gamma"])
+def test_a_discount_that_is_no_discount_is_refused(name, setting):
+    with pytest.raises(ValueError, match=f"^{setting} must be between 0 and 1, not 1"):
+        make(name, **{setting: 1.0})
 
 
 def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
-    learner = make("ppo", relative_advantages=1.0)
+    learner = make("ppo", relative_costs=True)
     learner.iterate()
     buffer = learner._model.rollout_buffer
-    living = value_of_living(make_task("stabilize"), learner.config.reward_scale, learner._model.gamma)
+    living = value_of_living(make_task("stabilize"), SCALE, learner._model.gamma)
     returns, values = torch.as_tensor(buffer.returns), torch.as_tensor(buffer.values)
     torch.testing.assert_close(torch.as_tensor(buffer.advantages), relative_advantages(returns, values, living))
     assert buffer.advantages.std() == pytest.approx(1, abs=0.02)
 
 
-def test_what_shaping_adds_to_values_is_no_cost_to_go():
+def test_what_shaping_adds_to_values_is_no_cost_to_go(monkeypatch):
+    monkeypatch.setattr(CurriculumBatch, "_start_on_optima", lambda batch, ended: None)
     task = make_task("turn")
-    settings = replace(TINY["ppo"], relative_advantages=1.0, pay=False, curriculum=Curriculum(shaping=10.0))
-    learner = ppo.make(task, default_params(), settings, 0, None)
+    learner = ppo.make(task, default_params(), replace(TINY["ppo"], relative_costs=True, backwards=True), 0)
     learner.iterate()
     buffer = learner._model.rollout_buffer
     x, y, gamma, theta, vx, vy = (task.observation_scale[i] * buffer.observations[..., i] for i in range(6))
     away = np.sqrt(x**2 + y**2 + (0.3 * vx) ** 2 + (0.3 * vy) ** 2 + gamma**2 + theta**2)
     potentials = buffer.swap_and_flatten(buffer.potentials[..., np.newaxis])  # as SB3 does with the others
-    np.testing.assert_allclose(potentials[:, 0], -10 * learner.config.reward_scale * away, rtol=1e-4)
+    np.testing.assert_allclose(potentials[:, 0], -10 * model_free._COST_SCALE * away, rtol=1e-4)
     returns, values = torch.as_tensor(buffer.returns), torch.as_tensor(buffer.values)
     without_cost = -torch.as_tensor(potentials)  # who reaches the gate from there at once
     expected = relative_advantages(returns, values, without_cost)
@@ -245,23 +261,22 @@ def test_demonstrations_of_another_task_are_refused(name, demos):
 def test_every_task_has_settings_of_ppo_and_sac(task, name):
     key = type(task).__name__.lower()
     settings = LEARNERS[name].settings(key)
-    TrainingEnv(task, default_params(), 2, settings.episode_seconds, settings.reward_scale)
+    TrainingEnv(task, default_params(), 2, settings.episode_seconds, SCALE)
+    assert set(asdict(LEARNERS[name].settings(key, warm=True))) == set(asdict(settings))
 
 
 def test_with_demonstrations_it_first_imitates_and_then_teaches_its_critic_alone(name, demos):
     learner = make(name, demos)
-    cloned = parameters(run(learner, TINY[name].clone_iterations))
+    cloned = parameters(run(learner, CLONED))
     assert learner._model.num_timesteps == 0
-    assert torch.equal(parameters(run(learner, TINY[name].critic_warmup_iterations)), cloned)
+    assert torch.equal(parameters(run(learner, 1)), cloned)
     assert learner._model.num_timesteps > 0
     assert not torch.equal(parameters(run(learner, 1)), cloned)
 
 
-def test_cloning_comes_near_the_expert(name, demos):
-    learner = LEARNERS[name].make(
-        make_task("stabilize"), default_params(), replace(TINY[name], clone_gradient_steps=200), 0, demos
-    )
-    run(learner, TINY[name].clone_iterations)
+def test_cloning_comes_near_the_expert(name, demos, monkeypatch):
+    monkeypatch.setattr(model_free, "_CLONE_STEPS", 200)
+    learner = run(make(name, demos), CLONED)
     data = load_demos(demos, make_task("stabilize"))
     with torch.no_grad():
         error = learner.network(torch.as_tensor(data.observations)).numpy() - data.actions
@@ -276,64 +291,98 @@ def test_half_of_what_sac_learns_from_is_demonstrated(demos):
     assert shown == [False] * 8 + [True] * 8
 
 
-def test_rewards_beside_demonstrations_are_shaped_for_ppo_alone(params):
-    task = make_task("turn")
-    none, flags = np.zeros((1, len(task.observation_scale)), np.float32), np.ones(1, bool)
-    shown = Demos(none, np.zeros((1, 2), np.float32), np.zeros(1, np.float32), none, flags, ~flags, none[:, :2])
-    shaped = {"curriculum": Curriculum(shaping=10.0), "symmetry": "none"}
-    assert ppo.Ppo(task, params, replace(TINY["ppo"], **shaped), 0, shown)
-    with pytest.raises(ValueError, match="shaping cannot be used with sac's demonstrations"):
-        sac.Sac(task, params, replace(TINY["sac"], **shaped), 0, shown)
-
-
-@pytest.mark.parametrize("plain", [False, True])
-def test_after_cloning_the_critic_of_ppo_may_take_larger_steps_than_its_actor(plain, demos):
-    rates = {"demo_learning_rate": 1e-5, "demo_critic_learning_rate": 1e-3}
-    learner = make("ppo", demos, products=not plain, symmetry="none", **rates)
-    run(learner, TINY["ppo"].clone_iterations + 2)
+def test_after_cloning_the_critic_of_ppo_takes_larger_steps_than_its_actor(demos):
+    learner = run(make("ppo", demos, symmetry="none", learning_rate=1e-5), CLONED + 2)
     of_actor, of_critic = learner._optimizers[0].param_groups
     assert of_actor["lr"] <= 1e-5
     assert of_critic["lr"] == 1e-3
     assert {id(p) for p in of_actor["params"]} == {id(p) for p in learner._actor.parameters()}
 
 
-def test_the_layers_of_sacs_critics_can_be_normalized():
-    learner = make("sac", products=False, layer_norm=True)
+@pytest.mark.parametrize("linear", [False, True])
+def test_ppo_trains_on_from_a_policy_of_any_shape_and_its_critic_first(linear):
+    torch.manual_seed(4)
+    task = make_task("turn")
+    given = PolicyNetwork(spec_for(task, "frame", (5, 6), linear))
+    settings = replace(TINY["ppo"], iterations=4)
+
+    def started(seed=0):
+        return LEARNERS["ppo"].make(task, default_params(), settings, seed, None, given)
+
+    learner = started()
+    assert learner.network.spec == given.spec
+    critics = [learner._model.policy.branches.critic.linear.weight.detach().clone()]
+    run(learner, 1)
+    critics.append(learner._model.policy.branches.critic.linear.weight.detach().clone())
+    given_weights = torch.cat([value.flatten() for value in given.state_dict().values()])
+    assert torch.equal(parameters(learner), given_weights)
+    assert not torch.equal(*critics)
+    run(learner, 3)
+    assert not torch.equal(parameters(learner), given_weights)
+    seen = 9 * observed(50, 9)
+    with torch.no_grad():
+        expected = learner._actor.network(seen)
+    np.testing.assert_allclose(learner._model.predict(seen.numpy(), deterministic=True)[0], expected, atol=1e-6)
+    second = started(seed=1)
+    second.load_state_dict(through_a_file(run(started(), 3).state_dict()))
+    assert torch.equal(parameters(run(second, 1)), parameters(learner))
+
+
+def test_sac_trains_on_from_its_own_policy_and_says_from_what_it_cannot():
+    given = run(make("sac", n_steps=1), 1).network
+    config = replace(TINY["sac"], iterations=2)
+    learner = LEARNERS["sac"].make(make_task("stabilize"), default_params(), config, 3, None, given)
+    assert torch.equal(parameters(learner), torch.cat([value.flatten() for value in given.state_dict().values()]))
+    run(learner)
+    with pytest.raises(ValueError, match="cannot start one of"):
+        LEARNERS["sac"].make(make_task("stabilize"), default_params(), replace(config, hidden=(9,)), 3, None, given)
+
+
+def test_a_warm_start_is_one_and_not_backwards(demos, name):
+    given = make(name).network
+    with pytest.raises(ValueError, match="give one of --demos and --start"):
+        LEARNERS[name].make(make_task("stabilize"), default_params(), TINY[name], 0, demos, given)
+    if name == "ppo":
+        with pytest.raises(ValueError, match="backwards goes from scratch alone"):
+            make(name, demos, backwards=True)
+
+
+def test_sac_normalizes_the_layers_of_its_critics_beside_demonstrations(demos):
+    learner = make("sac", demos, products=False)
     start = [value.clone() for value in learner._model.critic.parameters()]
     for critics in (learner._model.critic, learner._model.critic_target):
         for network in critics.q_networks:
             assert sum(isinstance(layer, torch.nn.LayerNorm) for layer in network) == len(TINY["sac"].hidden)
-            living = value_of_living(make_task("stabilize"), learner.config.reward_scale, learner.config.gamma)
+            living = value_of_living(make_task("stabilize"), SCALE, learner.config.gamma)
             assert float(network[-1].bias.detach()) == pytest.approx(living)
     run(learner)
     assert all(not torch.equal(*pair) for pair in zip(start, learner._model.critic.parameters(), strict=True))
 
 
-def test_sac_without_pay_learns_from_demonstrations_without_pay():
-    one, flag = np.ones((1, 8), np.float32), np.ones(1, bool)
+def test_from_demonstrations_of_a_task_that_ends_at_its_goal_rewards_are_minus_the_cost(name):
+    task = make_task("turn")
+    one, flag = np.ones((1, len(task.observation_scale)), np.float32), np.ones(1, bool)
     shown = Demos(one, one[:, :2], np.array([1.5], np.float32), one, ~flag, flag, one[:, :2])
-    learner = sac.Sac(make_task("stabilize"), default_params(), replace(TINY["sac"], pay=False), 0, shown)
-    run(learner, TINY["sac"].clone_iterations + 1)
-    sample = learner._model.replay_buffer.sample(2)
-    assert float(sample.rewards[1]) == pytest.approx(-0.5 * TINY["sac"].reward_scale)  # living pays 2 in a step
-
-
-def test_without_pay_a_reward_is_minus_the_running_cost_and_a_failure_costs_its_price(name):
-    learner = make(name, num_envs=1, pay=False, failure_price=7.0, reward_scale=0.5, episode_seconds=8.0)
+    kind = {"ppo": ppo.Ppo, "sac": sac.Sac}[name]
+    learner = kind(task, default_params(), replace(TINY[name], num_envs=1, episode_seconds=8.0), 0, shown)
+    run(learner, CLONED + 2)
+    if name == "sac":
+        sample = learner._model.replay_buffer.sample(2)
+        paid = task.survival_reward * task.control_dt
+        assert float(sample.rewards[1]) == pytest.approx((1.5 - paid) * model_free._COST_SCALE)
     observation = torch.as_tensor(learner._env.reset())
-    _, reward, done, _ = learner._env.step(np.zeros((learner._settings.num_envs, 2), np.float32))
+    _, reward, done, _ = learner._env.step(np.zeros((1, 2), np.float32))
     assert not done.any()
-    assert (reward < 0).all()  # with pay, 1 less the cost
-    assert (reward > -3.5).all()
-    for _ in range(60):  # it falls
-        _, reward, done, _ = learner._env.step(np.ones((learner._settings.num_envs, 2), np.float32))
+    assert (reward < 0).all()
+    for _ in range(200):  # it falls
+        _, reward, done, _ = learner._env.step(np.ones((1, 2), np.float32))
         if done.any():
             break
-    assert (reward[done] < -0.5 * 7.0).all()
-    assert (reward[done] > -0.5 * (7.0 + 8.0)).all()
-    with torch.no_grad():
-        values = learner._model.policy.predict_values(observation) if name == "ppo" else torch.zeros(1)
-    assert values.abs().max() < 1.0  # not the value of living
+    assert (reward[done] < -model_free._COST_SCALE * FAILURE_PRICE).all()
+    assert (reward[done] > -model_free._COST_SCALE * (FAILURE_PRICE + 20.0)).all()
+    if name == "ppo":
+        with torch.no_grad():
+            assert learner._model.policy.predict_values(observation).abs().max() < 3.0  # not the value of living
 
 
 @pytest.mark.parametrize("name", ["turn", "stabilize"])
@@ -366,9 +415,9 @@ def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
     action, flag = np.zeros((1, 2), np.float32), np.ones(1, bool)
     shown = Demos(one, action, np.array([-3.0], np.float32), one, ~flag, flag, action + 0.5)
     learner = sac.Sac(make_task("stabilize"), default_params(), TINY["sac"], 0, shown)
-    run(learner, TINY["sac"].clone_iterations + 1)
+    run(learner, CLONED + 1)
     sample = learner._model.replay_buffer.sample(2)
-    assert float(sample.rewards[1]) == pytest.approx(-3 * TINY["sac"].reward_scale)
+    assert float(sample.rewards[1]) == pytest.approx(-3 * SCALE)
     assert float(sample.dones[1]) == 0
     assert sample.actions[1].tolist() == [0.5, 0.5]
 
@@ -387,9 +436,9 @@ def test_a_quadratic_value_is_linear_in_what_the_critic_sees(frame):
 
 
 def test_critics_have_a_linear_path_and_start_at_the_value_of_living_for_ever(name):
-    task, learner = make_task("stabilize"), make(name, products=True)
-    value = value_of_living(task, TINY[name].reward_scale, TINY[name].gamma)
-    assert value == pytest.approx(TINY[name].reward_scale * 100 * task.control_dt / (1 - TINY[name].gamma))
+    task, learner = make_task("stabilize"), make(name)
+    value = value_of_living(task, SCALE, TINY[name].gamma)
+    assert value == pytest.approx(SCALE * 100 * task.control_dt / (1 - TINY[name].gamma))
     observation, action = observed(50), torch.zeros(50, 2)
     policy = learner._model.policy
     if name == "ppo":
@@ -409,25 +458,6 @@ def test_the_value_of_living_is_finite_without_a_discount():
     assert value_of_living(task, 1.0, 1.0) == pytest.approx(task.survival_pay)
 
 
-def test_without_products_the_networks_are_those_of_stable_baselines3(name):
-    learner = make(name, products=False)
-    config, model = TINY[name], learner._model
-    if name == "ppo":
-        plain = PPO("MlpPolicy", learner._env, n_steps=16, batch_size=32, policy_kwargs={"net_arch": [16, 8]}, seed=0)
-    else:
-        kwargs = {"net_arch": [16, 8], "n_critics": config.num_critics, "activation_fn": torch.nn.SiLU}
-        plain = SAC("MlpPolicy", learner._env, buffer_size=100, policy_kwargs=kwargs, seed=0)
-    assert type(model.policy) is type(plain.policy)
-    set_by_us = {"log_std", "actor.log_std.weight", "actor.log_std.bias"}
-    set_by_us |= {f"{kind}.qf{i}.4.bias" for kind in ("critic", "critic_target") for i in range(2)}
-    for key, expected in plain.policy.state_dict().items():
-        assert key in set_by_us or torch.equal(model.policy.state_dict()[key], expected), key
-
-
-def test_products_change_nothing_about_what_an_actor_sees(name):
-    assert make(name, products=True).network.spec == make(name, products=False).network.spec
-
-
 SYMMETRIES = {"stabilize": "odd", "turn": "fine_frame", "orbit": "centred", "weave": "centred"}
 
 
@@ -437,7 +467,7 @@ def test_ppo_uses_the_symmetry_of_every_task():
 
 @pytest.mark.parametrize(("task", "symmetry"), [*SYMMETRIES.items(), ("turn", "frame"), ("weave", "mirrors")])
 def test_the_actor_of_ppo_has_the_symmetry_of_its_task(task, symmetry):
-    settings = replace(TINY["ppo"], symmetry=symmetry, rl_iterations=1)
+    settings = replace(TINY["ppo"], symmetry=symmetry, iterations=1)
     learner = LEARNERS["ppo"].make(make_task(task), default_params(), settings, 0, None)
     start = parameters(learner)
     run(learner)
@@ -454,22 +484,15 @@ def test_ppo_refuses_a_symmetry_that_the_task_has_not():
         LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], symmetry="mirrors"), 0, None)
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_forces_may_be_held_for_longer_in_training_and_living_pays_as_much(name):
-    settings = replace(TINY[name], control_dt=0.05, gamma=0.9)
-    learner = LEARNERS[name].make(make_task("stabilize"), default_params(), settings, 0, None)
+def test_sac_holds_forces_longer_from_scratch_and_living_pays_as_much(monkeypatch):
+    monkeypatch.setattr(sac, "_CONTROL_DT", 0.05)
+    learner = make("sac", gamma=0.9)
+    assert learner._model.gamma == pytest.approx(0.9**2.5)
     run(learner)
     assert learner._env.batch.task.control_dt == 0.05
     assert learner.network.spec.task == make_task("stabilize").problem()
-    paid = settings.reward_scale * make_task("stabilize").survival_reward * 0.05
-    assert make(name, control_dt=0.05, gamma=0.9)._model.gamma == pytest.approx(0.9**2.5)
+    paid = SCALE * make_task("stabilize").survival_reward * 0.05
     assert learner._value_of_living(0.9) == pytest.approx(paid / 0.1)
-
-
-def test_longer_forces_are_refused_where_optima_are_shown():
-    settings = replace(TINY["ppo"], control_dt=0.05, curriculum=Curriculum(starts_on_optima=0.5))
-    with pytest.raises(ValueError, match="control_dt cannot be used with"):
-        LEARNERS["ppo"].make(make_task("turn"), default_params(), settings, 0, None)
 
 
 def assert_envs_act_as_its_policy(learner):
@@ -484,7 +507,8 @@ def assert_envs_act_as_its_policy(learner):
 
 
 @pytest.mark.parametrize("task", ["turn", "orbit", "weave"])
-def test_sac_sees_and_acts_in_the_frame_of_its_task(task):
+def test_sac_sees_and_acts_in_the_frame_of_its_task(task, monkeypatch):
+    monkeypatch.setattr(model_free, "_AVERAGED_ITERATIONS", 1)
     settings = replace(TINY["sac"], symmetry=LEARNERS["sac"].settings(task).symmetry)
     learner = LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None)
     run(learner)
@@ -493,7 +517,8 @@ def test_sac_sees_and_acts_in_the_frame_of_its_task(task):
 
 
 @pytest.mark.parametrize("task", ["stabilize", "orbit", "weave"])
-def test_sac_with_a_centred_actor_acts_as_its_policy_does_and_keeps_the_steady_motion(task):
+def test_sac_with_a_centred_actor_acts_as_its_policy_does_and_keeps_the_steady_motion(task, monkeypatch):
+    monkeypatch.setattr(model_free, "_AVERAGED_ITERATIONS", 1)
     made = make_task(task)
     learner = LEARNERS["sac"].make(made, default_params(), replace(TINY["sac"], symmetry="centred"), 0, None)
     run(learner)
@@ -520,21 +545,19 @@ def test_targets_of_sac_can_add_up_the_rewards_of_several_steps():
 
 
 def test_gradients_at_sacs_critics_are_relative_to_the_cost_to_go():
-    plain, relative = make("sac"), make("sac", relative_values=1.0)
+    relative = make("sac")
     seen, acted = torch.rand(16, 8), torch.rand(16, 2, requires_grad=True)
-    gradients = [
-        torch.autograd.grad(learner._model.critic(seen, acted)[0].sum(), acted)[0] for learner in (plain, relative)
-    ]
     with torch.no_grad():
         lowest = torch.stack(relative._model.critic(seen, acted)).amin(0)
-    assert_relative(relative, *gradients, lowest)
+    (gradient,) = torch.autograd.grad(relative._model.critic(seen, acted)[0].sum(), acted)
+    relative._model.critic._forward_hooks.clear()
+    (plain,) = torch.autograd.grad(relative._model.critic(seen, acted)[0].sum(), acted)
+    assert_relative(relative, plain, gradient, lowest)
 
 
-@pytest.mark.parametrize("plain", [False, True])
-def test_gradients_at_ppos_critic_are_relative_to_the_cost_to_go(plain):
-    kind = {"symmetry": "none", "products": False} if plain else {}
+def test_gradients_at_ppos_critic_are_relative_to_the_cost_to_go():
     gradients = []
-    for learner in (make("ppo", **kind), relative := make("ppo", relative_values=1.0, **kind)):
+    for learner in (make("ppo"), relative := make("ppo", relative_costs=True)):
         seen = torch.linspace(-1, 1, 128).reshape(16, 8).requires_grad_()
         values = learner._model.policy.evaluate_actions(seen, torch.zeros(16, 2))[0]
         gradients.append(torch.autograd.grad(values.sum(), seen)[0])
@@ -549,14 +572,14 @@ def assert_relative(learner, plain, relative, values):
     run(learner)
 
 
-def test_beside_demonstrations_sac_learns_from_single_steps_of_the_task(demos):
-    farther = {"n_steps": 3, "buffer_steps": 40, "control_dt": 0.05, "products": True, "relative_values": 1.0}
-    learner = make("sac", demos, **farther)
-    replay = learner._replay
-    assert (replay.n_steps, replay.buffer_size, learner._env.batch.task.control_dt) == (1, 3 * 8, 0.02)
-    assert type(learner._model.critic.q_networks[0]) is torch.nn.Sequential
+def test_beside_demonstrations_sac_learns_from_single_steps_of_the_task(demos, monkeypatch):
+    monkeypatch.setattr(sac, "_CONTROL_DT", 0.05)
+    learner = make("sac", demos)
+    assert (learner._replay.n_steps, learner._env.batch.task.control_dt) == (1, 0.02)
     assert not learner._model.critic._forward_hooks
-    assert make("sac", n_steps=3, buffer_steps=40)._replay.buffer_size == 40 // 4
+    with pytest.raises(ValueError, match="n_steps must be 1 with demonstrations"):
+        make("sac", demos, n_steps=3)
+    assert make("sac", buffer_size=40)._replay.buffer_size == 40 // 4
 
 
 @pytest.mark.parametrize("demonstrated", [False, True])
@@ -593,7 +616,7 @@ def test_a_mirrored_sample_is_a_step_of_the_mirrored_robot():
 def test_the_critics_of_sac_start_near_the_value_of_living(products):
     learner = make("sac", products=products)
     settings = learner.config
-    value = settings.reward_scale * 100 * 0.02 / (1 - settings.gamma)
+    value = SCALE * 100 * 0.02 / (1 - settings.gamma)
     with torch.no_grad():
         values = torch.cat(learner._model.critic(0.1 * observed(20), torch.zeros(20, 2)))
     assert (values - value).abs().max() < 0.3 * value
@@ -615,7 +638,7 @@ def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
 
 @pytest.mark.parametrize(("task", "most"), [("stabilize", 4.0), ("turn", 16.0)])
 def test_targets_of_sac_do_not_exceed_what_can_be_earned(task, most):
-    settings = replace(TINY["sac"], gamma=0.99, reward_scale=0.02, products=False)
+    settings = replace(TINY["sac"], gamma=0.99, products=False)
     model = LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None)._model
     for critic in (model.critic, model.critic_target):
         for network in critic.q_networks:

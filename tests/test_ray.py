@@ -17,7 +17,8 @@ from ballbot_train.commands.train import train
 from ballbot_train.evaluation.benchmark import benchmark
 from ballbot_train.executors import Workers, open_pool
 from ballbot_train.learning import tuning
-from ballbot_train.learning.demonstrations import DemoConfig, load_demos, write_demos
+from ballbot_train.learning.datasets import load_demos
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS
 
 ray = pytest.importorskip("ray")
@@ -154,7 +155,7 @@ def test_trainings_of_seeds_come_back_from_the_nodes_as_this_machine_makes_them(
     head, _ = cluster
     settings = replace(
         LEARNERS["ppo"].settings("turn"),
-        rl_iterations=2,
+        iterations=2,
         num_envs=4,
         num_steps=8,
         batch_size=16,

@@ -25,11 +25,10 @@ ENVS = 64
 SMALL = {
     "num_envs": ENVS,
     "hidden": (8,),
-    "buffer_steps": 1000,
+    "buffer_size": 1000,
     "gradient_steps": 1,
     "batch_episodes": ENVS,
     "gathering_iterations": 1,
-    "total_iterations": 1,
     "iterations": 1,
 }
 

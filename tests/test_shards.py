@@ -12,14 +12,8 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_train import shards
 from ballbot_train.commands.certify import certify
-from ballbot_train.learning.demonstrations import (
-    DemoConfig,
-    StreamedDemos,
-    command_of,
-    load_demos,
-    write_demos,
-    write_shards,
-)
+from ballbot_train.learning.datasets import StreamedDemos, command_of, load_demos
+from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
 from ballbot_train.learning.learners import LEARNERS
 
 TASK = make_task("turn")

@@ -397,7 +397,7 @@ def test_a_task_that_no_learner_knows_trains_with_default_settings(learner, monk
     monkeypatch.setitem(TASKS, "stand", Stand)
     algorithm, module = LEARNERS[learner], importlib.import_module(LEARNERS[learner].module)
     settings = algorithm.settings("stand")
-    assert settings == getattr(module, algorithm.config)()
+    assert settings == module.TUNED[""]
     made = algorithm.make(make_task("stand"), default_params(), replace(settings, **SMALL.get(learner, {})), 0, None)
     before = parameters(made)
     for _ in range(2):

@@ -30,7 +30,7 @@ def test_a_training_has_the_env_steps_that_are_asked_for():
     search = Search("ppo", "stabilize", (0,), 500_000, 4)
     settings = settings_of(search, {"num_steps": 64})
     iteration = settings.num_envs * 64
-    assert settings.rl_iterations * iteration == pytest.approx(500_000, abs=iteration / 2)
+    assert settings.iterations * iteration == pytest.approx(500_000, abs=iteration / 2)
     assert settings.evaluations == 4
 
 
@@ -38,7 +38,7 @@ class Fake:
     """A learner that gets better with every iteration, the more so the nearer its learning rate is to 2e-3."""
 
     def __init__(self, settings, seed):
-        self.iteration, self.iterations = 0, settings.rl_iterations
+        self.iteration, self.iterations = 0, settings.iterations
         self._off = abs(settings.learning_rate - 2e-3) * 1000 + 0.01 * seed
 
     def iterate(self):
@@ -53,7 +53,7 @@ class Fake:
 def fakes(monkeypatch):
     made = []
 
-    def make(self, task, params, settings, seed, demos):
+    def make(self, task, params, settings, seed, demos=None):
         made.append(settings)
         if settings.batch_size == 2048:
             raise ValueError("not finite")
@@ -174,15 +174,8 @@ def test_a_search_belongs_to_a_robot(fakes, tmp_path, capsys):
 
 @pytest.mark.parametrize("robot", ["paper", "rolling"])
 def test_real_trainings_have_an_outcome_per_seed(robot):
-    tiny = {
-        "num_envs": 4,
-        "num_steps": 4,
-        "hidden": (4,),
-        "critic_hidden": (4,),
-        "num_mini_batches": 2,
-        "update_epochs": 1,
-    }
-    search = Search("rsl_ppo", "stabilize", (0, 1), 32, 1, robot)
+    tiny = {"num_envs": 4, "num_steps": 4, "hidden": (4,), "batch_size": 8}
+    search = Search("ppo", "stabilize", (0, 1), 32, 1, robot)
     cost, outcome = tuning.outcome_of(search, settings_of(search, tiny))
     assert isinstance(cost, float)
     assert isinstance(outcome, Outcome)

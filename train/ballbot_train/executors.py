@@ -41,10 +41,9 @@ class Workers:
     """Where the items of a run are done. The results are the same everywhere."""
 
     workers: int | None = None
-    """Processes of this machine, or tasks at once on a Ray cluster; default, one for every core of either."""
+    """Processes, or tasks on a Ray cluster; default, all cores."""
     ray: str | None = None
-    """Do the work on a Ray cluster: "auto" is the one that this machine belongs to, "local" starts one on this machine, and
-    HOST:PORT is the address of any other."""
+    """Address of a Ray cluster, HOST:PORT, "auto" or "local"."""
 
     @classmethod
     def of(cls, workers: "int | Workers") -> "Workers":

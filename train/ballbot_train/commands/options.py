@@ -12,3 +12,6 @@ except ModuleNotFoundError as error:
 
 WorkersOption = Annotated[Workers, tyro.conf.arg(name="")]
 """The options --workers and --ray of every command that does much work."""
+
+NONE = tyro.conf.arg(help_behavior_hint="")
+"""Of an option whose help needs no word about its default."""

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from ballbot_gym import certified
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import WorkersOption
+from ballbot_train.commands.options import NONE, WorkersOption
 from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
@@ -30,27 +30,31 @@ class Run:
     """Name of a task."""
     robot: RobotName = PAPER
     """Name of a robot."""
-    demos: str | None = None
-    """Folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards."""
-    start: Path | None = None
-    """Policy file whose weights training starts from; only for rsl_ppo and shac."""
+    demos: Annotated[str | None, NONE] = None
+    """Dataset of `ballbot demos`, or the URL of shards."""
+    start: Annotated[Path | None, NONE] = None
+    """Policy file to train on from; ppo, sac, shac."""
     seed: int = 0
-    """Seed of everything that is drawn."""
-    seeds: str | None = None
-    """Several seeds in place of one, as 0:5 (0 to 4) or 0,3,7: a queue of one-core runs, each in a folder in --out. The same
-    command continues a queue that was stopped."""
+    """Seed of all that is drawn."""
+    seeds: Annotated[str | None, NONE] = None
+    """Several, as 0:5 or 0,3,7: a queue of one-core runs."""
     workers: WorkersOption = Workers()
-    """Who does the runs of --seeds, each on one core; by default one after another here, and all cores of a cluster."""
+    """Who does the runs of --seeds."""
     threads: int = 1
-    """Threads of torch. Another number changes the last digits; more than one is slower beside other work."""
-    out: Path | None = None
-    """Folder of the run, or of all runs of --seeds; default runs/train/TASK-LEARNER."""
+    """Threads of torch."""
+    out: Annotated[Path | None, NONE] = None
+    """Folder; default runs/train/TASK-LEARNER."""
     test_episodes: int = certified.EPISODES
-    """On how many of the certified episodes the policy is measured in the end, from the first."""
+    """Certified episodes that measure the kept policy."""
     validation_episodes: int = VALIDATION_EPISODES
-    """On how many fresh episodes the policy is chosen that the run keeps. More show rarer failures, and take longer."""
+    """Fresh episodes that choose the policy to keep."""
     resume: bool = False
-    """Continue the run in this folder, if there is one."""
+    """Continue the run in this folder."""
+
+    @property
+    def warm(self) -> bool:
+        """Whether training starts from demonstrations or a policy."""
+        return self.demos is not None or self.start is not None
 
 
 def train(
@@ -77,7 +81,7 @@ def train(
         learner: name of a learner in `LEARNERS`.
         task: name of a task.
         demos: folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards.
-        start: policy file whose weights training starts from, of any robot; only for rsl_ppo and shac.
+        start: policy file to train on from, for ppo, sac and shac; it may be of another robot.
         seed: seed of everything that is drawn.
         settings: the learner's settings; default, those tuned for the task.
         threads: threads of torch. Another number changes the last digits; more than one is slower beside other work.
@@ -101,8 +105,7 @@ def train(
         raise ValueError(f"test_episodes must be 1 to {certified.EPISODES}, not {test_episodes}")
     if not 1 <= validation_episodes <= _MOST_VALIDATION_EPISODES:
         raise ValueError(f"validation_episodes must be 1 to {_MOST_VALIDATION_EPISODES}, not {validation_episodes}")
-    if demos is not None and not algorithm.demonstrations:
-        raise ValueError(f"{learner} uses no demonstrations")
+    algorithm.check(demos, start)
     workers = Workers.of(workers)
     if workers.ray is not None and seeds is None:
         raise ValueError("--ray does the runs of --seeds; a single training runs here")
@@ -128,12 +131,12 @@ def train(
     from ballbot_gym.env import make_task
     from ballbot_train.evaluation import optima
     from ballbot_train.learning import training
-    from ballbot_train.learning.demonstrations import command_of
+    from ballbot_train.learning.datasets import command_of
     from ballbot_train.policy import load_network, read_description
 
     torch.set_num_threads(threads)
     problem = make_task(task, robot)
-    settings = algorithm.settings(task) if settings is None else settings
+    settings = algorithm.settings(task, warm=run.warm) if settings is None else settings
     check_settings(settings)
     if command is None:
         command = command_with(learner, run, settings)
@@ -157,11 +160,8 @@ def train(
         **({} if validation_episodes == VALIDATION_EPISODES else {"validation_episodes": validation_episodes}),
     }
     optima.known(problem, robot, workers=workers)  # by which it is scored while it learns
-    made = algorithm.make(problem, named_robot(robot), settings, seed, demos)
-    if start is not None:
-        if not isinstance(made, training.Finetunable):
-            raise ValueError(f"{learner} cannot start from a policy")
-        made.start_from(load_network(start, problem, robot=None))
+    begun = None if start is None else load_network(start, problem, robot=None)
+    made = algorithm.make(problem, named_robot(robot), settings, seed, demos, begun)
     physics = physics_or_default(None)
     row = training.train(made, problem, config, out, resume, test_episodes)
     console.print(
@@ -175,7 +175,7 @@ def _train_seeds(learner: str, run: Run, out: Path, settings: Any, named: str, w
     from ballbot_train.learning import seeds as queue
 
     seeds = queue.parse_seeds(named)
-    settings = LEARNERS[learner].settings(run.task) if settings is None else settings
+    settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
     check_settings(settings)
 
     def command_of(seed: int) -> str:
@@ -225,7 +225,7 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     """Parses what was typed after `ballbot train`.
 
     Only the file of the learner that is named is imported. Its options are the fields of its settings, and their defaults
-    are the settings tuned for the task that is named.
+    are the settings tuned for the task that is named, with or without demonstrations or a policy to start from.
 
     Args:
         arguments: the words.
@@ -238,12 +238,15 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
 
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--task", nargs="?", default=Run.task, const=Run.task)  # tyro says what is wrong with no value
-    task = early.parse_known_args(arguments)[0].task
+    for option in ("--demos", "--start"):
+        early.add_argument(option, nargs="?", const="")
+    known = early.parse_known_args(arguments)[0]
+    task, warm = known.task, {known.demos, known.start} - {None, "None"} != set()
     named = arguments[0] if arguments and not arguments[0].startswith("-") else None
     if named is not None:
         check_names("learner", [named], LEARNERS)
         check_names("task", [task], TASKS)
-        tyro.cli(_command(named, task, call), prog=f"ballbot train {named}", args=list(arguments[1:]))
+        tyro.cli(_command(named, task, warm, call), prog=f"ballbot train {named}", args=list(arguments[1:]))
         return
     tyro.extras.subcommand_cli_from_dict(
         {name: _command(name) for name in LEARNERS},
@@ -280,7 +283,9 @@ def _option(name: str, value: Any) -> list[str]:
     return [f"--{name}", *map(str, value if isinstance(value, tuple | list) else [value])]
 
 
-def _command(name: str, task: str = "", call: Callable[[str, Run, Any], None] | None = None) -> Callable[..., None]:
+def _command(
+    name: str, task: str = "", warm: bool = False, call: Callable[[str, Run, Any], None] | None = None
+) -> Callable[..., None]:
     """A learner's command as a function whose signature tyro reads; one that is not to be called has no options."""
 
     def without_options() -> None:
@@ -290,7 +295,7 @@ def _command(name: str, task: str = "", call: Callable[[str, Run, Any], None] | 
 
     function: Callable[..., None] = without_options
     if call is not None:
-        settings = LEARNERS[name].settings(task)
+        settings = LEARNERS[name].settings(task, warm)
 
         def with_options(run: Any = Run(), settings: Any = settings) -> None:
             call(name, run, settings)

@@ -28,7 +28,7 @@ def tune(
     """Searches a learner's hyperparameters: Optuna's TPE, pruned by regret; a killed search continues when started again.
 
     Args:
-        learner: ppo, rsl_ppo or sac.
+        learner: ppo or sac.
         task: name of a task.
         trials: how many sets of settings to try in all. More than before continues a search that has ended.
         seeds: trainings per trial, with the seeds 0, 1, 2 ... What counts is their mean.

@@ -92,9 +92,7 @@ def highest_value(task: Task, reward_scale: float, gamma: float) -> float:
     return max(living, value_of_living(task, reward_scale, 1.0)) if task.first_exit else living
 
 
-def relative_advantages(
-    returns: torch.Tensor, values: torch.Tensor, living: float | torch.Tensor, power: float = 1.0
-) -> torch.Tensor:
+def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float | torch.Tensor) -> torch.Tensor:
     """Advantages relative to the cost to go, normalized, of returns and values of any one shape.
 
     Args:
@@ -102,21 +100,20 @@ def relative_advantages(
         values: what the critic expects.
         living: value of a state without any cost, so that the cost to go is `living` minus the value. Where rewards are
             shaped, it is less by the potential of the state, and so a tensor.
-        power: of the cost to go by which they are divided.
     """
-    relative = (returns - values) / cost_to_go(values, living) ** power
+    relative = (returns - values) / cost_to_go(values, living)
     return (relative - relative.mean()) / (relative.std() + 1e-8)
 
 
-def weigh_gradients(values: Sequence[torch.Tensor], living: float, power: float) -> None:
+def weigh_gradients(values: Sequence[torch.Tensor], living: float) -> None:
     """Divides gradients that flow back into the values (n, 1) of several critics by the cost to go, as the lowest say it.
 
-    The mean of all n factors is 1. `living` and `power` are as of `relative_advantages`.
+    The mean of all n factors is 1. `living` is as of `relative_advantages`.
     """
     if not values[0].requires_grad:
         return
     lowest = torch.stack([value.detach() for value in values]).amin(0)
-    weights = cost_to_go(lowest, living) ** -power
+    weights = cost_to_go(lowest, living) ** -1
     weights /= weights.mean()
     for value in values:
         value.register_hook(lambda gradient: gradient * weights)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ballbot_gym.tasks.symmetry import REACH, Frame
-from ballbot_train.learning.demonstrations import Demos
+from ballbot_train.learning.datasets import Demos
 
 
 def demos_in_frame(demos: Demos, frame: Frame) -> Demos:

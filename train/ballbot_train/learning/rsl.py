@@ -1,6 +1,5 @@
 """rsl-rl on the batched environments: `OnPolicyRunner(RslVecEnv(BallbotBatch("stabilize", 4096)), config)`."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,28 +12,17 @@ if TYPE_CHECKING:
 
 
 class RslVecEnv:
-    """A `BallbotBatch` with the interface of rsl-rl's `VecEnv`. Observations are the group "policy".
-
-    With `critic_inputs` there is a second group, "critic". It is computed once per step here, and not in every pass of an
-    update.
-    """
+    """A `BallbotBatch` with the interface of rsl-rl's `VecEnv`. Observations are the group "policy"."""
 
     num_actions = 2
 
-    def __init__(
-        self,
-        batch: BallbotBatch,
-        seed: int = 0,
-        critic_inputs: Callable[[torch.Tensor], torch.Tensor] | None = None,
-    ):
+    def __init__(self, batch: BallbotBatch, seed: int = 0):
         """Starts an episode in every env.
 
         Args:
             batch: the envs.
             seed: of the run; those with other seeds meet other episodes.
-            critic_inputs: maps observations (B, n) to what the critic sees, such as `critics.CriticInputs`.
         """
-        self._critic_inputs = critic_inputs
         self.batch, self.num_envs, self.device = batch, batch.num_envs, batch.device
         self.max_episode_length = batch.task.steps
         self.cfg: dict[str, Any] = {"task": batch.task.id, "num_envs": batch.num_envs}
@@ -66,7 +54,4 @@ class RslVecEnv:
     def _grouped(self, observation: torch.Tensor) -> "TensorDict":
         from tensordict import TensorDict  # it comes with rsl-rl
 
-        groups = {"policy": observation.contiguous()}
-        if self._critic_inputs is not None:
-            groups["critic"] = self._critic_inputs(observation)
-        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+        return TensorDict({"policy": observation.contiguous()}, batch_size=[self.num_envs], device=self.device)

@@ -100,14 +100,6 @@ class Learner(Protocol):
 
 
 @runtime_checkable
-class Finetunable(Protocol):
-    """A learner that can start from the weights of a policy."""
-
-    def start_from(self, network: PolicyNetwork) -> None:
-        """Takes the weights of a policy; raises a ValueError for a network of another shape."""
-
-
-@runtime_checkable
 class Staged(Protocol):
     """A learner whose training begins easier than the task."""
 
@@ -444,7 +436,7 @@ class _Run:
             "training": self.config,
             "chosen_by": {"episodes": f"{self.validation_episodes} fresh, for validation", "cost": self.best[0]},
             "iteration": self._chosen["iteration"],
-            "training_seconds": round(self.seconds, 1),
+            "training_seconds": round(self.cpu_seconds, 1),
             **({"curriculum_reached": reached} if reached else {}),
         }
 

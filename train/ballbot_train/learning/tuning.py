@@ -18,7 +18,7 @@ A search is a folder:
 | trials.csv | a line per trial: its state, its costs over the seeds, its settings |
 | importances.csv | how much each setting matters, by PED-ANOVA, from the finished trials |
 | best.json | all settings of the best trial, what each seed reached, and the command that trains with them |
-| ppo.yml, sac.yml | of those two learners: settings of the four ids in the format of rl-zoo3 |
+| ppo.yml or sac.yml | settings of the four ids in the format of rl-zoo3 |
 
 A search that is killed goes on where it stopped; trials that were running begin anew. Trials run in this process, in several,
 or on a Ray cluster. The study stays with this process: workers only train, and say what they reach.
@@ -29,7 +29,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.executors import Pool, Workers, open_pool
 from ballbot_train.learning import training
-from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.learners import LEARNERS, ppo, sac
 
 try:
     import optuna
@@ -52,7 +52,6 @@ except ModuleNotFoundError as error:
     raise missing("ballbot tune", error.name, "tune") from error
 
 _STARTUP_TRIALS = 8  # drawn at random before the estimator proposes, and before any trial is pruned
-_ITERATIONS = ("rl_iterations", "total_iterations")  # names of the setting that bounds a training
 _INTERRUPTED = "interrupted"
 _STUDY = "study.db"
 
@@ -73,52 +72,27 @@ class Choice:
     values: tuple[Any, ...]
 
 
-_WIDTHS = Choice(((64, 64), (128, 128), (256, 256)))
-_GAMMAS = Choice((0.98, 0.985, 0.99, 0.995, 0.998))
-_OF_PPO: dict[str, Range | Choice] = {
-    "clip_range": Choice((0.1, 0.2, 0.3)),
-    "max_grad_norm": Range(0.2, 5.0),
+_OF_BOTH: dict[str, Range | Choice] = {
+    "learning_rate": Range(1e-4, 5e-3),
+    "final_learning_rate_fraction": Range(0.005, 0.5),
+    "gamma": Choice((0.98, 0.985, 0.99, 0.995, 0.998)),
     "std": Range(0.1, 0.8),
-    "final_std": Range(0.005, 0.1),
-    "reward_scale": Range(0.005, 0.2),
-    "hidden": _WIDTHS,
+    "hidden": Choice(((64, 64), (128, 128), (256, 256))),
 }
 
 SPACES: dict[str, dict[str, Range | Choice]] = {
     "ppo": {
-        "num_steps": Choice((24, 48, 64, 96, 128, 256, 512)),
-        "batch_size": Choice((256, 512, 1024, 2048, 3072)),
-        "update_epochs": Choice((3, 5, 10)),
-        "learning_rate": Range(1e-4, 5e-3),
-        "final_learning_rate_fraction": Range(0.005, 0.5),
-        "gamma": _GAMMAS,
+        "num_steps": Choice((24, 48, 64, 96, 128, 256)),
+        "batch_size": Choice((512, 1024, 2048, 3072)),
         "gae_lambda": Range(0.9, 0.99, log=False),
-        **_OF_PPO,
-    },
-    "rsl_ppo": {
-        "num_steps": Choice((16, 24, 48)),
-        "num_mini_batches": Choice((4, 8, 16, 32)),
-        "update_epochs": Choice((3, 5, 8)),
-        "learning_rate": Range(2e-4, 1e-2),
-        "final_learning_rate": Range(1e-5, 5e-4),
-        "gamma": _GAMMAS,
-        "final_gamma": Choice((0.99, 0.995, 0.998, 0.9985, 0.999)),
-        "gae_lambda": Range(0.8, 0.99, log=False),
-        **_OF_PPO,
-        "critic_hidden": _WIDTHS,
+        "final_std": Range(0.005, 0.1),
+        **_OF_BOTH,
     },
     "sac": {
-        "gradient_steps": Choice((1, 2, 4, 8, 16)),
+        "gradient_steps": Choice((4, 8, 16)),
         "batch_size": Choice((128, 256, 512)),
-        "learning_rate": Range(1e-4, 5e-3),
-        "final_learning_rate_fraction": Range(0.005, 0.5),
-        "gamma": _GAMMAS,
-        "tau": Range(0.002, 0.05),
         "target_entropy": Range(-8.0, -1.0, log=False),
-        "ent_coef": Range(1e-3, 0.2),
-        "std": Range(0.1, 0.8),
-        "reward_scale": Range(0.005, 0.2),
-        "hidden": _WIDTHS,
+        **_OF_BOTH,
     },
 }
 """What is searched, by name of learner. Every other setting stays as it is tuned for the task."""
@@ -255,8 +229,7 @@ def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
     """A learner's settings with those that were chosen, and with the search's number of env steps."""
     settings = replace(LEARNERS[search.learner].settings(search.task), **chosen)
     iterations = max(1, round(search.env_steps / (settings.num_envs * settings.num_steps)))
-    name = next(field.name for field in fields(settings) if field.name in _ITERATIONS)
-    return replace(settings, evaluations=search.evaluations, **{name: iterations})
+    return replace(settings, evaluations=search.evaluations, iterations=iterations)
 
 
 def _search(
@@ -399,12 +372,10 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
         "validation_cost": trial.value,
         "seeds": list(search.seeds),
         **{name: trial.user_attrs[name] for name in ("costs", "success", "certified_regret")},
-        "settings": {
-            field.name: getattr(settings, field.name) for field in fields(settings) if field.name != "curriculum"
-        },
+        "settings": asdict(settings),
     }
     files.write(out / "best.json", json.dumps(best, indent=1) + "\n")
-    if search.learner in ("ppo", "sac") and search.robot == PAPER:  # the ids are the paper's robot
+    if search.robot == PAPER:  # the ids are the paper's robot
         files.write(out / f"{search.learner}.yml", zoo_yaml(search.learner, _best_settings(search, settings, out)))
     return best
 
@@ -451,7 +422,7 @@ def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:
 def _zoo_common(chosen: Any) -> dict[str, Any]:
     return {
         "n_envs": chosen.num_envs,
-        "n_timesteps": chosen.rl_iterations * chosen.num_envs * chosen.num_steps,
+        "n_timesteps": chosen.iterations * chosen.num_envs * chosen.num_steps,
         "policy": "MlpPolicy",
         "learning_rate": f"lin_{chosen.learning_rate:.3g}",
         "batch_size": chosen.batch_size,
@@ -462,24 +433,24 @@ def _zoo_common(chosen: Any) -> dict[str, Any]:
 def _zoo_ppo(chosen: Any) -> dict[str, Any]:
     return _zoo_common(chosen) | {
         "n_steps": chosen.num_steps,
-        "n_epochs": chosen.update_epochs,
+        "n_epochs": ppo.UPDATE_EPOCHS,
         "gae_lambda": round(chosen.gae_lambda, 4),
-        "clip_range": chosen.clip_range,
-        "max_grad_norm": round(chosen.max_grad_norm, 4),
+        "clip_range": ppo.CLIP_RANGE,
+        "max_grad_norm": ppo.MAX_GRAD_NORM,
         "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, log_std_init={math.log(chosen.std):.3f})"',
     }
 
 
 def _zoo_sac(chosen: Any) -> dict[str, Any]:
     return _zoo_common(chosen) | {
-        "buffer_size": chosen.buffer_steps or 1_000_000,
+        "buffer_size": chosen.buffer_size,
         "n_steps": chosen.n_steps,
         "train_freq": 1,
         "gradient_steps": chosen.gradient_steps,
-        "tau": round(chosen.tau, 5),
-        "ent_coef": f"auto_{chosen.ent_coef:.3g}",
+        "tau": sac.TAU,
+        "ent_coef": f"auto_{sac.ENT_COEF}",
         "target_entropy": round(chosen.target_entropy, 3),
-        "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, n_critics={chosen.num_critics}, activation_fn=nn.SiLU)"',
+        "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, activation_fn=nn.SiLU)"',
     }
 
 

@@ -9,7 +9,6 @@ COLORS = {
     "nmpc-offset-free": "#f2c14e",
     "dagger": "#34495e",
     "ppo": "#2e8b57",
-    "rsl_ppo": "#a04000",
     "sac": "#17a2b8",
     "shac": "#8e44ad",
 }
@@ -20,7 +19,6 @@ LABELS = {
     "nmpc-offset-free": "NMPC, offset-free",
     "dagger": "DAgger",
     "ppo": "PPO",
-    "rsl_ppo": "PPO by rsl_rl",
     "sac": "SAC",
     "shac": "SHAC",
 }

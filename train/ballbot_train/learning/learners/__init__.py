@@ -3,8 +3,9 @@
 A new learner is one file and one line in `LEARNERS`. Its file holds
 
 - a frozen dataclass of settings whose defaults suit any task, with a docstring under every field;
-- `TUNED`, settings by name of task, for the tasks that want others than the defaults;
-- `make(task, params, settings, seed, demos)`, which returns the learner before its first iteration (see `training.Learner`).
+- `TUNED`, settings by name of task, and by "" for any other task;
+- `make(task, params, settings, seed, demos, start)`, which returns the learner before its first iteration (see
+  `training.Learner`).
 """
 
 import math
@@ -19,6 +20,7 @@ from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
     from ballbot_train.learning.training import Learner
+    from ballbot_train.policy import PolicyNetwork
 
 
 @dataclass(frozen=True)
@@ -33,19 +35,44 @@ class Algorithm:
     """One line for the command line."""
     demonstrations: bool
     """Whether the learner can use demonstrations."""
+    starts: bool
+    """Whether it can start from a policy."""
 
-    def settings(self, task: str) -> Any:
-        """The settings tuned for a task, or the defaults if the task has none.
+    @property
+    def name(self) -> str:
+        return self.module.rpartition(".")[2]
+
+    def settings(self, task: str, warm: bool = False) -> Any:
+        """The settings tuned for a task, or those of any other task.
 
         Args:
             task: name of a task.
+            warm: whether training starts from demonstrations or a policy.
 
         Returns:
             A frozen dataclass; `dataclasses.replace` changes some of its fields.
         """
-        return load(f"{self.module}:TUNED").get(task, load(f"{self.module}:{self.config}")())
+        table = load(f"{self.module}:{'WARM' if warm and self.name in _WITH_WARM else 'TUNED'}")
+        return table.get(task, table[""])
 
-    def make(self, task: Task, params: BallbotParams, settings: Any, seed: int, demos: str | Path | None) -> "Learner":
+    def check(self, demos: object, start: object) -> None:
+        """Raises a ValueError where demonstrations or a policy to start from are of no use to this learner."""
+        if demos is not None and not self.demonstrations:
+            raise ValueError(f"{self.name} uses no demonstrations")
+        if start is not None and not self.starts:
+            raise ValueError(f"{self.name} cannot start from a policy; use ppo, sac or shac")
+        if demos is not None and start is not None:
+            raise ValueError("training starts from demonstrations or from a policy; give one of --demos and --start")
+
+    def make(
+        self,
+        task: Task,
+        params: BallbotParams,
+        settings: Any,
+        seed: int,
+        demos: str | Path | None = None,
+        start: "PolicyNetwork | None" = None,
+    ) -> "Learner":
         """Makes the learner.
 
         Args:
@@ -54,30 +81,28 @@ class Algorithm:
             settings: as of `settings`.
             seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
+            start: a policy to train on from, or None; it may be of another robot.
 
         Returns:
             The learner before its first iteration.
 
         Raises:
-            ValueError: the demonstrations are missing, of another task, or of no use to this learner.
+            ValueError: demonstrations or policy are missing, of another task or shape, or of no use to this learner.
         """
-        if demos is not None and not self.demonstrations:
-            raise ValueError(f"{self.module.rpartition('.')[2]} uses no demonstrations")
-        if task.clock and self.module.rpartition(".")[2] in ("dagger", "shac"):
+        self.check(demos, start)
+        if task.clock and self.name in ("dagger", "shac"):
             raise ValueError(
-                f"{self.module.rpartition('.')[2]} does not know the time, on which cost and goal of {task.id} depend; "
-                "train ppo or sac"
+                f"{self.name} does not know the time, on which cost and goal of {task.id} depend; train ppo or sac"
             )
+        given = {"demos": demos} | ({"start": start} if self.starts else {})
         with load("ballbot_train.weights:own_defaults")():
-            return load(f"{self.module}:make")(task, params, settings, seed, demos)
+            return load(f"{self.module}:make")(task, params, settings, seed, **given)
 
 
+_WITH_WARM = ("ppo", "sac")  # learners whose settings differ after a warm start
 _MAY_BE_ZERO = {
     "batch_episodes",
-    "buffer_steps",
     "candidate_episodes",
-    "clone_iterations",
-    "critic_warmup_iterations",
     "gathering_iterations",
     "horizon",
     "rollouts_per_plan",
@@ -85,23 +110,10 @@ _MAY_BE_ZERO = {
     "tube_samples",
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
-_SHARES = {"curriculum_progress", "final_gamma", "gae_lambda", "gamma", "hard_fraction", "reset_fraction", "tau"}
-_POSITIVE = {
-    "critic_learning_rate",
-    "demo_critic_learning_rate",
-    "demo_std",
-    "final_learning_rate",
-    "final_std",
-    "finetune_critic_learning_rate",
-    "finetune_learning_rate",
-    "finetune_std",
-    "last_learning_rate",
-    "learning_rate",
-    "reward_scale",
-    "std",
-}
+_SHARES = {"final_gamma", "gae_lambda", "gamma", "hard_fraction", "reset_fraction", "short_episodes"}
+_POSITIVE = {"critic_learning_rate", "final_std", "learning_rate", "std"}
 _MOST = 10**9  # of whole numbers
-_MOST_OF = {"critic_hidden": 2**14, "hidden": 2**14, "horizon": 10**5, "num_envs": MOST_ENVS, "num_steps": 10**6}
+_MOST_OF = {"buffer_size": 10**8, "hidden": 2**14, "horizon": 10**5, "num_envs": MOST_ENVS, "num_steps": 10**6}
 _MOST_STEPS = 10**8  # env steps of an iteration, which are all in memory
 
 
@@ -133,20 +145,15 @@ def check_settings(settings: Any) -> None:
             f"{envs} envs of {steps} steps are {envs * steps} env steps per iteration, and at most {_MOST_STEPS} are kept in "
             "memory; take fewer of either"
         )
-    if getattr(settings, "num_mini_batches", 1) > envs * steps:
-        raise ValueError(
-            f"num_mini_batches {settings.num_mini_batches} is more than the {envs * steps} env steps of an iteration"
-        )
 
 
 _HERE = __name__
 
 LEARNERS: dict[str, Algorithm] = {
-    "dagger": Algorithm(f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True),
-    "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True),
-    "rsl_ppo": Algorithm(
-        f"{_HERE}.rsl_ppo", "RslPpoConfig", "PPO by rsl_rl on thousands of envs", demonstrations=False
+    "dagger": Algorithm(
+        f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True, starts=False
     ),
-    "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True),
-    "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False),
+    "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True, starts=True),
+    "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True, starts=True),
+    "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False, starts=True),
 }

@@ -39,7 +39,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry
-from ballbot_train.learning.demonstrations import Demos, StreamedDemos, load_demos
+from ballbot_train.learning.datasets import Demos, StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
@@ -66,46 +66,47 @@ class DaggerConfig:
     iterations: int = 50
     """Number of iterations."""
     gathering_iterations: int = 35
-    """Iterations at the start that gather samples; the others only fit. 0, with demonstrations: behaviour cloning."""
+    """First of them that gather samples; 0: clone --demos."""
     evaluations: int = 6
-    """Number of evaluations, at equal distances."""
+    """Evaluations, at equal distances."""
     episodes_per_iteration: int = 6
-    """Episodes drawn and planned per gathering iteration."""
+    """Episodes planned per gathering iteration."""
     candidate_episodes: int = 64
-    """Episodes from which those are chosen, up to half of them ones that the learner fails; 0 chooses at random."""
+    """Drawn to choose from, half where it fails; 0: random."""
     max_guesses: int = 5
-    """Greatest number of the task's guesses that are tried for the optimum of an episode."""
+    """Guesses tried for an optimum."""
     rollouts_per_plan: int = 2
-    """Rollouts of the learner per plan; the last state of each is labelled by a new optimum."""
+    """Rollouts that end where a new optimum labels."""
     max_rollout_seconds: float = 2.0
-    """Longest such rollout, s; the limit grows to this over the gathering iterations."""
+    """Longest of these in the end, s."""
     start_noise: float = 0.0
-    """Standard deviation of the disturbance of a rollout's first state, in units of the tube's."""
+    """Disturbance of their starts, in units of the tube's."""
     tube_samples: int = 1
-    """States drawn around each state of an optimum and labelled by TVLQR."""
+    """States around an optimum that TVLQR labels."""
     tracked_rollouts_per_plan: int = 0
-    """Rollouts of the learner over the whole plan, whose states TVLQR labels."""
+    """Rollouts along a plan that TVLQR labels."""
     max_distance: float = 2.0
-    """Greatest distance from the plan at which TVLQR labels such a state, in units of the tube's standard deviations."""
+    """Farthest from it, in standard deviations of the tube."""
     batch_episodes: int = 0
-    """Optima that are found at once per gathering iteration, in place of those one by one; 0 where that does not work."""
+    """Optima found at once in place of one by one."""
     label_seconds: float = 4.0
-    """Length of an optimum's part that becomes samples, s; after it the robot rests."""
+    """Part of an optimum that becomes samples, s."""
     backoff: Backoff = Backoff(grip=EXECUTED.grip)
-    """What optima keep from their limits, so that the learner's errors do not violate them."""
+    """What optima keep from their limits."""
     gradient_steps: int = 150
     """Gradient steps per iteration."""
     batch_size: int = 1024
     """Samples per gradient step."""
     learning_rate: float = 3e-3
-    """Learning rate at the start. It falls along half a cosine."""
+    """Learning rate; it falls along half a cosine."""
     hidden: tuple[int, ...] = (128, 128)
-    """Units of the policy's hidden layers."""
+    """Units of hidden layers."""
     symmetry: RoutedSymmetry = "none"
-    """How the actor respects the task's symmetry; see `actors.Symmetry` and `actors.RoutedSymmetry`."""
+    """What the actor keeps of the task's symmetry."""
 
 
 TUNED: dict[str, DaggerConfig] = {
+    "": DaggerConfig(),
     "stabilize": DaggerConfig(
         iterations=30,
         gathering_iterations=20,

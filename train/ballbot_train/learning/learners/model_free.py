@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -19,10 +19,10 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import Frame
 from ballbot_gym.vector import BallbotVectorEnv
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import average_of
+from ballbot_train.learning.actors import Symmetry, average_of
 from ballbot_train.learning.critics import value_of_living, weigh_gradients
-from ballbot_train.learning.curricula import Curriculum, CurriculumBatch
-from ballbot_train.learning.demonstrations import Demos
+from ballbot_train.learning.curricula import CurriculumBatch
+from ballbot_train.learning.datasets import Demos
 from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy import PolicyNetwork, PolicySpec
@@ -32,61 +32,43 @@ from ballbot_train.policy import PolicyNetwork, PolicySpec
 class ModelFreeConfig:
     """Settings that PPO and SAC share."""
 
-    rl_iterations: int
-    """Iterations of reinforcement learning, each of `num_envs * num_steps` env steps."""
-    num_envs: int
-    """Envs that are stepped together."""
-    num_steps: int
-    """Control steps of each env per iteration."""
+    iterations: int = 400
+    """Iterations of `num_envs * num_steps` env steps."""
     evaluations: int = 20
-    """Number of evaluations, at equal distances."""
-    episode_seconds: float = 4.0
-    """Duration of an episode in training, s."""
-    control_dt: float | None = None
-    """How long each force is held in training from scratch, s; default, as in the task. Longer, an action changes more of
-    what follows, and critics tell actions apart more easily. With demonstrations forces are held as in them."""
-    reward_scale: float = 0.02
-    """Factor of every reward."""
-    gamma: float = 0.995
-    """Discount factor per control step of the task; with a longer `control_dt` that for as long."""
-    final_gamma: float | None = None
-    """Discount factor at the end; 1 less it goes there geometrically, as in `rsl_ppo`. Default, `gamma` throughout."""
-    hidden: tuple[int, ...] = (128, 128)
-    """Units of the hidden layers of actor and critics."""
-    products: bool = True
-    """Whether the critics have a linear path, and see the products of all pairs of their inputs; see `learning.critics`."""
-    relative_values: float = 0.0
-    """Power of the cost to go, as the critics expect it, by which gradients at their values are divided: of their own errors,
-    and of what the actor of SAC gains; 0, or with demonstrations: off. So states near the goal count too, as they do in
-    regret."""
-    curriculum: Curriculum = Curriculum()
-    """What training makes easier at first."""
-    pay: bool = True
-    """Whether living pays in training. If not, the reward is minus the running cost. Evaluation is the same."""
-    failure_price: float = 300.0
-    """What a failure costs at once in training where living does not pay."""
-    learning_rate_schedule: Literal["linear", "geometric"] = "linear"
-    """How the learning rate falls: along a straight line, or by the same factor in every iteration."""
-    curriculum_progress: float = 1.0
-    """All schedules wait at this share of their course until the curriculum is over, and then go on to their end in the
-    iterations that are left; 1: they do not wait. All that is learnt until then needs the noise of before."""
-    last_learning_rate: float | None = None
-    """Learning rate when the curriculum is over, from where it falls to the same end in the iterations left; default, or with
-    demonstrations, as scheduled. Large steps find the way, and small ones then bring costs down."""
-    clone_iterations: int = 20
-    """Iterations of behaviour cloning before reinforcement learning, if there are demonstrations."""
-    clone_gradient_steps: int = 300
-    """Gradient steps per iteration of behaviour cloning."""
-    clone_batch_size: int = 1024
-    """Demonstrated steps per gradient step, in behaviour cloning and in the imitation loss."""
-    clone_learning_rate: float = 2e-3
-    """Learning rate of behaviour cloning at the start; falls linearly to 0."""
-    critic_warmup_iterations: int = 10
-    """Iterations of reinforcement learning that train the critic alone, if there are demonstrations."""
-    averaged_iterations: int = 1
-    """Iterations over which the policy is a running average of the actor; 1: it is the actor."""
-    imitation_weight: float = 0.0
-    """Weight of the imitation loss at the start of reinforcement learning; falls linearly to 0."""
+    """Evaluations, at equal distances."""
+    num_envs: int = 512
+    """Envs that are stepped together."""
+    num_steps: int = 96
+    """Control steps of each env per iteration."""
+    episode_seconds: float = 8.0
+    """Duration in training, s. The rest is bootstrapped."""
+    short_episodes: float = 0.0
+    """Share of the episodes that is cut after 0.6 s."""
+    gamma: float = 0.99
+    """Discount per control step of 0.02 s."""
+    final_gamma: float = 0.995
+    """Discount at the end; 1 less it falls geometrically."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of hidden layers."""
+    symmetry: Symmetry = "none"
+    """What the actor keeps of the task's symmetry."""
+    learning_rate: float = 2e-3
+    """Learning rate; it falls linearly."""
+    final_learning_rate_fraction: float = 0.05
+    """That at the end, as a fraction."""
+    batch_size: int = 3072
+    """Env steps per gradient step."""
+    std: float = 0.2
+    """Standard deviation of actions in ±1 at the start."""
+
+
+_REWARD_SCALE = 0.02  # of rewards that pay for living
+_COST_SCALE = 0.05  # of those that are minus the cost alone, which are smaller
+_AVERAGED_ITERATIONS = 10  # over which the policy is a running average of the actor
+_CLONE_ITERATIONS, _CLONE_STEPS, _CLONE_BATCH, _CLONE_RATE = 60, 300, 1024, 2e-3  # the rate falls linearly to 0
+_WAITING_PROGRESS = 0.2  # share of their course at which schedules wait until training backwards has come to the task
+_SETTLED_LEARNING_RATE = 7e-4  # when it has come there, from where it falls to the same end
+_WARMUP_ITERATIONS = 15  # of the critic alone, after a warm start: an untrained one would undo what the actor knows
 
 
 class ModelFree(ABC):
@@ -95,7 +77,10 @@ class ModelFree(ABC):
     With demonstrations there are three stages. First the actor imitates the expert's actions (behaviour cloning). Then the
     critic alone is trained, because the gradient of an untrained critic would undo the imitation. Then actor and critic are
     trained by reinforcement learning. In this stage the gradient of an imitation loss is added to every step of the actor,
-    with a weight that falls to 0.
+    with a weight that falls to 0. A policy to start from takes the place of the first stage, and there is nothing to imitate.
+
+    On a task that ends at its goal, after a warm start or backwards, the reward is minus the cost: living would pay for
+    missing the goal.
 
     A resumed run does exactly what it would have done; only the success rate of the last hundred episodes starts anew.
     """
@@ -106,49 +91,54 @@ class ModelFree(ABC):
         params: BallbotParams,
         config: ModelFreeConfig,
         demos: Demos | None,
+        warm: bool,
         frame: Frame | None = None,
+        control_dt: float | None = None,
+        backwards: bool = False,
     ):
-        """Args: frame: in which the envs show observations and take actions; demos must be of it already.
+        """Args:
+        demos: to imitate.
+        warm: whether training starts from them or from a policy.
+        frame: in which the envs show observations and take actions; demos must be of it already.
+        control_dt: how long each force is held in training, s; default, as in the task.
+        backwards: as of `CurriculumBatch`.
 
         Raises:
-            ValueError: forces are held for longer than in the optima on which episodes begin.
+            ValueError: the task does not have what the settings ask for, or a discount factor is none.
         """
-        self.iteration, self._settings, self._task, self._demos = 0, config, task, demos
-        if config.control_dt is not None and demos is None:
-            if config.curriculum.starts_on_optima:
-                raise ValueError("control_dt cannot be used with curriculum.starts_on_optima")
-            task = replace(task, control_dt=config.control_dt)
-        self._trained = task
-        self._relative_values = config.relative_values if demos is None else 0.0
+        for name in ("gamma", "final_gamma"):
+            if not 0 < getattr(config, name) < 1:
+                raise ValueError(f"{name} must be between 0 and 1, not {getattr(config, name):g}")
+        self.iteration, self._settings, self._task, self._demos, self._warm = 0, config, task, demos, warm
+        self._trained = task if control_dt is None else replace(task, control_dt=control_dt)
+        self._pay = not (backwards or (warm and task.first_exit))
+        self._reward_scale = _REWARD_SCALE if self._pay else _COST_SCALE
         self._gamma = self._per_step(config.gamma)
         self._settled: float | None = None  # share of the iterations after which the curriculum was over
-        self._clone_iterations = 0 if demos is None else config.clone_iterations
-        self._warmup_iterations = 0 if demos is None else config.critic_warmup_iterations
-        self.iterations, self.evaluations = config.rl_iterations + self._clone_iterations, config.evaluations
+        self._clone_iterations = 0 if demos is None else _CLONE_ITERATIONS
+        self.iterations, self.evaluations = config.iterations + self._clone_iterations, config.evaluations
         self._env = TrainingEnv(
-            task,
+            self._trained,
             params,
             config.num_envs,
             config.episode_seconds,
-            config.reward_scale,
-            config.curriculum,
+            self._reward_scale,
             self._gamma,
             frame,
-            pay=config.pay,
-            failure_price=config.failure_price,
+            config.short_episodes,
+            backwards,
+            self._pay,
         )
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
         self._model: Any = model  # PPO or SAC, which both have a gamma
         self._actor, self._optimizers = actor, optimizers
-        self._average = average_of(actor, self._settings.averaged_iterations)
+        self._average = average_of(actor, _AVERAGED_ITERATIONS)
         model.set_logger(Logger(folder=None, output_formats=[]))
         model._last_obs = self._env.reset()
         model._last_episode_starts = np.ones(self._settings.num_envs, bool)
-        self._imitation = (
-            None if self._demos is None else Imitation(actor, self._demos, self._settings.clone_batch_size)
-        )
+        self._imitation = None if self._demos is None else Imitation(actor, self._demos)
         optimizers[0].register_step_pre_hook(self._add_imitation)
         self._random = ScopedRng()
 
@@ -158,12 +148,12 @@ class ModelFree(ABC):
 
     def _value_of_living(self, gamma: float) -> float:
         """Value of living for ever without cost."""
-        return value_of_living(self._trained, self._settings.reward_scale, gamma) if self._settings.pay else 0.0
+        return value_of_living(self._trained, self._reward_scale, gamma) if self._pay else 0.0
 
     def _weigh(self, _critics: nn.Module, _inputs: Any, values: Any) -> None:
         """A forward hook of critics: makes gradients at their values, a tensor or several, relative to the cost to go."""
         several = (values,) if isinstance(values, torch.Tensor) else values
-        weigh_gradients(several, self._value_of_living(self._model.gamma), self._relative_values)
+        weigh_gradients(several, self._value_of_living(self._model.gamma))
 
     @property
     def _kept(self) -> nn.Module:
@@ -191,14 +181,15 @@ class ModelFree(ABC):
         """Gives the discount factor to all that have a copy of it."""
         self._model.gamma = self._env.batch.gamma = gamma
 
+    @property
     @abstractmethod
-    def _imitation_scale(self) -> float:
-        """Factor of the imitation loss, the mean squared difference of the actions, besides its weight."""
+    def _imitation_weight(self) -> float:
+        """Weight of the imitation loss, the mean squared difference of the actions, at the start."""
 
     @property
     def preparation(self) -> int:
         """Iterations that imitate demonstrations, and of the critic alone."""
-        return self._clone_iterations + self._warmup_iterations
+        return self._clone_iterations + (_WARMUP_ITERATIONS if self._warm else 0)
 
     @property
     def difficulty(self) -> dict[str, float]:
@@ -247,15 +238,18 @@ class ModelFree(ABC):
     @property
     def _share_done(self) -> float:
         """Share of the iterations of reinforcement learning that are done."""
-        return (self.iteration - self._clone_iterations) / self._settings.rl_iterations
+        return (self.iteration - self._clone_iterations) / self._settings.iterations
 
     @property
     def _progress(self) -> float:
-        """Share of their course that the schedules are through: that of the iterations, unless they wait."""
-        waits = self._settings.curriculum_progress
-        if self._settled is None or waits == 1:
-            return min(self._share_done, waits)
-        begun = min(self._settled, waits)
+        """Share of their course that the schedules are through. Backwards, they wait until the task is its own: what is
+        learnt until then needs the noise of before.
+        """
+        if not self._env.batch.backwards:
+            return self._share_done
+        if self._settled is None:
+            return min(self._share_done, _WAITING_PROGRESS)
+        begun = min(self._settled, _WAITING_PROGRESS)
         return begun + (1 - begun) * self._since_settled
 
     @property
@@ -263,33 +257,30 @@ class ModelFree(ABC):
         """Share that is done of the iterations since the curriculum was over."""
         return 0.0 if self._settled is None else (self._share_done - self._settled) / (1 - self._settled)
 
-    def _annealed(self, rate: float, final_fraction: float) -> float:
-        """A learning rate in the present iteration."""
-        progress, last = self._progress, self._settings.last_learning_rate
-        if last is not None and self._settled is not None and self._demos is None:
-            rate, final_fraction, progress = last, final_fraction * rate / last, self._since_settled
-        if self._settings.learning_rate_schedule == "linear":
-            return schedules.linear(rate, final_fraction, progress)
-        return schedules.geometric(rate, final_fraction * rate, progress)
+    @property
+    def _learning_rate(self) -> float:
+        """The learning rate now. Large steps find the way backwards, and small ones then bring costs down."""
+        rate, fraction = self._settings.learning_rate, self._settings.final_learning_rate_fraction
+        if self._settled is not None and self._env.batch.backwards:
+            settled = _SETTLED_LEARNING_RATE
+            return schedules.linear(settled, fraction * rate / settled, self._since_settled)
+        return schedules.linear(rate, fraction, self._progress)
 
     @property
     def _critic_only(self) -> bool:
-        return self.iteration < self._clone_iterations + self._warmup_iterations
+        return self.iteration < self.preparation
 
     def _clone(self) -> dict[str, float]:
         """One iteration of behaviour cloning."""
         assert self._imitation is not None
-        progress = self.iteration / self._clone_iterations
-        rate = schedules.linear(self._settings.clone_learning_rate, 0.0, progress)
-        return self._imitation.clone(self._settings.clone_gradient_steps, rate)
+        return self._imitation.clone(schedules.linear(_CLONE_RATE, 0.0, self.iteration / self._clone_iterations))
 
     def _improve(self) -> dict[str, float]:
         """One iteration of reinforcement learning."""
         settings, model = self._settings, self._model
         if self._settled is None and self._env.batch.is_settled:
             self._settled = self._share_done
-        if settings.final_gamma is not None:
-            self._raise_gamma(self._per_step(schedules.discount(settings.gamma, settings.final_gamma, self._progress)))
+        self._raise_gamma(self._per_step(schedules.discount(settings.gamma, settings.final_gamma, self._progress)))
         self._actor.requires_grad_(not self._critic_only)
         # SB3 takes None as "never" for its own printing
         model.learn(settings.num_envs * settings.num_steps, log_interval=cast(int, None), reset_num_timesteps=False)
@@ -306,8 +297,7 @@ class ModelFree(ABC):
     def _add_imitation(self, *_: object) -> None:
         """Adds the gradient of the imitation loss to that of a step of the actor."""
         if self._imitation is not None and not self._critic_only:
-            weight = self._settings.imitation_weight * (1 - self._progress) * self._imitation_scale()
-            (weight * self._imitation.loss()).backward()
+            (self._imitation_weight * (1 - self._progress) * self._imitation.loss()).backward()
 
 
 class TrainingEnv(VecEnvWrapper):
@@ -324,11 +314,11 @@ class TrainingEnv(VecEnvWrapper):
         num_envs: int,
         episode_seconds: float,
         reward_scale: float,
-        curriculum: Curriculum = Curriculum(),
         gamma: float = 1.0,
         frame: Frame | None = None,
+        short_episodes: float = 0.0,
+        backwards: bool = False,
         pay: bool = True,
-        failure_price: float = 0.0,
     ):
         """Makes the envs.
 
@@ -338,19 +328,16 @@ class TrainingEnv(VecEnvWrapper):
             num_envs: how many.
             episode_seconds: duration of an episode, s.
             reward_scale: factor of every reward.
-            curriculum: what is easier at first.
-            gamma: the learner's discount factor, for the curriculum's shaping.
+            gamma: the learner's discount factor, for shaping.
             frame: in which observations are shown and actions taken; default, the task's own.
-            pay, failure_price: as of `CurriculumBatch`.
+            short_episodes, backwards, pay: as of `CurriculumBatch`.
 
         Raises:
-            ValueError: the task has not what the curriculum asks for.
+            ValueError: the task has not what these ask for.
         """
         shorter = replace(task, duration=episode_seconds)
         self._vector = BallbotVectorEnv(num_envs, shorter, params=params, compile=False, engine="torch")
-        self.batch = CurriculumBatch(
-            shorter, num_envs, params, curriculum, gamma, full=task, pay=pay, failure_price=failure_price
-        )
+        self.batch = CurriculumBatch(shorter, num_envs, params, gamma, task, short_episodes, backwards, pay)
         self._vector.batch = self.batch
         self._scale = np.float32(reward_scale)
         self._frame, self._axes = frame, np.zeros(0)
@@ -400,28 +387,28 @@ class TrainingEnv(VecEnvWrapper):
 class Imitation:
     """Imitation of an expert by an actor: behaviour cloning, and a loss to add to that of reinforcement learning."""
 
-    def __init__(self, actor: nn.Module, demos: Demos, batch_size: int):
-        """Args: actor: observations (n, no) to mean actions (n, 2); batch_size: demonstrated steps per gradient step."""
-        self._actor, self._batch_size = actor, batch_size
+    def __init__(self, actor: nn.Module, demos: Demos):
+        """Args: actor: observations (n, no) to mean actions (n, 2)."""
+        self._actor = actor
         self._observations, self._labels = torch.as_tensor(demos.observations), torch.as_tensor(demos.actions)
         self._optimizer = torch.optim.Adam(actor.parameters())
 
     def loss(self) -> torch.Tensor:
         """Mean squared difference from the expert's actions in demonstrated states, drawn at random."""
-        chosen = torch.randint(len(self._labels), (self._batch_size,))
+        chosen = torch.randint(len(self._labels), (_CLONE_BATCH,))
         return nn.functional.mse_loss(self._actor(self._observations[chosen]), self._labels[chosen])
 
-    def clone(self, gradient_steps: int, learning_rate: float) -> dict[str, float]:
+    def clone(self, learning_rate: float) -> dict[str, float]:
         """Takes gradient steps of behaviour cloning; returns figures to log."""
         total = 0.0
         self._optimizer.param_groups[0]["lr"] = learning_rate
-        for _ in range(gradient_steps):
+        for _ in range(_CLONE_STEPS):
             loss = self.loss()
             self._optimizer.zero_grad()
             loss.backward()
             self._optimizer.step()
             total += float(loss.detach())
-        return {"loss/cloning": total / gradient_steps}
+        return {"loss/cloning": total / _CLONE_STEPS}
 
     def state_dict(self) -> dict[str, Any]:
         """State of the optimizer. The actor belongs to the model."""

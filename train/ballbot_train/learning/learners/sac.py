@@ -26,8 +26,8 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES, Frame
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value
-from ballbot_train.learning.curricula import Curriculum
-from ballbot_train.learning.demonstrations import Demos, load_demos
+from ballbot_train.learning.curricula import FAILURE_PRICE
+from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
 from ballbot_train.policy import PolicyNetwork, centred
@@ -38,91 +38,96 @@ from ballbot_train.policy_files import Mirrors
 class SacConfig(ModelFreeConfig):
     """Settings of `Sac`."""
 
-    products: bool = False
-    """Whether the critics have a linear path, and see the products of all pairs of observed quantities and actions; with
-    demonstrations they do not. With targets of one step of 0.02 s, as those have, nothing was learnt with them."""
-    rl_iterations: int = 200
-    num_envs: int = 16
-    num_steps: int = 63
-    clone_iterations: int = 15
-    imitation_weight: float = 300.0
-    gradient_steps: int = 4
-    """Gradient steps after each control step of all envs."""
     symmetry: Literal["none", "mirrors", "frame", "fine_frame", "centred"] = "none"
-    """Whether actor and critics learn from the task's mirror images as well, over which the policy is averaged; or see the
-    task's frame, or its fine frame, and act in it; with an actor that is exact in the steady motion of the end (centred)."""
-    n_steps: int = 1
-    """Control steps whose rewards a target of the critics adds up before it takes a value; with demonstrations one alone."""
-    buffer_steps: int = 0
-    """Env steps of its own that it keeps to learn from; 0, or with demonstrations: all. With the last ones alone, `n_steps`
-    may be larger, because they are of nearly the same policy."""
-    layer_norm: bool = False
-    """Whether the critics' hidden layers are normalized, as Ball et al. do, unless they see products."""
-    num_critics: int = 2
-    """Critics, whose smallest value counts."""
-    learning_rate: float = 5e-4
-    """Learning rate at the start."""
-    final_learning_rate_fraction: float = 0.1
-    """Learning rate at the end, as a fraction of that at the start. It falls as `learning_rate_schedule` says."""
-    batch_size: int = 256
-    """Env steps per gradient step."""
-    tau: float = 0.005
-    """Share by which the target critics move to the critics at each gradient step."""
-    target_entropy: float = -5.0
-    """Entropy of the actions to which the entropy coefficient is tuned, nats."""
-    ent_coef: float = 0.01
-    """Entropy coefficient at the start, in scaled rewards per nat."""
-    std: float = 0.5
-    """Standard deviation of the actions at the start, before tanh."""
-    demo_std: float = 0.05
-    """In place of `std` if there are demonstrations."""
+    """What actor and critics keep of the task's symmetry."""
+    products: bool = False
+    """Critics see products of all pairs of inputs."""
+    gradient_steps: int = 16
+    """Gradient steps per control step of all envs."""
+    n_steps: int = 8
+    """Steps that a target looks ahead."""
+    buffer_size: int = 64_000
+    """Own env steps that are kept."""
+    target_entropy: float = -4.0
+    """Entropy that the coefficient is tuned to, nats."""
 
 
-_FAR = SacConfig(
-    control_dt=0.05,
-    n_steps=8,
-    gradient_steps=16,
-    batch_size=512,
+_SCRATCH = SacConfig(
+    iterations=300,
+    num_envs=128,
+    num_steps=25,
+    episode_seconds=4.0,
+    gamma=0.98,
+    final_gamma=0.992,
+    hidden=(128, 128),
     learning_rate=1e-3,
     final_learning_rate_fraction=0.03,
-    relative_values=1.0,
+    batch_size=512,
     std=0.3,
-    target_entropy=-4.0,
-    averaged_iterations=10,
 )
-# Targets that look 0.4 s ahead, in steps that the present policy took. With one step of 0.02 s the critics' errors are larger
-# than what an action changes, and SAC forgot what it had learnt.
 
 TUNED: dict[str, SacConfig] = {
-    "stabilize": replace(
-        _FAR,
-        symmetry="mirrors",
-        rl_iterations=300,
-        num_envs=128,
-        num_steps=25,
-        buffer_steps=64_000,
-        gamma=0.98,
-        final_gamma=0.992,
-        products=True,
-        evaluations=30,
-        curriculum=Curriculum(short_episodes=0.3),
-    ),
+    "": _SCRATCH,
+    "stabilize": replace(_SCRATCH, evaluations=30, short_episodes=0.3, symmetry="mirrors", products=True),
     "orbit": replace(
-        _FAR,
-        symmetry="centred",
-        rl_iterations=700,
+        _SCRATCH,
+        iterations=700,
+        evaluations=35,
         num_envs=512,
         num_steps=12,
-        buffer_steps=64_000,
+        short_episodes=0.3,
         gamma=0.985,
         final_gamma=0.993,
-        evaluations=35,
-        curriculum=Curriculum(short_episodes=0.3, short_seconds=1.0),
+        symmetry="centred",
     ),
-    "turn": SacConfig(episode_seconds=8.0, symmetry="frame"),
-    "weave": SacConfig(episode_seconds=8.0, symmetry="frame"),
+    "turn": replace(_SCRATCH, episode_seconds=8.0, symmetry="frame"),
+    "weave": replace(_SCRATCH, episode_seconds=8.0, symmetry="frame"),
 }
-"""Settings by name of task; every other task takes the defaults."""
+"""From scratch by name of task; "" is any other.
+
+Targets look 0.4 s ahead, in steps that the present policy took. With one step of 0.02 s the critics' errors are larger than
+what an action changes, and SAC forgot what it had learnt.
+"""
+
+_WARM = replace(
+    _SCRATCH,
+    iterations=60,
+    evaluations=40,
+    num_envs=64,
+    gamma=0.995,
+    final_gamma=0.995,
+    learning_rate=3e-4,
+    final_learning_rate_fraction=0.1,
+    std=0.05,
+    gradient_steps=8,
+    n_steps=1,
+    buffer_size=1_000_000,
+    target_entropy=-5.0,
+)
+
+WARM: dict[str, SacConfig] = {
+    "": _WARM,
+    "stabilize": replace(_WARM, symmetry="mirrors"),
+    "orbit": replace(_WARM, gamma=0.99, final_gamma=0.99, hidden=(64, 64), symmetry="frame"),
+    "weave": replace(_WARM, episode_seconds=8.0, hidden=(256, 256), symmetry="frame"),
+    "turn": replace(
+        _WARM,
+        episode_seconds=8.0,
+        gamma=0.998,
+        final_gamma=0.998,
+        hidden=(256, 256),
+        symmetry="frame",
+        learning_rate=1e-4,
+    ),
+}
+"""The same with demonstrations, or from a policy; "" is any other task. Demonstrations are single steps of the task."""
+
+_CONTROL_DT = (
+    0.05  # s, how long each force is held from scratch: an action changes more, and critics tell actions apart
+)
+TAU = 0.005  # share by which the target critics move to the critics at each gradient step
+ENT_COEF = 0.01  # entropy coefficient at the start, in scaled rewards per nat
+_IMITATION_WEIGHT = 300.0
 
 
 class SymmetricReplay(NStepReplayBuffer):
@@ -293,57 +298,57 @@ def last_bias(critic: torch.nn.Module) -> torch.Tensor:
 class Sac(ModelFree):
     """The learner; see `training.Learner`."""
 
-    def __init__(self, task: Task, params: BallbotParams, config: SacConfig, seed: int = 0, demos: Demos | None = None):
-        """Takes demonstrations to learn from as well, or None.
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        config: SacConfig,
+        seed: int = 0,
+        demos: Demos | None = None,
+        start: PolicyNetwork | None = None,
+    ):
+        """Takes demonstrations to learn from as well, or a policy of SAC's to start from.
 
         Raises:
-            ValueError: the task has no frame, and the settings ask for it; or they shape rewards beside demonstrations.
+            ValueError: the task has not what the settings ask for, or the policy is of another shape.
         """
-        if demos is not None and config.curriculum.shaping:
-            raise ValueError(
-                "curriculum.shaping cannot be used with sac's demonstrations, because their rewards are not shaped"
-            )
-        if demos is not None and not config.pay:
-            demos = demos.without_pay(task, config.failure_price)
+        if demos is not None and config.n_steps > 1:
+            raise ValueError("n_steps must be 1 with demonstrations, which are single steps")
         self._spec = spec_for(task, config.symmetry, config.hidden)
         frame = None if self._spec.frame is None else FRAMES[self._spec.frame]
+        if demos is not None and task.first_exit:
+            demos = demos.without_pay(task, FAILURE_PRICE)
         if demos is not None and frame is not None:
             demos = demos_in_frame(demos, frame)
-        super().__init__(task, params, config, demos, frame)
+        warm = demos is not None or start is not None
+        super().__init__(task, params, config, demos, warm, frame, None if warm else _CONTROL_DT)
         self.config = config
-        products = config.products and demos is None
-        rate = config.learning_rate
         value = self._value_of_living(self._gamma)
-        own = products or config.layer_norm or self._spec.centred
-        critic = _critic_network(products, config.layer_norm, value)
-        networks = {"network": critic, "centre": frame if self._spec.centred else None}
+        networks = {
+            "network": _critic_network(config.products, warm, value),
+            "centre": frame if self._spec.centred else None,
+        }
         model = SAC(
-            OwnPolicy if own else "MlpPolicy",
+            OwnPolicy,
             self._env,
-            learning_rate=lambda _: self._annealed(rate, config.final_learning_rate_fraction),
-            buffer_size=(demos is None and config.buffer_steps)
-            or config.rl_iterations * config.num_steps * config.num_envs,
+            learning_rate=lambda _: self._learning_rate,
+            buffer_size=config.buffer_size,
             learning_starts=0,
             batch_size=config.batch_size,
-            tau=config.tau,
+            tau=TAU,
             gamma=self._gamma,
             gradient_steps=config.gradient_steps,
             replay_buffer_class=SymmetricReplay,
             replay_buffer_kwargs={
                 "demos": demos,
-                "reward_scale": config.reward_scale,
+                "reward_scale": self._reward_scale,
                 "mirrors": self._spec.mirrors,
-                "n_steps": config.n_steps if demos is None else 1,
+                "n_steps": config.n_steps,
                 "gamma": self._gamma,
             },
-            ent_coef=f"auto_{config.ent_coef}",
+            ent_coef=f"auto_{ENT_COEF}",
             target_entropy=config.target_entropy,
-            policy_kwargs={
-                "net_arch": list(config.hidden),
-                "n_critics": config.num_critics,
-                "activation_fn": torch.nn.SiLU,
-                **(networks if own else {}),
-            },
+            policy_kwargs={"net_arch": list(config.hidden), "activation_fn": torch.nn.SiLU, **networks},
             seed=seed,
             device="cpu",
         )
@@ -352,17 +357,16 @@ class Sac(ModelFree):
         self._replay = cast(SymmetricReplay, model.replay_buffer)
         actor, log_std = model.actor, cast(torch.nn.Linear, model.actor.log_std)
         torch.nn.init.zeros_(log_std.weight)
-        torch.nn.init.constant_(log_std.bias, math.log(config.std if demos is None else config.demo_std))
-        if not products:
+        torch.nn.init.constant_(log_std.bias, math.log(config.std))
+        if not config.products:
             for critic in (*model.critic.q_networks, *model.critic_target.q_networks):
                 torch.nn.init.constant_(last_bias(critic), value)
-        if not config.curriculum.shaping:  # which adds to rewards
-            # Critics overestimate, more and more, because they learn from their own estimates. Costs are not negative, so
-            # there is a limit, and values drift no farther.
-            model.critic_target.register_forward_hook(
-                lambda _module, _inputs, values: tuple(value.clamp(max=self._highest()) for value in values)
-            )
-        if self._relative_values:
+        # Critics overestimate, more and more, because they learn from their own estimates. Costs are not negative, so there
+        # is a limit, and values drift no farther.
+        model.critic_target.register_forward_hook(
+            lambda _module, _inputs, values: tuple(value.clamp(max=self._highest()) for value in values)
+        )
+        if not warm:
             model.critic.register_forward_hook(self._weigh)
         self._model: SAC
         self._set_model(
@@ -372,6 +376,19 @@ class Sac(ModelFree):
             else torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
             (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
         )
+        if start is not None:
+            self._start_from(start)
+
+    def _start_from(self, start: PolicyNetwork) -> None:
+        """Takes the weights of a policy."""
+        mine = self.network.spec
+        if replace(start.spec, task=mine.task, robot=mine.robot) != mine:
+            raise ValueError(f"a policy of {start.spec} cannot start one of {mine}; give --hidden or --symmetry")
+        given = [layer for layer in start.mlp if isinstance(layer, torch.nn.Linear)]
+        for module in (self._actor, self._average.module):
+            own = [layer for layer in module.modules() if isinstance(layer, torch.nn.Linear)]
+            for layer, other in zip(own, given, strict=True):
+                layer.load_state_dict(other.state_dict())
 
     @property
     def network(self) -> PolicyNetwork:
@@ -390,8 +407,7 @@ class Sac(ModelFree):
 
     def _highest(self) -> float:
         """The most that a value can be."""
-        config = self.config
-        return highest_value(self._trained, config.reward_scale, self._model.gamma) if config.pay else 0.0
+        return highest_value(self._trained, self._reward_scale, self._model.gamma) if self._pay else 0.0
 
     def _value_biases(self) -> list[torch.Tensor]:
         critics = (*self._model.critic.q_networks, *self._model.critic_target.q_networks)
@@ -401,14 +417,22 @@ class Sac(ModelFree):
         super()._take_gamma(gamma)
         self._replay.gamma = gamma
 
-    def _imitation_scale(self) -> float:
-        return 1.0
+    @property
+    def _imitation_weight(self) -> float:
+        return _IMITATION_WEIGHT
 
 
-def make(task: Task, params: BallbotParams, config: SacConfig, seed: int, demos: str | Path | None) -> Sac:
+def make(
+    task: Task,
+    params: BallbotParams,
+    config: SacConfig,
+    seed: int,
+    demos: str | Path | None = None,
+    start: PolicyNetwork | None = None,
+) -> Sac:
     """Makes the learner.
 
     Raises:
-        ValueError: the demonstrations are of another task.
+        ValueError: the demonstrations are of another task, or the policy to start from is of another shape.
     """
-    return Sac(task, params, config, seed, None if demos is None else load_demos(demos, task))
+    return Sac(task, params, config, seed, None if demos is None else load_demos(demos, task), start)

@@ -13,7 +13,6 @@ each step a share of it ends that grows with the depth in the goal.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -39,42 +38,41 @@ class ShacConfig:
     """Settings of `Shac` and of `WholeEpisodes`, which takes over where `horizon` is 0."""
 
     iterations: int = 4000
-    """Iterations, each of `horizon` control steps of `num_envs` envs, or of as many whole episodes."""
+    """Iterations of a window or of whole episodes."""
     evaluations: int = 20
-    """Number of evaluations, at equal distances."""
+    """Evaluations, at equal distances."""
     num_envs: int = 512
     """Envs that are stepped together."""
     horizon: int = 50
-    """Control steps of a window, through which the gradient runs. 0: it runs through whole episodes, and there is no critic.
-    This takes a good policy nearer to the optimum."""
+    """Control steps of a window; 0: whole episodes, to refine."""
     episode_seconds: float = 4.0
     """Duration of whole episodes, s."""
     learning_rate: float = 3e-3
-    """Learning rate of the policy at the start."""
+    """Learning rate of the policy."""
     critic_learning_rate: float = 3e-3
-    """Learning rate of the critic at the start."""
+    """Learning rate of the critic."""
     gamma: float = 1.0
-    """Discount factor per control step; below 1 for tasks whose cost never ends."""
+    """Discount; below 1 where cost never ends."""
     hidden: tuple[int, ...] = (128, 128)
-    """Units of the hidden layers of policy and critic."""
+    """Units of hidden layers."""
     symmetry: RoutedSymmetry = "none"
-    """How the actor respects the task's symmetry; see `actors.Symmetry` and `actors.RoutedSymmetry`."""
+    """What the actor keeps of the task's symmetry."""
     reset_fraction: float = 0.4
-    """Share of the envs that start a new episode after each window, because the first second costs most."""
+    """Share of the envs that start anew after a window."""
     hard_fraction: float = 0.0
-    """Share of the new episodes that are hard: of 16 times as many that are drawn, those with the highest expected cost."""
+    """Share of those that start where high cost is expected."""
     margin_clearance: float = 0.0
-    """Distance from the margins at which a penalty starts, in the margins' units."""
+    """Distance to a margin where a penalty starts."""
     margin_penalty: float = 0.0
-    """Penalty per second and squared shortfall of this clearance; 0: none. It grows linearly from 0.15 on."""
+    """Per second and squared shortfall of it; 0: none."""
     one_way: bool = False
-    """Whether the penalty keeps a policy of Weave on the sides of the obstacles on which it started. From scratch no way past
-    the first obstacle was found with it."""
+    """Weave stays on the sides where it started; not from scratch."""
     exit_softness: float = 0.0
-    """Width of the gradual first exit of windows, in units of the goal functions; 0: episodes end at once."""
+    """Width of a gradual end, in units of the goal."""
 
 
 TUNED: dict[str, ShacConfig] = {
+    "": ShacConfig(),
     "stabilize": ShacConfig(symmetry="odd"),
     "turn": ShacConfig(exit_softness=0.3),
     "orbit": ShacConfig(gamma=0.998),
@@ -362,10 +360,18 @@ class Shac:
 
 
 def make(
-    task: Task, params: BallbotParams, config: ShacConfig, seed: int, demos: str | Path | None
+    task: Task,
+    params: BallbotParams,
+    config: ShacConfig,
+    seed: int,
+    demos: None = None,
+    start: PolicyNetwork | None = None,
 ) -> Shac | WholeEpisodes:
-    """Makes the learner, which uses no demonstrations; raises a ValueError where the task or a setting does not fit."""
+    """Makes the learner, without demonstrations; raises a ValueError where the task, a setting or a policy does not fit."""
     for name in ("margin_clearance", "one_way"):
         if getattr(config, name) and not config.margin_penalty:
             raise ValueError(f"{name} needs margin_penalty above 0")
-    return Shac(task, params, config, seed) if config.horizon else WholeEpisodes(task, params, config, seed)
+    learner = Shac(task, params, config, seed) if config.horizon else WholeEpisodes(task, params, config, seed)
+    if start is not None:
+        learner.start_from(start)
+    return learner

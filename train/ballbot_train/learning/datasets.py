@@ -1,0 +1,230 @@
+"""Reads demonstrations: a dataset as a whole, or shards one by one."""
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_gym.checks import LARGEST
+from ballbot_gym.tasks import Task
+from ballbot_train import shards
+from ballbot_train.policy_files import OBSERVATION_VERSION
+
+_IN_DATASET = {  # where Minari keeps the arrays of an episode, by their names in a shard
+    "observations": "observations",
+    "states": "infos/state",
+    "labels": "infos/expert_action",
+    "actions": "actions",
+    "rewards": "rewards",
+    "terminations": "terminations",
+    "truncations": "truncations",
+}
+_UNFIT = (KeyError, ValueError, IndexError, TypeError)  # arrays that do not fit together
+
+
+@dataclass(frozen=True)
+class Demos:
+    """n control steps of demonstrations, episode after episode.
+
+    | field | shape | meaning |
+    |---|---|---|
+    | observations | (n, no) float32 | before the step |
+    | actions | (n, 2) float32 | the expert's, in [−1, 1] |
+    | rewards | (n,) float32 | of the executed actions |
+    | next_observations | (n, no) float32 | after the step; of an episode's last step too |
+    | terminations, truncations | (n,) bool | the episode ended with this step |
+    | executed | (n, 2) float32 | executed actions: the expert's plus noise, in [−1, 1] |
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    next_observations: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+    executed: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def without_pay(self, task: Task, failure_price: float) -> "Demos":
+        """The same steps where living does not pay: rewards are minus the running cost, and a failure costs its price.
+
+        The step that arrives at the goal of a first-exit task is known by its reward, the pay of all the time that was left.
+        """
+        pay = task.survival_reward * task.control_dt
+        starts = np.flatnonzero(np.append(True, (self.terminations | self.truncations)[:-1]))
+        step = np.arange(len(self)) - np.repeat(starts, np.diff(np.append(starts, len(self))))
+        arrived = self.terminations & (self.rewards > pay) & task.first_exit
+        failed = self.terminations & ~arrived
+        rewards = self.rewards - pay - arrived * pay * (task.steps - step - 1) - failed * failure_price
+        return replace(self, rewards=rewards.astype(np.float32))
+
+
+class StreamedDemos:
+    """Demonstrations that are read shard by shard, for datasets that do not fit into memory."""
+
+    def __init__(self, url: str | Path, task: Task, seed: int):
+        """Args: url: of a set of `ballbot demos --shards`; task: the set must be made for it; seed: of the order of shards.
+
+        Raises:
+            ValueError: there is no such set, or it is of another task or observation version.
+        """
+        self._shards, self._task, self._seed = _opened(url, task), task, seed
+
+    def at(self, iteration: int) -> Demos:
+        """The demonstrations of an iteration: one shard, which depends on seed and iteration alone.
+
+        All shards come once before any comes again, each time in another order.
+        """
+        numbers = self._shards.numbers
+        epoch, i = divmod(iteration, len(numbers))
+        order = np.random.default_rng([self._seed, epoch, 2]).permutation(len(numbers))
+        return _of_shard(self._shards, numbers[order[i]], self._task)
+
+
+def _opened(url: str | Path, task: Task) -> shards.Shards:
+    """The set of shards, made for a task."""
+    opened = shards.Shards(url)
+    if opened.about is None or "demos" not in opened.about or not opened.numbers:
+        raise ValueError(f'{url} is no dataset of "ballbot demos --shards", or an empty one')
+    _check_made_for(str(url), opened.about, task)
+    return opened
+
+
+def _of_shard(opened: shards.Shards, number: int, task: Task) -> Demos:
+    arrays = opened.read(number)
+    try:
+        return _demos(arrays, len(task.observation_scale))
+    except _UNFIT as error:
+        raise _damaged_shard(opened, number, error) from error
+
+
+def load_demos(path: str | Path, task: Task) -> Demos:
+    """Reads a dataset of `ballbot demos`, all its episodes.
+
+    Args:
+        path: folder of the dataset, or the URL of shards.
+        task: the dataset must have been made for this very task.
+
+    Raises:
+        ValueError: there is no such dataset, or it is damaged, or of another task or observation version.
+    """
+    if shards.is_set(path):
+        opened = _opened(path, task)
+        parts = [vars(_of_shard(opened, number, task)) for number in opened.numbers]
+        return Demos(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    path = Path(path)
+    _check_made_for(str(path), metadata_of(path), task)
+    try:
+        return _demos(_dataset(path), len(task.observation_scale))
+    except Exception as error:  # h5py has dozens of ways to refuse a damaged file
+        raise _damaged_dataset(path, error) from error
+
+
+def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task) -> None:
+    """Raises a ValueError for demonstrations of another task or observation version."""
+    if metadata.get("task") != repr(task):
+        raise ValueError(f"{path} holds demonstrations of {metadata.get('task')}, not of {task!r}")
+    if metadata.get("observation_version") != OBSERVATION_VERSION:
+        raise ValueError(
+            f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "
+            'make it anew with "ballbot demos"'
+        )
+
+
+def _dataset(path: Path) -> dict[str, np.ndarray]:
+    """A dataset's HDF5 as arrays of a shard; see `_arrays_of`.
+
+    Minari itself would make the env that a dataset describes, with whatever code that names, and read arrays of any size.
+    """
+    main = path / "data" / "main_data.hdf5"
+    if not main.is_file():
+        raise ValueError(f"{main} is no regular file")
+    size, declared = main.stat().st_size, 0
+    arrays: dict[str, list[np.ndarray]] = {name: [] for name in _IN_DATASET}
+    with h5py.File(main, "r") as file:
+        for i in range(len(file)):
+            group: Any = file[f"episode_{i}"]
+            declared += sum(group[place].nbytes for place in _IN_DATASET.values())
+            if declared > size:
+                raise ValueError(f"its arrays declare more than the {size} bytes of {main.name}")
+            for name, place in _IN_DATASET.items():
+                arrays[name].append(group[place][()])
+    lengths = np.array([len(each) for each in arrays["actions"]], np.int64)
+    return {name: np.concatenate(parts) for name, parts in arrays.items()} | {"lengths": lengths}
+
+
+def _demos(arrays: Mapping[str, np.ndarray], observations: int) -> Demos:
+    """The demonstrations of a shard's arrays, with so many observations.
+
+    Raises:
+        KeyError, ValueError, IndexError, TypeError: they do not fit together, or one holds something else than numbers.
+    """
+    lengths = arrays["lengths"]
+    n, ends = int(lengths.sum()), np.cumsum(lengths + 1) - 1  # where the observations of each episode end
+    shapes = {"observations": (n + len(lengths), observations), "labels": (n, 2), "actions": (n, 2), "rewards": (n,)}
+    found = {
+        name: files.numbers(arrays[name], name, shape, LARGEST).astype(np.float32) for name, shape in shapes.items()
+    }
+    for name in ("terminations", "truncations"):
+        if arrays[name].dtype != np.bool_ or arrays[name].shape != (n,):
+            raise ValueError(f"{name} must be {n} truth values, not {arrays[name].shape} of {arrays[name].dtype}")
+    return Demos(
+        observations=np.delete(found["observations"], ends, 0),
+        actions=found["labels"],
+        rewards=found["rewards"],
+        next_observations=np.delete(found["observations"], ends - lengths, 0),
+        terminations=arrays["terminations"],
+        truncations=arrays["truncations"],
+        executed=found["actions"],
+    )
+
+
+def _damaged_dataset(path: str | Path, error: Exception) -> ValueError:
+    return ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r:.300})')
+
+
+def _damaged_shard(opened: shards.Shards, number: int, error: Exception) -> ValueError:
+    return ValueError(f"shard {number} of {opened.url} is damaged; make the set anew ({error!r:.300})")
+
+
+def command_of(path: str | Path) -> str:
+    """The command that makes a dataset of `ballbot demos` anew.
+
+    Raises:
+        ValueError: it is no such dataset.
+    """
+    if shards.is_set(path):
+        opened = shards.Shards(path)
+        settings = {"episodes": opened.episodes} | (opened.about or {}).get("demos", {})
+        options = {"shards": str(path)}
+    else:
+        settings, options = metadata_of(Path(path))["demos"], {"out": str(path)}
+    for name, value in settings.items():
+        options |= (
+            {f"{name}.{part}": each for part, each in value.items()} if isinstance(value, dict) else {name: value}
+        )
+    words = ["ballbot", "demos"]
+    for name, value in options.items():
+        if isinstance(value, bool):
+            words.append(f"--{name}" if value else f"--no-{name}")
+        else:
+            words += [f"--{name}", str(value)]
+    return shlex.join(words)
+
+
+def metadata_of(path: Path) -> dict[str, Any]:
+    """Metadata of a dataset of `ballbot demos`; raises a ValueError for anything else."""
+    try:
+        metadata = files.read_json(path / "data" / "metadata.json")
+        if not isinstance(metadata, dict) or not isinstance(metadata.get("demos"), dict):
+            raise ValueError("not made by ballbot demos")
+    except ValueError as error:
+        raise ValueError(f'{path} is no dataset of "ballbot demos": {error}') from error
+    return metadata
