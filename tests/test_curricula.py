@@ -331,11 +331,10 @@ def test_the_curriculum_is_over_once_enough_episodes_of_the_task_itself_succeed(
     assert resumed.is_settled
 
 
-def test_short_episodes_end_after_their_seconds_and_the_others_do_not(constants):
+def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
     torch.manual_seed(0)
-    constants(SHORT_SECONDS=0.1)
     task = replace(make_task("stabilize"), duration=2.0)
-    batch = CurriculumBatch(task, 400, default_params(), short_episodes=0.5)
+    batch = CurriculumBatch(task, 400, default_params(), short_episodes=(0.5, 0.1))
     batch.reset(seed=0)
     assert batch.state is not None
     batch.state = batch.state._replace(steps=torch.full((400,), task.steps - 1))
@@ -380,7 +379,8 @@ def test_training_backwards_goes_on_from_its_state_as_if_never_stopped(monkeypat
     ("name", "settings", "message"),
     [
         ("stabilize", {"backwards": True}, "BallbotStabilize-v0 cannot be learnt backwards"),
-        ("turn", {"short_episodes": 0.5}, "BallbotTurn-v0 pays at its goal"),
+        ("turn", {"short_episodes": (0.5, 0.6)}, "BallbotTurn-v0 pays at its goal"),
+        ("weave", {"short_episodes": (1.5, 0.6)}, "short_episodes must be a share of 0 to 1"),
     ],
 )
 def test_what_a_task_has_not_is_refused(name, settings, message):

@@ -33,7 +33,8 @@ TINY = {
         hidden=(16, 8),
         batch_size=32,
         gae_lambda=0.95,
-        relative_costs=False,
+        relative_advantages=False,
+        relative_values=False,
     ),
     "sac": sac.SacConfig(
         products=True,
@@ -228,7 +229,7 @@ def test_a_discount_that_is_no_discount_is_refused(name, setting):
 
 
 def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
-    learner = make("ppo", relative_costs=True)
+    learner = make("ppo", relative_advantages=True)
     learner.iterate()
     buffer = learner._model.rollout_buffer
     living = value_of_living(make_task("stabilize"), SCALE, learner._model.gamma)
@@ -240,7 +241,7 @@ def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
 def test_what_shaping_adds_to_values_is_no_cost_to_go(monkeypatch):
     monkeypatch.setattr(CurriculumBatch, "_start_on_optima", lambda batch, ended: None)
     task = make_task("turn")
-    learner = ppo.make(task, default_params(), replace(TINY["ppo"], relative_costs=True, backwards=True), 0)
+    learner = ppo.make(task, default_params(), replace(TINY["ppo"], relative_advantages=True, backwards=True), 0)
     learner.iterate()
     buffer = learner._model.rollout_buffer
     x, y, gamma, theta, vx, vy = (task.observation_scale[i] * buffer.observations[..., i] for i in range(6))
@@ -557,7 +558,7 @@ def test_gradients_at_sacs_critics_are_relative_to_the_cost_to_go():
 
 def test_gradients_at_ppos_critic_are_relative_to_the_cost_to_go():
     gradients = []
-    for learner in (make("ppo"), relative := make("ppo", relative_costs=True)):
+    for learner in (make("ppo"), relative := make("ppo", relative_values=True)):
         seen = torch.linspace(-1, 1, 128).reshape(16, 8).requires_grad_()
         values = learner._model.policy.evaluate_actions(seen, torch.zeros(16, 2))[0]
         gradients.append(torch.autograd.grad(values.sum(), seen)[0])

@@ -35,7 +35,6 @@ from ballbot_train.evaluation import fresh
 FAILURE_PRICE = 60.0
 """What a failure costs at once where living does not pay."""
 
-_SHORT_SECONDS = 0.6  # duration of the episodes that are cut
 _GOAL_FACTOR, _GOAL_STEP = 5.0, 0.97  # how much wider the goal begins, and the factor by which it narrows
 _RAMPS = {"max_speed": (4.05, 0.2)}  # fields that bound what is drawn: where they begin, and the step to the task's own
 _EPISODES = 256  # that end before their share of successes is looked at; then they are counted anew
@@ -114,7 +113,7 @@ class CurriculumBatch(BallbotBatch):
         params: BallbotParams,
         gamma: float = 1.0,
         full: Task | None = None,
-        short_episodes: float = 0.0,
+        short_episodes: tuple[float, float] = (0.0, 0.6),
         backwards: bool = False,
         pay: bool = True,
     ):
@@ -126,7 +125,7 @@ class CurriculumBatch(BallbotBatch):
             params: the robot.
             gamma: discount factor of the learner, for shaping.
             full: the task itself, whose optima are found; default, `task`.
-            short_episodes: share of the episodes that is cut.
+            short_episodes: share of the episodes that is cut, and how long these last, s.
             backwards: whether training goes from the goal backwards.
             pay: whether living pays; else, and backwards, the reward is minus the running cost, and a failure has a price.
 
@@ -136,7 +135,9 @@ class CurriculumBatch(BallbotBatch):
         distance = task.goal_distance((0.0,) * 8, (1.0,) * len(task.constant_names))
         if backwards and (not task.first_exit or distance is None):
             raise ValueError(f"{task.id} cannot be learnt backwards: it needs first_exit and goal_distance")
-        if short_episodes and task.first_exit:
+        if not (0 <= short_episodes[0] <= 1 and short_episodes[1] > 0):
+            raise ValueError(f"short_episodes must be a share of 0 to 1 and seconds above 0, not {short_episodes}")
+        if short_episodes[0] and task.first_exit:
             raise ValueError(f"{task.id} pays at its goal for the time that is left, so short_episodes must be 0")
         super().__init__(task, num_envs, compile=False, params=params)
         self.gamma, self._own, self._full = gamma, task, task if full is None else full
@@ -203,7 +204,7 @@ class CurriculumBatch(BallbotBatch):
         if self.backwards:
             result = self._go_backwards(result, ended)
         self._begin(ended)
-        if self._short:
+        if self._short[0]:
             self._shorten(ended)
         return result._replace(reward=reward)
 
@@ -363,8 +364,9 @@ class CurriculumBatch(BallbotBatch):
     def _shorten(self, ended: torch.Tensor) -> None:
         """Cuts a share of the episodes that have just begun: their clocks start late, which no observation shows."""
         assert self.state is not None
-        least = self.task.steps - max(1, round(_SHORT_SECONDS / self.task.control_dt))
-        short = ended & (torch.rand(self.num_envs) < self._short)
+        share, seconds = self._short
+        least = self.task.steps - max(1, round(seconds / self.task.control_dt))
+        short = ended & (torch.rand(self.num_envs) < share)
         self.state = self.state._replace(steps=torch.where(short, self.state.steps.clamp(min=least), self.state.steps))
 
 

@@ -110,7 +110,7 @@ _MAY_BE_ZERO = {
     "tube_samples",
 }
 _MAY_BE_NEGATIVE = {"target_entropy"}
-_SHARES = {"final_gamma", "gae_lambda", "gamma", "hard_fraction", "reset_fraction", "short_episodes"}
+_SHARES = {"final_gamma", "gae_lambda", "gamma", "hard_fraction", "reset_fraction"}
 _POSITIVE = {"critic_learning_rate", "final_std", "learning_rate", "std"}
 _MOST = 10**9  # of whole numbers
 _MOST_OF = {"buffer_size": 10**8, "hidden": 2**14, "horizon": 10**5, "num_envs": MOST_ENVS, "num_steps": 10**6}

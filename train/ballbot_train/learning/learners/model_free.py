@@ -42,8 +42,8 @@ class ModelFreeConfig:
     """Control steps of each env per iteration."""
     episode_seconds: float = 8.0
     """Duration in training, s. The rest is bootstrapped."""
-    short_episodes: float = 0.0
-    """Share of the episodes that is cut after 0.6 s."""
+    short_episodes: tuple[float, float] = (0.0, 0.6)
+    """Share of the episodes that is cut, and after how many s."""
     gamma: float = 0.99
     """Discount per control step of 0.02 s."""
     final_gamma: float = 0.995
@@ -316,7 +316,7 @@ class TrainingEnv(VecEnvWrapper):
         reward_scale: float,
         gamma: float = 1.0,
         frame: Frame | None = None,
-        short_episodes: float = 0.0,
+        short_episodes: tuple[float, float] = (0.0, 0.6),
         backwards: bool = False,
         pay: bool = True,
     ):

@@ -33,8 +33,10 @@ class PpoConfig(ModelFreeConfig):
 
     gae_lambda: float = 0.98
     """λ of the advantages."""
-    relative_costs: bool = True
-    """Divide advantages and critic errors by the cost to go."""
+    relative_advantages: bool = True
+    """Divide advantages by the cost to go, as regret is."""
+    relative_values: bool = True
+    """Divide the critic's errors by it too."""
     final_std: float = 0.03
     """Deviation at the end; it falls geometrically."""
     backwards: bool = False
@@ -51,19 +53,27 @@ TUNED: dict[str, PpoConfig] = {
         num_envs=2048,
         num_steps=24,
         episode_seconds=4.0,
-        short_episodes=0.85,
+        short_episodes=(0.85, 0.6),
         gamma=0.995,
         final_gamma=0.999,
         gae_lambda=0.9,
-        relative_costs=False,
+        relative_advantages=False,
+        relative_values=False,
         symmetry="odd",
         final_std=0.05,
     ),
-    "orbit": PpoConfig(iterations=600, evaluations=40, episode_seconds=4.0, short_episodes=0.3, symmetry="centred"),
+    "orbit": PpoConfig(
+        iterations=600,
+        evaluations=40,
+        episode_seconds=4.0,
+        short_episodes=(0.3, 0.6),
+        relative_values=False,
+        symmetry="centred",
+    ),
     "weave": PpoConfig(
         final_gamma=0.994,
         hidden=(128, 128),
-        short_episodes=0.3,
+        short_episodes=(0.3, 0.6),
         symmetry="centred",
         final_learning_rate_fraction=0.02,
     ),
@@ -75,7 +85,8 @@ TUNED: dict[str, PpoConfig] = {
         gamma=0.998,
         final_gamma=0.9995,
         gae_lambda=0.97,
-        relative_costs=False,
+        relative_advantages=False,
+        relative_values=False,
         hidden=(128, 128),
         symmetry="fine_frame",
         learning_rate=1.5e-3,
@@ -94,7 +105,8 @@ second, and the critic alone does not tell: with 24 steps and 0.95 Weave's robot
 _WARM = PpoConfig(
     iterations=100,
     evaluations=40,
-    relative_costs=False,
+    relative_advantages=False,
+    relative_values=False,
     gamma=0.995,
     final_gamma=0.998,
     learning_rate=1e-4,
@@ -106,7 +118,9 @@ _WARM = PpoConfig(
 WARM: dict[str, PpoConfig] = {
     "": _WARM,
     "stabilize": replace(_WARM, episode_seconds=4.0, hidden=(128, 128), symmetry="odd"),
-    "orbit": replace(_WARM, episode_seconds=4.0, symmetry="frame", relative_costs=True, gamma=0.99, short_episodes=0.5),
+    "orbit": replace(
+        _WARM, episode_seconds=4.0, symmetry="frame", relative_advantages=True, gamma=0.99, short_episodes=(0.5, 0.6)
+    ),
     "weave": replace(_WARM, hidden=(256, 256), symmetry="frame", std=0.02),
     "turn": replace(_WARM, hidden=(256, 256), symmetry="frame", gamma=0.998, learning_rate=3e-5),
 }
@@ -273,13 +287,13 @@ class Ppo(ModelFree):
                 "value": self._value_of_living(self._gamma),
                 "warm": warm,
             },
-            rollout_buffer_class=RelativeRollouts if config.relative_costs else None,
+            rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
             rollout_buffer_kwargs=(
                 {
                     "living": self._value_of_living,
                     "potential": lambda: self._reward_scale * self._env.batch.last_potential.numpy(),
                 }
-                if config.relative_costs
+                if config.relative_advantages
                 else None
             ),
             seed=seed,
@@ -288,7 +302,7 @@ class Ppo(ModelFree):
         policy = cast(BranchedPolicy, model.policy)
         self._log_std = cast(torch.nn.Parameter, policy.log_std)
         self._log_std.requires_grad_(False)
-        if config.relative_costs and not warm:  # the critic's last layer, which the policy has as an identity
+        if config.relative_values:  # the critic's last layer, which the policy has as an identity
             policy.value_net.register_forward_hook(self._weigh)
         self._model: PPO
         self._set_model(model, policy.branches.actor, (policy.optimizer,))

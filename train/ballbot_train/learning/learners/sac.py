@@ -68,14 +68,14 @@ _SCRATCH = SacConfig(
 
 TUNED: dict[str, SacConfig] = {
     "": _SCRATCH,
-    "stabilize": replace(_SCRATCH, evaluations=30, short_episodes=0.3, symmetry="mirrors", products=True),
+    "stabilize": replace(_SCRATCH, evaluations=30, short_episodes=(0.3, 0.6), symmetry="mirrors", products=True),
     "orbit": replace(
         _SCRATCH,
         iterations=700,
         evaluations=35,
         num_envs=512,
         num_steps=12,
-        short_episodes=0.3,
+        short_episodes=(0.3, 1.0),
         gamma=0.985,
         final_gamma=0.993,
         symmetry="centred",
