@@ -73,13 +73,6 @@ SECTIONS = (
         quick=("--episodes", "20"),
     ),
     Section(
-        "Intervals",
-        "scaling",
-        ("problem", "intervals"),
-        {"seconds": "s"},
-        quick=("--quick",),
-    ),
-    Section(
         "NMPC",
         "mpc_latency",
         ("task", "mode", "nodes", "horizon", "control_dt"),
