@@ -139,3 +139,9 @@ def push_arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndar
         return None
     body = pose(params, robot.x).body
     return body, body + PUSH_SCALE * np.array([*robot.push, 0.0])
+
+
+def ring(marker: Marker) -> np.ndarray:
+    """(n, 2) points, m, of a marker's circle."""
+    angles = np.linspace(0, 2 * math.pi, 97)
+    return marker.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) + np.array(marker.position)

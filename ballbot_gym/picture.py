@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFilter
 
-from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, Robot, arrow, body_axis, push_arrow
+from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, Robot, arrow, body_axis, push_arrow, ring
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 
@@ -34,6 +34,7 @@ _FLAT = 0.05  # m: lower markers are painted on the floor
 _CAP = 0.06  # of the body's length, in the ball's colour at its top
 _SPHERE = ((1.0, -0.35), (0.93, -0.2), (0.82, -0.05), (0.66, 0.08), (0.48, 0.2), (0.3, 0.34), (0.13, 0.5))
 """Discs that make a shaded sphere: their radius, and how light they are."""
+
 
 Rgb = tuple[int, int, int]
 
@@ -78,11 +79,11 @@ class _Painter:
         self._paint_floor()
         for marker in markers:
             if marker.ring:
-                self._paint_line(_ring(marker), _rgb(marker.color), dashed=True)
+                self._paint_line(ring(marker), rgb(marker.color), dashed=True)
             elif marker.height < _FLAT:
                 self._paint_marker(marker)
         for path in self._drawing.paths:
-            self._paint_line(path.points, _rgb(path.color), path.dashed)
+            self._paint_line(path.points, rgb(path.color), path.dashed)
         self._paint_shadows()
         bodies = [
             (self._depth(_foot(marker)), marker) for marker in markers if not marker.ring and marker.height >= _FLAT
@@ -165,7 +166,7 @@ class _Painter:
             yield _cast(low, high, self._drawing.params.body_radius), darkness
 
     def _paint_marker(self, marker: Marker) -> None:
-        foot, radius, color = _foot(marker), marker.radius, _rgb(marker.color)
+        foot, radius, color = _foot(marker), marker.radius, rgb(marker.color)
         top = foot + (0, 0, marker.height)
         with self._glass(marker.color[3], np.array([foot, top]), radius):
             if marker.height < _FLAT:
@@ -198,14 +199,14 @@ class _Painter:
         neck = high - _CAP * params.body_length * body_axis(robot.x)
         radius = params.body_radius
         parts = [
-            (ball, lambda: self._paint_sphere(ball, params.ball_radius, _rgb(BALL))),
-            ((low + high) / 2, lambda: self._paint_cylinder(low, neck, radius, _rgb(robot.color))),
-            ((low + 3 * high) / 4, lambda: self._paint_cylinder(neck, high, 1.02 * radius, _rgb(BALL))),
+            (ball, lambda: self._paint_sphere(ball, params.ball_radius, rgb(BALL))),
+            ((low + high) / 2, lambda: self._paint_cylinder(low, neck, radius, rgb(robot.color))),
+            ((low + 3 * high) / 4, lambda: self._paint_cylinder(neck, high, 1.02 * radius, rgb(BALL))),
         ]
         if (ends := arrow(params, robot)) is not None:
-            parts.append(((ends[0] + ends[1]) / 2, lambda: self._paint_arrow(*ends, _rgb(FORCE))))
+            parts.append(((ends[0] + ends[1]) / 2, lambda: self._paint_arrow(*ends, rgb(FORCE))))
         if (push := push_arrow(params, robot)) is not None:
-            parts.append(((push[0] + push[1]) / 2, lambda: self._paint_arrow(*push, _rgb(PUSH))))
+            parts.append(((push[0] + push[1]) / 2, lambda: self._paint_arrow(*push, rgb(PUSH))))
         for _, paint in sorted(parts, key=lambda part: -float(self._camera.project(part[0])[1])):
             paint()
 
@@ -231,9 +232,9 @@ class _Painter:
         lights = sides @ _LIGHT / np.linalg.norm(sides, axis=1)
         for k in np.flatnonzero(sides @ (self._camera.eye - low) > 2 * radius):
             self._pen.polygon(faces[k].tolist(), _shaded(color, float(lights[k])))
-        for end, ring, outward in ((low, rings[0], -axis), (high, rings[1], axis)):
+        for end, rim, outward in ((low, rings[0], -axis), (high, rings[1], axis)):
             if outward @ (self._camera.eye - end) > 0:
-                self._pen.polygon(ring.ravel().tolist(), _shaded(color, 0.3 + float(outward @ _LIGHT)))
+                self._pen.polygon(rim.ravel().tolist(), _shaded(color, 0.3 + float(outward @ _LIGHT)))
 
     def _paint_arrow(self, start: np.ndarray, end: np.ndarray, color: Rgb) -> None:
         """A horizontal arrow between points (3,), m."""
@@ -285,12 +286,6 @@ def _foot(marker: Marker) -> np.ndarray:
     return np.array([*marker.position, 0.0])
 
 
-def _ring(marker: Marker) -> np.ndarray:
-    """(n, 2) points of a circle."""
-    angles = np.linspace(0, 2 * math.pi, 97)
-    return marker.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) + np.array(marker.position)
-
-
 def _circle(centre: np.ndarray, radius: float) -> np.ndarray:
     """(n, 3) points of a horizontal circle."""
     return centre + radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES], axis=1)
@@ -317,8 +312,8 @@ def _cast(low: np.ndarray, high: np.ndarray, radius: float) -> np.ndarray:
     return points - points[..., 2:] * (_LIGHT / _LIGHT[2])
 
 
-def _rgb(color: str | Sequence[float]) -> Rgb:
-    """A colour "#rrggbb", or one of shares of red, green and blue."""
+def rgb(color: str | Sequence[float]) -> Rgb:
+    """Red, green and blue, 0 to 255, of a colour "#rrggbb", or of one of shares."""
     if isinstance(color, str):
         return ImageColor.getrgb(color)[:3]
     red, green, blue = (round(255 * share) for share in color[:3])

@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrow, pose, push_arrow
+from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrow, pose, push_arrow, ring
 from ballbot_gym.engines import State
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.picture import rgb
 from ballbot_gym.tasks.marker import Marker
 
 HOST, PORT = "127.0.0.1", 8080
@@ -223,14 +224,14 @@ class Viewer:
         opacity = None if robot.alpha == 1 else robot.alpha
         ball, body = (scene.add_frame(f"{name}/{part}", show_axes=False) for part in ("ball", "body"))
         look = {"opacity": opacity, "cast_shadow": False, "receive_shadow": False}
-        sphere = scene.add_icosphere(f"{name}/ball/shape", params.ball_radius, _rgb(BALL), **look)
+        sphere = scene.add_icosphere(f"{name}/ball/shape", params.ball_radius, rgb(BALL), **look)
         radius, length = params.body_radius, params.body_length
-        shape = scene.add_cylinder(f"{name}/body/shape", radius, length, _rgb(robot.color), **look)
+        shape = scene.add_cylinder(f"{name}/body/shape", radius, length, rgb(robot.color), **look)
         cap = scene.add_cylinder(
             f"{name}/body/cap",
             1.02 * radius,
             0.06 * length,
-            _rgb(BALL),
+            rgb(BALL),
             position=(0.0, 0.0, 0.44 * length),
             **look,
         )
@@ -254,7 +255,7 @@ class Viewer:
             if ends is None:
                 return
             name = f"/world/{_node_name(key)}"
-            self._nodes[key] = [self.server.scene.add_arrows(name, np.array([ends]), _rgb(color))]
+            self._nodes[key] = [self.server.scene.add_arrows(name, np.array([ends]), rgb(color))]
         (node,) = self._nodes[key]
         node.visible = ends is not None
         if ends is not None:
@@ -276,7 +277,7 @@ class Viewer:
             name = f"/world/{_node_name(key)}"
             thickness = 0.02 if path.dashed else 0.015
             self._nodes[key] = [
-                self.server.scene.add_line_segments(name, segments, _rgb(path.color), thickness=thickness)
+                self.server.scene.add_line_segments(name, segments, rgb(path.color), thickness=thickness)
             ]
         (node,) = self._nodes[key]
         node.points = segments
@@ -290,11 +291,9 @@ class Viewer:
         self._nodes["markers"] = [self._add_marker(i, marker) for i, marker in enumerate(markers)]
 
     def _add_marker(self, i: int, marker: Marker) -> Any:
-        scene, (x, y), color = self.server.scene, marker.position, _rgb(marker.color[:3])
+        scene, (x, y), color = self.server.scene, marker.position, rgb(marker.color[:3])
         if marker.ring:
-            angles = np.linspace(0, 2 * math.pi, 97)
-            around = marker.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) + (x, y)
-            segments = _segments(GroundPath(around, ""))
+            segments = _segments(GroundPath(ring(marker), ""))
             return scene.add_line_segments(f"/world/marker{i}", segments, color, thickness=0.03)
         opacity = None if marker.color[3] == 1 else marker.color[3]
         return scene.add_cylinder(
@@ -403,11 +402,3 @@ def _dragged(event: Any) -> np.ndarray:
 def _node_name(name: str) -> str:
     """A name without what viser reads as a path."""
     return "".join(letter if letter.isalnum() else "_" for letter in name)
-
-
-def _rgb(color: str | Sequence[float]) -> tuple[int, int, int]:
-    """A colour "#rrggbb", or one of shares of red, green and blue, as viser takes it."""
-    if isinstance(color, str):
-        return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
-    red, green, blue = (round(255 * share) for share in color[:3])
-    return red, green, blue
