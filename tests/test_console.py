@@ -74,20 +74,10 @@ def test_nothing_is_printed_after_the_end(monkeypatch):
 )
 def test_a_machine_with_more_to_do_than_cores_is_busy(start, workers, end, busy, monkeypatch):
     monkeypatch.setattr(provenance.os, "cpu_count", lambda: 4)
-    facts = provenance.load_facts([(start, workers)], [end])
+    monkeypatch.setattr(provenance, "load", lambda: end)
+    facts = provenance.load_facts(start, workers)
     assert facts["busy"] is busy
     assert facts["load_end"] == (None if math.isnan(end) else end)
-
-
-def test_a_run_that_was_interrupted_on_a_busy_machine_stays_one_of_a_busy_machine(monkeypatch, tmp_path):
-    monkeypatch.setattr(provenance.os, "cpu_count", lambda: 4)
-    monkeypatch.setattr(provenance, "load", lambda: 9.0)
-    provenance.LoadRecord(tmp_path, 1)
-    with (tmp_path / "unfinished" / "loads.jsonl").open("a") as file:
-        file.write("\n[9.")  # the kill
-    monkeypatch.setattr(provenance, "load", lambda: 0.5)
-    assert provenance.LoadRecord(tmp_path, 1).facts() == {"busy": True, "load_start": 9.0, "load_end": 0.5}
-    assert not provenance.LoadRecord(tmp_path / "other", 1).facts()["busy"]
 
 
 def test_times_of_a_busy_machine_are_marked():

@@ -1,16 +1,12 @@
 """What a result depends on besides its settings: versions of the code and its libraries, and the machine."""
 
 import importlib.metadata
-import json
 import math
 import os
 import platform
 import subprocess
-import time
-from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ballbot_train import jobs
 from ballbot_train.executors import Workers
 
 _PACKAGES = ("gymnasium", "numpy", "pybullet", "casadi", "scipy")
@@ -30,8 +26,6 @@ def provenance() -> dict[str, object]:
 BUSY = 1.25
 """Load per core from which times are no longer those of the code alone."""
 
-_LOAD_SECONDS = 10.0
-
 
 def load() -> float:
     """Processes that ran or waited for a core in the last minute; NaN where the system does not say."""
@@ -41,62 +35,20 @@ def load() -> float:
         return math.nan
 
 
-def load_facts(starts: Iterable[tuple[float, int]], later: Iterable[float]) -> dict[str, object]:
-    """Whether a run was timed on a busy machine, and the loads that say so.
+def load_facts(before: float, workers: int | Workers) -> dict[str, object]:
+    """Whether a run that ends now was timed on a busy machine, and the loads that say so.
 
     Args:
-        starts: `load()` before every part of the run, which its own workers had not raised, and the number of workers.
-        later: `load()` while the run worked and at its end.
+        before: `load()` before the run, which its own workers had not raised.
+        workers: a number of processes, or `Workers`.
 
     Returns:
-        "busy", "load_start" and "load_end", the largest of each; null where the system does not say, and then it is not busy.
+        "busy", "load_start" and "load_end"; loads are null where the system does not say, and then it is not busy.
     """
-    starts, later, limit = list(starts), list(later), BUSY * (os.cpu_count() or 1)
-    busy = any(start + workers > limit for start, workers in starts) or any(end > limit for end in later)
-    return {"busy": busy, "load_start": _largest(start for start, _ in starts), "load_end": _largest(later)}
-
-
-def _largest(loads: Iterable[float]) -> float | None:
-    return max((round(value, 2) for value in loads if math.isfinite(value)), default=None)
-
-
-class LoadRecord:
-    """The loads during all parts of a run: an interrupted run goes on in another process, perhaps on a quieter machine."""
-
-    def __init__(self, out: Path, workers: int | Workers):
-        """Begins a part of the run whose folder is `out`, which `jobs.claim` has locked."""
-        self._path = jobs.unfinished(out) / "loads.jsonl"
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._add(load(), Workers.of(workers).here)
-
-    def watched(self, on_progress: Callable[[str, int], None]) -> Callable[[str, int], None]:
-        """The function, which then notes the load too, now and then."""
-
-        def call(name: str, count: int) -> None:
-            if time.monotonic() - self._noted > _LOAD_SECONDS:
-                self._add(load())
-            on_progress(name, count)
-
-        return call
-
-    def facts(self) -> dict[str, object]:
-        """`load_facts` of all parts of the run, which ends now."""
-        self._add(load())
-        starts, later = [], []
-        for line in self._path.read_text().splitlines():
-            try:
-                value, workers = json.loads(line)
-                (later if workers is None else starts).append(
-                    float(value) if workers is None else (float(value), workers)
-                )
-            except (ValueError, TypeError):
-                continue
-        return load_facts(starts, later)
-
-    def _add(self, value: float, workers: int | None = None) -> None:
-        self._noted = time.monotonic()
-        with self._path.open("a") as file:
-            file.write("\n" + json.dumps([value, workers]))  # a kill may have left half a line
+    after, limit = load(), BUSY * (os.cpu_count() or 1)
+    start, end = (round(value, 2) if math.isfinite(value) else None for value in (before, after))
+    busy = before + Workers.of(workers).here > limit or after > limit
+    return {"busy": busy, "load_start": start, "load_end": end}
 
 
 def _version(package: str) -> str:

@@ -16,7 +16,7 @@ from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
 from ballbot_train.executors import Workers
-from ballbot_train.provenance import LoadRecord
+from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
 from ballbot_train.report.replay import certified_replay
@@ -55,10 +55,10 @@ def benchmark(
     physics = physics_or_default(physics)
     episodes = checked_episodes(episodes, quick, few=8)
     facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
-    loads = LoadRecord(out, workers)
+    load_before = load()
     with progress_bars({task: episodes * len(group) for task, group in chosen.items()}) as bars:
-        done = run_benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance), seed, robot)
-    facts |= loads.facts()
+        done = run_benchmark(chosen, episodes, physics, out, workers, bars.advance, seed, robot)
+    facts |= load_facts(load_before, workers)
     busy = bool(facts["busy"])
     recovered, damaged = basins.recovered_fractions(runs / "basins", robot)
     if damaged:

@@ -25,7 +25,7 @@ from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_r
 from ballbot_train.evaluation.controllers import is_expert, make_controller, task_name
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
 from ballbot_train.executors import Workers
-from ballbot_train.provenance import LoadRecord, provenance
+from ballbot_train.provenance import load, load_facts, provenance
 
 _FRESH = 10_000
 _WORST = 10
@@ -200,10 +200,10 @@ def _certified(
     chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: Workers, robot: str
 ) -> None:
     facts = open_run(out, chosen, workers, physics, 0, robot, episodes=episodes)
-    loads = LoadRecord(out, workers)
+    load_before = load()
     with progress_bars(dict.fromkeys(chosen, episodes)) as bars:
-        results = benchmark(chosen, episodes, physics, out, workers, loads.watched(bars.advance), robot=robot)
-    facts |= loads.facts()
+        results = benchmark(chosen, episodes, physics, out, workers, bars.advance, robot=robot)
+    facts |= load_facts(load_before, workers)
     rows = leaderboard(results)
     write_leaderboard(rows, results, facts, out)
     jobs.release(out)

@@ -62,7 +62,7 @@ def optimize(
     _, info = env.reset(seed=seed, options=options)
     load_before = load()
     optimum = find_optimum(env.task, params, info["state"], info["constants"])
-    busy = bool(load_facts([(load_before, 1)], [load()])["busy"])
+    busy = bool(load_facts(load_before, 1)["busy"])
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
     circles = figures.marker_circles(env.task.markers(info["constants"]))

@@ -23,7 +23,7 @@ from ballbot_train.console import (
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
 from ballbot_train.executors import Workers
-from ballbot_train.provenance import LoadRecord
+from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
 
 _BUSY_NOTE = (
@@ -64,12 +64,10 @@ def robustness(
     check_some("stress", stresses, stressed.STRESSES)
     episodes = checked_episodes(episodes, quick, few=3)
     facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
-    loads = LoadRecord(out, workers)
+    load_before = load()
     with progress_bars(stressed.episodes_to_run(chosen, stresses, episodes)) as bars:
-        results = stressed.run(
-            chosen, stresses, episodes, physics, out, workers, loads.watched(bars.advance), seed, robot
-        )
-    facts |= loads.facts()
+        results = stressed.run(chosen, stresses, episodes, physics, out, workers, bars.advance, seed, robot)
+    facts |= load_facts(load_before, workers)
     rows = stressed.rows_of(results, seed)
     stressed.write(rows, results, facts, out)
     for task in chosen:
