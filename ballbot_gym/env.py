@@ -527,11 +527,6 @@ REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
 
-_REPLACED = {
-    "failure_cost": "a failure now costs survival_reward for every second not lived: give survival_reward (1/s) instead"
-}
-"""Arguments that are no more, and what to do."""
-
 
 def observation_space(task: Task, params: BallbotParams) -> spaces.Box:
     """What a robot can observe in a task."""
@@ -602,8 +597,7 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
     known = sorted(field.name for field in dataclasses.fields(TASKS[task]))
     for name in sorted(task_fields.keys() - set(known)):
         # Python's own words, because clients such as torchrl look for them.
-        hint = _REPLACED.get(name) or f"it has {', '.join(known)}"
-        raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; {hint}")
+        raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; it has {', '.join(known)}")
     return TASKS[task](**(own_fields(robot, task) | task_fields))
 
 
