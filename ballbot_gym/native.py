@@ -327,8 +327,9 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
     actions = np.asfortranarray([[0.1, -0.2], [-0.3, 0.4], [1.2, 0.5], [-0.6, -1.2]], dtype)
     found: list[dict[str, Any]] = []
     numbers = BallbotBatch(task, len(actions), dtype="float64" if double else "float32", compile=False, params=params)
-    for envs in (BallbotNative(task, len(actions), dtype, params, code=code), numbers):
-        state: Any = envs.initial_state(seed=0)
+    both: tuple[Any, Any] = (BallbotNative(task, len(actions), dtype, params, code=code), numbers)
+    for envs in both:
+        state = envs.initial_state(seed=0)
         envs.state = state
         start = {"first observation": envs.observe(state), "start": state.x, "constants": state.c}
         with torch.no_grad():
