@@ -1,17 +1,19 @@
-"""One self-contained HTML page: tables that sort, figures, and a replay in 3D.
+"""One self-contained HTML page: tables that sort, figures, curves, and a replay in 3D.
 
-A page is a list of `Section`s. Everything is embedded, so the file opens offline and can be moved. The templates, scripts
-and styles are in `assets/`. The templates escape all text.
+A page is a list of `Section`s. Everything is embedded, Plotly's JavaScript included, so the file opens offline and can be
+moved. The templates, scripts and styles are in `assets/`. The templates escape all text.
 """
 
 from __future__ import annotations
 
 import base64
 import functools
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jinja2
 import numpy as np
@@ -19,7 +21,11 @@ from markupsafe import Markup
 
 from ballbot_gym import drawing, files
 from ballbot_gym.params import BallbotParams
+from ballbot_train.escaping import plotly_text
 from ballbot_train.report.replay import Replay, Take
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
 
 _ASSETS = Path(__file__).parent / "assets"
 _WORD_COLUMNS = 2  # of a table: the first columns hold words, the others hold numbers
@@ -36,7 +42,33 @@ class Section:
     lead: str = ""
     """One or two sentences above the body, plain text."""
     scripts: tuple[str, ...] = ()
-    """The scripts that the body needs: names of files in `assets/`."""
+    """The scripts that the body needs: "plotly", and names of files in `assets/`."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A curve over x (n,), with a band between `low` and `high` (n,) if given."""
+
+    label: str
+    x: Sequence[float] | np.ndarray
+    y: Sequence[float] | np.ndarray
+    color: str
+    low: Sequence[float] | np.ndarray | None = None
+    high: Sequence[float] | np.ndarray | None = None
+    steps: bool = False
+    """Whether y jumps at each x instead of running straight to the next."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes with curves."""
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: Sequence[Line]
+    log_x: bool = False
+    log_y: bool = False
 
 
 def write_report(title: str, sections: Iterable[Section | None], facts: Mapping[str, object], path: Path) -> Path:
@@ -59,7 +91,8 @@ def write_report(title: str, sections: Iterable[Section | None], facts: Mapping[
         sections=shown,
         facts=facts,
         style=_asset("style.css"),
-        scripts=[_asset(name) for name in names],
+        plotly=_plotly_script() if "plotly" in names else None,
+        scripts=[_asset(name) for name in names if name != "plotly"],
     )
     return files.write(path, page)
 
@@ -81,13 +114,22 @@ def folder_section(title: str, folder: Path, lead: str = "") -> Section | None:
     return pictures_section(title, sorted(folder.glob("*.png")), lead)
 
 
+def curves_section(title: str, panels: Sequence[Panel], lead: str = "") -> Section | None:
+    """Curves that the reader can zoom and read off, under one legend; None if there are no panels."""
+    if not panels:
+        return None
+    legend = dict.fromkeys((line.label, line.color) for panel in panels for line in panel.lines)
+    figures = [_panel(panel).to_plotly_json() for panel in panels]
+    return Section(title, _render("curves.html.j2", legend=legend, panels=figures), lead, ("plotly", "curves.js"))
+
+
 def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Section | None:
     """Episodes in 3D, one scene for each take, with play, pause and scrubbing; None if there are no takes."""
     replays = [replay for replay in replays if replay.takes]
     if not replays:
         return None
     data = scene_data(replays[0].params) | {"episodes": [_replay_data(replay) for replay in replays]}
-    return Section(title, _render("replay.html.j2", data=data), lead, ("scene.js", "replay.js"))
+    return Section(title, _render("replay.html.j2", data=data), lead, ("plotly", "scene.js", "replay.js"))
 
 
 def scene_data(params: BallbotParams) -> dict[str, object]:
@@ -110,7 +152,8 @@ def _templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False}
+    environment.policies["json.dumps_function"] = _json
+    environment.policies["json.dumps_kwargs"] = {}
     return environment
 
 
@@ -121,6 +164,61 @@ def _render(template: str, **values: object) -> Markup:
 def _asset(name: str) -> Markup:
     """The text of one of this package's own scripts or styles."""
     return Markup((_ASSETS / name).read_text(encoding="utf-8"))
+
+
+def _plotly_script() -> Markup:
+    import plotly.offline
+
+    return Markup(plotly.offline.get_plotlyjs())
+
+
+def _json(data: object) -> str:
+    """Compact JSON of figures and replays; the template's `tojson` escapes it afterwards."""
+    from plotly.utils import PlotlyJSONEncoder
+
+    return json.dumps(data, separators=(",", ":"), ensure_ascii=False, cls=PlotlyJSONEncoder)
+
+
+def _panel(panel: Panel) -> Figure:
+    from plotly.graph_objects import Figure
+
+    figure = Figure(layout_template="none")
+    for line in panel.lines:
+        if line.low is not None and line.high is not None:
+            outline = np.concatenate([line.x, np.asarray(line.x)[::-1]])
+            band = np.concatenate([line.high, np.asarray(line.low)[::-1]])
+            figure.add_scatter(
+                x=outline.tolist(),
+                y=band.tolist(),
+                fill="toself",
+                fillcolor=line.color,
+                opacity=0.15,
+                line={"width": 0},
+                mode="lines",
+                hoverinfo="skip",
+            )
+        figure.add_scatter(
+            x=np.asarray(line.x).tolist(),
+            y=np.asarray(line.y).tolist(),
+            name=plotly_text(line.label),
+            mode="lines",
+            line={"color": line.color, "width": 2, "shape": "hv" if line.steps else "linear"},
+        )
+    figure.update_layout(
+        title={"text": plotly_text(panel.title), "font": {"size": 14}, "x": 0.02, "y": 0.97},
+        plot_bgcolor="white",
+        margin={"l": 52, "r": 12, "t": 34, "b": 44},
+        showlegend=False,
+        height=300,
+        xaxis=_axis(panel.x_label, panel.log_x),
+        yaxis=_axis(panel.y_label, panel.log_y),
+    )
+    return figure
+
+
+def _axis(label: str, log: bool) -> dict[str, object]:
+    kind = {"type": "log", "dtick": 1} if log else {"type": "linear"}
+    return {"title": label, "gridcolor": "#eef0f3", "zerolinecolor": "#d5d9e0", "linecolor": "#c3cad6", **kind}
 
 
 def _replay_data(replay: Replay) -> dict[str, object]:

@@ -1,4 +1,4 @@
-// The same episode under several controllers: a scene each, by scene.js.
+// The same episode under several controllers: a scene each, by scene.js, and traces of tilt and force in step with them.
 // The data are states at 50 Hz.
 "use strict";
 
@@ -44,7 +44,7 @@ class Replay {
     this.find("follow").onchange = () => this.draw();
   }
 
-  choose(index) {
+  async choose(index) {
     this.pause();
     this.episode = this.data.episodes[index];
     [...this.find("episodes").children].forEach((chip, n) => chip.setAttribute("aria-pressed", n === index));
@@ -52,7 +52,8 @@ class Replay {
     this.end = dt * (Math.max(...takes.map((take) => take.x.length)) - 1);
     this.find("scrub").max = this.end;
     this.find("stages").replaceChildren(...takes.map((take, n) => this.stage(take, n)));
-    this.seek(0);
+    this.drawTraces();
+    await this.seek(0);
     this.root.dataset.ready = "true";
   }
 
@@ -99,11 +100,32 @@ class Replay {
     canvas.onpointerup = canvas.onpointercancel = () => (last = null);
   }
 
-  seek(t) {
+  drawTraces() {
+    const { takes, dt } = this.episode;
+    const plot = (name, title, valuesOf) => {
+      const lines = takes.map((take) => {
+        const y = valuesOf(take);
+        return { x: y.map((_, n) => n * dt), y, mode: "lines", name: take.label.replaceAll("&", "&amp;").replaceAll("<", "&lt;"), line: { color: take.color, width: 2 } };
+      });
+      const layout = {
+        title: { text: title, font: { size: 13 }, x: 0.02, y: 0.97 }, margin: { l: 42, r: 10, t: 28, b: 36 }, showlegend: false,
+        xaxis: { title: { text: "time, s", standoff: 4 }, range: [0, this.end], fixedrange: true, gridcolor: "#eef0f3" },
+        yaxis: { rangemode: "tozero", fixedrange: true, gridcolor: "#eef0f3" }, hovermode: "x unified",
+        shapes: [{ type: "line", x0: 0, x1: 0, yref: "paper", y0: 0, y1: 1, line: { color: "#1d2430", width: 1.5 } }],
+      };
+      return Plotly.react(this.find(name), lines, layout, { displayModeBar: false, responsive: true });
+    };
+    plot("tilts", "tilt, deg", (take) => take.gamma.map((gamma, n) => tiltOf(gamma, take.theta[n])));
+    plot("forces", "force, N", (take) => take.fx.map((fx, n) => Math.hypot(fx, take.fy[n])));
+  }
+
+  async seek(t) {
     this.time = Math.min(t, this.end);
     this.find("scrub").value = this.time;
     this.find("clock").textContent = this.time.toFixed(2) + " s";
     this.draw();
+    const cursor = { "shapes[0].x0": this.time, "shapes[0].x1": this.time };
+    await Promise.all(["tilts", "forces"].map((name) => Plotly.relayout(this.find(name), cursor)));
   }
 
   draw() {
@@ -131,11 +153,11 @@ class Replay {
     this.playing = true;
     this.find("play").textContent = "Pause";
     let last = performance.now();
-    const tick = (now) => {
+    const tick = async (now) => {
       if (!this.playing) return;
       const step = Math.min((now - last) / 1000, 0.1) * Number(this.find("speed").value);
       last = now;
-      this.seek(this.time + Math.max(0, step));
+      await this.seek(this.time + Math.max(0, step));
       if (this.time >= this.end) this.pause();
       else requestAnimationFrame(tick);
     };
