@@ -1,7 +1,7 @@
 """Random numbers for batches: a hash of (the env's seed, the episode's number, the step, an index), in torch.
 
 An env's random numbers therefore do not depend on the batch or on its position in it, and the starts of new episodes are
-drawn without a loop.
+drawn without a loop. `key` and `floats` give the same numbers for one env, in plain Python.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ _WORD = 0xFFFFFFFF  # hashes are 32-bit words kept in int64, whose products then
 
 
 def key(seed: Any, episode: Any, step: Any) -> Any:
-    """(B,) words that determine the random numbers of one step. Step 0 is the start of the episode."""
+    """(B,) words that determine the random numbers of one step. Step 0 is the start of the episode. Ints give an int."""
     return _mix(_mix(_mix(_mix(seed & _WORD) ^ (seed >> 32)) ^ (episode & _WORD)) ^ (step & _WORD))
 
 
@@ -21,6 +21,11 @@ def uniforms(key: "torch.Tensor", count: int, dtype: "torch.dtype") -> "tuple[to
     """`count` tensors (B,) of uniform numbers in [0, 1), multiples of 2⁻²⁴ and so the same in both dtypes."""
     words = (_mix((key + 0x9E3779B9 * i) & _WORD) for i in range(1, count + 1))
     return tuple((word >> 8).to(dtype) * 2.0**-24 for word in words)
+
+
+def floats(key: int, count: int) -> tuple[float, ...]:
+    """What `uniforms` gives for one env."""
+    return tuple((_mix((key + 0x9E3779B9 * i) & _WORD) >> 8) * 2.0**-24 for i in range(1, count + 1))
 
 
 def _mix(word: Any) -> Any:

@@ -7,14 +7,14 @@ from gymnasium.vector import AutoresetMode
 
 torch = pytest.importorskip("torch")
 
-from ballbot_gym import Randomization  # noqa: E402
-from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
+from ballbot_gym import Randomization, counter_rng  # noqa: E402
+from ballbot_gym.vector import LOOP_BELOW, BallbotBatch, BallbotLoop, BallbotVectorEnv  # noqa: E402
 
 ROBOTS = Randomization(body_mass=(0.8, 1.2), actuator_delay=(0.0, 0.06), position_noise=0.01, push_impulse=(0.0, 3.0))
 
 
 @pytest.mark.parametrize("limit", [None, 7])
-@pytest.mark.parametrize("engine", ["native", "torch"])
+@pytest.mark.parametrize("engine", ["native", "loop", "torch"])
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine, limit):
     """The sync envs draw other episodes, so that both are started alike at each restart of ours.
@@ -101,7 +101,7 @@ def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(task, mode, engine,
     assert ends > 30  # and as many restarts
 
 
-@pytest.mark.parametrize("engine", ["native", "torch"])
+@pytest.mark.parametrize("engine", ["native", "loop", "torch"])
 def test_disabled_wants_a_reset_of_what_has_ended(engine):
     envs = BallbotVectorEnv(2, duration=0.04, engine=engine, compile=False, autoreset_mode="Disabled")
     envs.reset(seed=0, options={"state": np.zeros(8)})
@@ -138,9 +138,28 @@ def test_all_engines_and_all_modes_run_the_same_episodes(task, randomization):
         return np.array(found)
 
     expected = starts("torch", "SameStep")
-    for engine in ("torch",) if randomization else ("native", "torch"):
+    for engine in ("torch", "loop") if randomization else ("native", "torch", "loop"):
         for mode in ("SameStep", "NextStep", "Disabled"):
             np.testing.assert_allclose(starts(engine, mode), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_numbers_of_one_env_are_those_of_the_batch():
+    seeds, episodes = torch.tensor([0, 5, 2**31, 2**62 + 3]), torch.tensor([0, 1, 70, 2**33])
+    for step in (0, 400):
+        keys = counter_rng.key(seeds, episodes, torch.full_like(seeds, step))
+        rows = torch.stack(counter_rng.uniforms(keys, 9, torch.float64)).T
+        for i in range(4):
+            single = counter_rng.key(int(seeds[i]), int(episodes[i]), step)
+            assert single == keys[i]
+            assert counter_rng.floats(single, 9) == tuple(rows[i].tolist())
+
+
+def test_where_there_is_no_machine_code_small_batches_loop_and_large_ones_do_not():
+    assert isinstance(BallbotVectorEnv(1, compile=False).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(1, randomization=ROBOTS).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(LOOP_BELOW - 1, compile=False).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(LOOP_BELOW, compile=False).batch, BallbotBatch)
+    assert isinstance(BallbotVectorEnv(2, compile=True).batch, BallbotBatch)
 
 
 def test_gymnasiums_normalizing_wrappers_take_next_step_and_disabled():

@@ -160,7 +160,7 @@ NO_REAL_NUMBERS = {
 @pytest.mark.parametrize("given", NO_REAL_NUMBERS.values(), ids=NO_REAL_NUMBERS)
 def test_single_and_vector_envs_refuse_the_same_numbers_as_actions_states_and_constants(given):
     single, action = env(task="orbit"), given([0.0, 0.0])
-    for envs in (single, BallbotVectorEnv(1, "orbit", engine="torch", compile=False)):
+    for envs in (single, *(BallbotVectorEnv(1, "orbit", engine=engine, compile=False) for engine in ("loop", "torch"))):
         envs.reset(seed=0)
         with pytest.raises(ValueError, match=r"^actions? must be (real numbers|finite)"):
             envs.step(action if envs is single else action[None] if isinstance(action, np.ndarray) else [action])
@@ -177,7 +177,7 @@ def test_single_and_vector_envs_clip_the_same_actions(huge):
     expected = single.step([huge, -huge])[-1]
     assert expected["clipped"]
     for dtype in (torch.float32, torch.float64):
-        for engine in ("native", "torch"):
+        for engine in ("native", "loop", "torch"):
             envs = BallbotVectorEnv(1, engine=engine, dtype=dtype, compile=False)
             envs.reset(seed=0, options={"state": np.zeros(8)})
             infos = envs.step([[huge, -huge]])[-1]

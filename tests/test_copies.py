@@ -139,10 +139,11 @@ def test_bad_states_are_refused():
         env.set_state(np.zeros(8))
 
 
+@pytest.mark.parametrize("engine", ["loop", "torch"])
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-def test_vector_envs_copy_pickle_and_go_back(task, mode):
+def test_vector_envs_copy_pickle_and_go_back(task, engine, mode):
     pytest.importorskip("torch")
-    settings = {"engine": "torch", "compile": False, "randomization": ALL, "duration": 0.3, "autoreset_mode": mode}
+    settings = {"engine": engine, "compile": False, "randomization": ALL, "duration": 0.3, "autoreset_mode": mode}
     envs = gymnasium.make_vec(task.id, num_envs=3, **settings)
 
     def run(envs):

@@ -19,6 +19,7 @@ import casadi  # noqa: E402
 from ballbot_gym import Randomization, codegen, machine_code, native  # noqa: E402
 from ballbot_gym.batch import BallbotBatch  # noqa: E402
 from ballbot_gym.env import make_task  # noqa: E402
+from ballbot_gym.loop import BallbotLoop  # noqa: E402
 from ballbot_gym.robots import named_robot  # noqa: E402
 from ballbot_gym.tasks.stabilize import Stabilize  # noqa: E402
 from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
@@ -241,8 +242,8 @@ def test_auto_takes_machine_code_unless_something_speaks_against_it():
     assert isinstance(BallbotVectorEnv(1).batch, native.BallbotNative)
     assert isinstance(BallbotVectorEnv(2000).batch, native.BallbotNative)
     assert isinstance(BallbotVectorEnv(2000, compile=False).batch, BallbotBatch)
-    assert isinstance(BallbotVectorEnv(2, randomization=Randomization(body_mass=(0.9, 1.1))).batch, BallbotBatch)
-    with pytest.raises(ValueError, match='engine="native" knows no Randomization; take engine="torch"'):
+    assert isinstance(BallbotVectorEnv(2, randomization=Randomization(body_mass=(0.9, 1.1))).batch, BallbotLoop)
+    with pytest.raises(ValueError, match='engine="native" knows no Randomization; take engine="torch" or "loop"'):
         BallbotVectorEnv(2, engine="native", randomization=Randomization(body_mass=(0.9, 1.1)))
     with pytest.raises(ValueError, match="engine='native' runs on the CPU, not on cuda"):
         BallbotVectorEnv(2, engine="native", device="cuda")
@@ -284,14 +285,14 @@ def test_a_task_that_cannot_be_traced_runs_in_torch_with_a_word_in_the_log(caplo
         BallbotVectorEnv(100, task, engine="native")
 
 
-def test_without_a_compiler_envs_run_in_torch(monkeypatch, caplog):
+def test_without_a_compiler_envs_run_in_python_or_torch(monkeypatch, caplog):
     def refuse(*args):
         raise machine_code.NoMachineCodeError("cc failed: no such instruction")
 
     monkeypatch.setattr(machine_code, "library", refuse)
     native._code.cache_clear(), native._checked_code.cache_clear()
     with caplog.at_level(logging.WARNING):
-        assert isinstance(BallbotVectorEnv(2).batch, BallbotBatch)
+        assert isinstance(BallbotVectorEnv(2).batch, BallbotLoop)
     assert "no such instruction" in caplog.text
     with pytest.raises(native.NativeUnavailableError, match="no such instruction"):
         BallbotVectorEnv(2, engine="native")

@@ -313,12 +313,13 @@ def test_the_papers_info_has_no_grip(make_env):
     assert limit_names(env.task, env.params) == env.task.limit_names
 
 
-def test_batches_lose_grip_as_single_envs_do():
+@pytest.mark.parametrize("engine", ["torch", "loop"])
+def test_batches_lose_grip_as_single_envs_do(engine):
     torch = pytest.importorskip("torch")
     from ballbot_gym.vector import BallbotVectorEnv
 
     count, rng = 8, np.random.default_rng(0)
-    vector = BallbotVectorEnv(count, robot="rolling", engine="torch", dtype=torch.float64, autoreset_mode="NextStep")
+    vector = BallbotVectorEnv(count, robot="rolling", engine=engine, dtype=torch.float64, autoreset_mode="NextStep")
     env = BallbotEnv(robot="rolling", physics="rk4")
     x = rng.uniform(-0.2, 0.2, (count, 8))
     _, infos = vector.reset(seed=0, options={"state": x})

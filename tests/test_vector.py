@@ -31,7 +31,7 @@ INFO = (
 )
 
 
-@pytest.fixture(params=["native", "torch"])
+@pytest.fixture(params=["native", "torch", "loop"])
 def make_vec(request):
     """Makes vector envs that are closed after the test; float64 and eager unless said otherwise."""
     envs = []
@@ -354,6 +354,7 @@ def test_bad_arguments_are_refused():
     for kwargs, error, message in (
         ({"num_envs": 0}, ValueError, "num_envs"),
         ({"num_envs": 10**9}, ValueError, "num_envs must be at most 1048576, not 1000000000"),
+        ({"num_envs": 10**9, "engine": "loop"}, ValueError, "num_envs must be at most 1048576"),
         ({"num_envs": 2, "dtype": torch.float16}, ValueError, "dtype"),
         ({"num_envs": 2, "compile": "yes"}, ValueError, "compile"),
         ({"num_envs": 2, "render_mode": "human"}, ValueError, "render_mode"),
@@ -364,7 +365,7 @@ def test_bad_arguments_are_refused():
         (
             {"num_envs": 2, "engine": "numpy"},
             ValueError,
-            "unknown engine 'numpy'; known: 'auto', 'native', 'torch'",
+            "unknown engine 'numpy'; known: 'auto', 'native', 'torch', 'loop'",
         ),
         ({"num_envs": 2, "max_episode_steps": 0}, ValueError, "max_episode_steps must be a positive whole number"),
         ({"num_envs": 2, "frameskip": 4}, TypeError, "got an unexpected keyword argument 'frameskip'"),
