@@ -102,7 +102,7 @@ def motion_svg(trajectory: Trajectory, markers: Sequence[Marker] = ()) -> str:
 
 def svg(width: int, height: int, body: str) -> str:
     """An SVG in the colours of the page around it."""
-    style = f"width:{width}px;max-width:100%;font:11px sans-serif"
+    style = f"flex:1 1 {2 * width // 3}px;max-width:{width}px;font:11px sans-serif"
     return f'<svg viewBox="0 0 {width} {height}" style="{style}" fill="none" stroke-width="2" role="img">{body}</svg>'
 
 
