@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 # imports anew: one that trains takes 6 s to start in place of 2.5.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types pytest test-slow verify bench soak faults fuzz docs pictures certify clients pythons ray clean
+.PHONY: demo test types pytest test-slow verify bench soak faults fuzz docs notebooks pictures certify clients pythons ray clean
 
 demo: $(VENV)/runs
 	$(BIN)/ballbot benchmark --episodes 10 --out runs/demo
@@ -53,6 +53,10 @@ fuzz: $(VENV)/installed
 # the documentation as a site
 docs: $(VENV)/installed
 	$(BIN)/mkdocs build --strict
+
+# the documentation's notebooks, run anew
+notebooks: $(VENV)/installed
+	$(BIN)/python docs/make_notebooks.py
 
 # the pictures and films of the documentation that show other policies than the shipped ones, or were made by another command
 pictures: $(VENV)/installed

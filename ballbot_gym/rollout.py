@@ -10,11 +10,13 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym.checks import real_array
+from ballbot_gym.display import Moving
 from ballbot_gym.engines import default_physics, make_simulator
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 
 
@@ -90,13 +92,13 @@ class ActionController:
         return self._params.force_limit * action
 
 
-@dataclass(frozen=True)
-class Episode:
+@dataclass(frozen=True, repr=False)
+class Episode(Moving):
     """One episode under one controller.
 
     `trajectory` holds the applied forces. `cost` includes a failure's price. From `settle_time`, s, the goal held until the
     end; it is NaN if the goal did not hold at the end. `reset_seconds` is the controller's wall time in `reset`,
-    `act_seconds` its median wall time in `act`.
+    `act_seconds` its median wall time in `act`. `markers` are what its task draws.
     """
 
     trajectory: Trajectory
@@ -107,6 +109,12 @@ class Episode:
     settle_time: float
     reset_seconds: float
     act_seconds: float
+    markers: tuple[Marker, ...] = ()
+
+    def facts(self) -> dict[str, str]:
+        end = "failure" if self.failure else "success" if self.success else "goal missed"
+        settled = "never" if math.isnan(self.settle_time) else f"{self.settle_time:.2f} s"
+        return {"end": end, "cost": f"{self.cost:.4g}", "settled": settled}
 
     @property
     def peak_tilt(self) -> float:
@@ -159,6 +167,7 @@ def rollout(
         settle_time=(last_unsettled + 1) * dt if settled[-1] else math.nan,
         reset_seconds=reset_seconds,
         act_seconds=float(np.median(act_seconds)),
+        markers=tuple(task.markers(c)),
     )
 
 

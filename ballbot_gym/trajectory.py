@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_gym import dynamics, files
+from ballbot_gym.display import Moving
 from ballbot_gym.paths import hermite_basis
 
 MAX_SAMPLES = 1_000_000
@@ -16,8 +17,8 @@ class TrajectoryError(ValueError):
     """The arrays of a trajectory do not fit together, or a file holds no trajectory."""
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Moving):
     """States at increasing times, with the forces between them.
 
     t: (N+1,) s. x: (N+1, 8); order and units in `dynamics.STATE`. u: (N, 2) N where each force is held until the next
@@ -50,6 +51,20 @@ class Trajectory:
             raise TrajectoryError(f"xdot {self.xdot.shape} must have the shape of x, {self.x.shape}")
         if not (np.diff(self.t) > 0).all():
             raise TrajectoryError("times must increase")
+
+    @property
+    def motion(self) -> "Trajectory":
+        """Itself."""
+        return self
+
+    def facts(self) -> dict[str, str]:
+        return {
+            "duration": f"{self.duration:.2f} s",
+            "states": f"{len(self.t)}",
+            "peak tilt": f"{np.degrees(self.tilt.max()):.1f}°",
+            "peak speed": f"{np.hypot(self.x[:, 4], self.x[:, 5]).max():.2f} m/s",
+            "peak force": f"{np.hypot(*self.u.T).max(initial=0.0):.0f} N",
+        }
 
     @property
     def duration(self) -> float:

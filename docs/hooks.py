@@ -1,13 +1,15 @@
 """What mkdocs does for the site besides its pages.
 
 `<!-- file: README.md -->` in a page stands for that file of the repository's root, and `<!-- settings -->` for the tables of
-the learners' settings. The playground's page is written anew. The script that sorts the report's tables sorts the site's too.
+the learners' settings. Notebooks are pages with their outputs. The playground's page is written anew. The script that sorts
+the report's tables sorts the site's too.
 """
 
 import ast
 import importlib
 import inspect
 import itertools
+import json
 import re
 import textwrap
 from dataclasses import fields, is_dataclass
@@ -23,6 +25,7 @@ from ballbot_train.report.playground import write_playground
 _ROOT = Path(__file__).parent.parent
 _SORTS = _ROOT / "train" / "ballbot_train" / "report" / "assets" / "table.js"
 _FILE = re.compile(r"<!-- file: (\S+) -->")
+_NOTEBOOK = re.compile(r"\]\((notebooks/[\w-]+)\.ipynb\)")
 _PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 
 
@@ -33,18 +36,42 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         FileNotFoundError: a page names a file that does not exist.
     """
     markdown = markdown.replace("<!-- settings -->", settings_tables()) if "<!-- settings -->" in markdown else markdown
+    markdown = _NOTEBOOK.sub(r"](\1.md)", markdown)
     return _FILE.sub(lambda match: _with_links_of_the_site((_ROOT / match[1]).read_text(encoding="utf-8")), markdown)
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:
     """Called by mkdocs with the site's files."""
     files.append(File.generated(config, "table.js", abs_src_path=str(_SORTS)))
+    for path in sorted((Path(config["docs_dir"]) / "notebooks").glob("*.ipynb")):
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=notebook_page(path)))
     return files
 
 
 def on_post_build(config: Any, **_: Any) -> None:
     """Called by mkdocs after the pages: writes the playground that docs/playground.md shows."""
     write_playground(Path(config["site_dir"]) / "playground" / "page.html")
+
+
+def notebook_page(path: Path) -> str:
+    """A notebook with its outputs, as Markdown."""
+    parts = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source.replace(".ipynb)", ".md)"))
+        else:
+            parts += [f"```python\n{source}\n```", *map(_output, cell["outputs"])]
+    return "\n\n".join([*parts, f"[This page as a notebook]({path.name})"])
+
+
+def _output(output: dict[str, Any]) -> str:
+    data = output.get("data", {"text/plain": output.get("text", "")})
+    if "text/html" in data:  # in one line, so that nothing in it is Markdown
+        return f"<div>{''.join(data['text/html'])}</div>".replace("\n", "&#10;")
+    if "image/png" in data:
+        return f'<img alt="the figure" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
+    return f"```text\n{''.join(data['text/plain']).rstrip()}\n```"
 
 
 def settings_tables() -> str:

@@ -39,6 +39,11 @@ TYPED = "import sys\nsys.argv = ['ballbot', '{}']\nfrom ballbot_train.cli import
             "ray",
         ),
         ("import ballbot_train.rllib", "ray", "rllib"),
+        (
+            "from ballbot_gym.trajectory import Trajectory; Trajectory([0, 1], [[0] * 8] * 2, [[0, 0]]).plot()",
+            "matplotlib",
+            "train",
+        ),
         ("import ballbot_train.learning.tuning", "optuna", "tune"),
         (TYPED.format("paper"), "matplotlib", "train"),
         (TYPED.format("demos"), "minari", "train"),

@@ -16,11 +16,13 @@ from ballbot_baselines.ocp import spent
 from ballbot_baselines.search import ALL_GUESSES, FROM_RIGHTING, Found, search
 from ballbot_baselines.shooting import Backoff, Shooting
 from ballbot_gym.checks import finite_array
+from ballbot_gym.display import Moving
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import checked_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 
 __all__ = ["ALL_GUESSES", "FROM_RIGHTING", "Backoff", "Optimum", "find_optimum", "plan_to_track"]
@@ -30,8 +32,8 @@ _SAME_BASIN = 1e-4  # solutions whose costs differ by less are one local optimum
 _RESERVES = (1.0, 0.3, 0.0)  # shares of what a plan to track leaves unused, from the first that allows a plan
 
 
-@dataclass(frozen=True)
-class Optimum:
+@dataclass(frozen=True, repr=False)
+class Optimum(Moving):
     """The best episode found: its cost, trajectory (forces held), and what the solver said of it.
 
     | field | meaning |
@@ -45,6 +47,7 @@ class Optimum:
     | `tried` | how many of the guesses were tried |
     | `next_basin` | by which share the next best local optimum costs more, on the grid that compared them, or NaN |
     | `costates` | (n, 8) slopes of the remaining cost with respect to x_1 … x_n; 0 for a simulated episode |
+    | `markers` | what the task draws |
     """
 
     cost: float
@@ -61,6 +64,10 @@ class Optimum:
     costates: np.ndarray
     tried: int = 1
     next_basin: float = math.nan
+    markers: tuple[Marker, ...] = ()
+
+    def facts(self) -> dict[str, str]:
+        return {"cost": f"{self.cost:.4g}", "status": self.status, "found in": f"{self.seconds:.2f} s"}
 
     @property
     def is_optimal(self) -> bool:
@@ -129,6 +136,7 @@ def find_optimum(
         costates=solution.costates,
         tried=len({i for i, _ in tried} | set(episode.compared)),
         next_basin=_next_basin(best, tried, episode.compared),
+        markers=tuple(task.markers(c)),
     )
 
 

@@ -36,7 +36,8 @@ RobotName = str
 """What options called --robot take: names in `ROBOTS`, among them those that the command line registers first."""
 
 # A file or pipe has no width of its own: give it one that holds the widest table.
-console = PlainConsole(width=None if sys.stdout.isatty() else 160)
+# Notebooks get lines of text as well: their bars need widgets.
+console = PlainConsole(width=None if sys.stdout.isatty() else 160, force_jupyter=False)
 
 
 LINE_SECONDS = 10.0

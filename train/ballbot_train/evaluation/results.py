@@ -10,7 +10,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from ballbot_gym import files
+from ballbot_gym import files, lazy
+from ballbot_gym.display import Displayed, percent, svg, text
+from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation.statistics import interval
 
 
@@ -42,8 +44,8 @@ class Result:
         return math.nan if self.failure else self.cost / self.optimum - 1
 
 
-@dataclass(frozen=True)
-class Row:
+@dataclass(frozen=True, repr=False)
+class Row(Displayed):
     """A leaderboard row. Regret, peak tilt, settle time and effort are of the episodes that did not fail."""
 
     task: str
@@ -66,6 +68,64 @@ class Row:
     step_us_median: float
     recovered: float = math.nan
     """Share of the physically recoverable states from which it recovers, where `ballbot basins` measured it."""
+
+    def facts(self) -> dict[str, str]:
+        return {
+            "controller": self.controller,
+            "task": self.task,
+            "episodes": f"{self.episodes}",
+            "success": f"{100 * self.success:.4g} %",
+            "failures": f"{self.falls}",
+            "mean regret": percent(self.regret_mean),
+        }
+
+    def _table(self) -> dict[str, str]:
+        return self.facts() | {
+            "95 % interval": f"{percent(self.regret_low)} to {percent(self.regret_high)}",
+            "median regret": percent(self.regret_median),
+            "median peak tilt": f"{self.peak_tilt_median:.1f}°",
+            "median settle time": f"{self.settle_time_median:.2f} s",
+            "mean force": f"{self.effort_mean:.0f} N",
+        }
+
+    def _picture(self) -> str:
+        mean, low, high = self.regret_mean, self.regret_low, self.regret_high
+        if not all(map(math.isfinite, (mean, low, high))):
+            return ""
+        least, most = min(0.0, low), max(0.01, 1.2 * high)
+        at_zero, at_low, at_mean, at_high = (
+            30 + 240 * (value - least) / (most - least) for value in (0, low, mean, high)
+        )
+        return svg(
+            300,
+            70,
+            f'<path d="M30 40H270M{at_zero:.1f} 30V50" stroke="#8888"/>'
+            f'<path d="M{at_low:.1f} 40H{at_high:.1f}" stroke="#1f6fb2" stroke-width="6"/>'
+            f'<circle cx="{at_mean:.1f}" cy="40" r="5" fill="#1f6fb2"/>'
+            + text(150, 18, "mean regret with its 95 % interval", "middle")
+            + text(at_zero, 64, "0", "middle")
+            + text(270, 64, percent(most), "middle"),
+        )
+
+    def show(self, episode: int = 0, physics: str | None = None, robot: str = PAPER) -> Path | None:
+        """The replay in 3D of a certified episode, run anew: in a notebook below the cell, elsewhere in the browser.
+
+        A row does not hold its physics and robot, and finds its controller by name.
+
+        Args: as of `evaluate`, and the index of the episode.
+
+        Returns:
+            The page that was written and opened; None in a notebook.
+
+        Raises:
+            ValueError: no such episode, physics or robot, or no controller of that name, as for a function of one's own; show
+                what `rollout` returns of it.
+        """
+        return lazy.load("ballbot_train.report.notebook:show_row")(self, episode, physics, robot)
+
+    def plot(self, *others: "Row") -> Any:
+        """A matplotlib Figure of the mean regret with its interval, beside that of other rows."""
+        return lazy.load("ballbot_train.report.notebook:plot_rows")((self, *others))
 
 
 def summarize(results: Sequence[Result], seed: int = 0) -> Row:

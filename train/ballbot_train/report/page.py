@@ -128,8 +128,24 @@ def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Sec
     replays = [replay for replay in replays if replay.takes]
     if not replays:
         return None
+    return Section(title, _replays(replays, traces=True), lead, ("plotly", "scene.js", "replay.js"))
+
+
+def replay_page(replay: Replay) -> str:
+    """The same without traces and so without Plotly, as a page of its own of some 60 kB."""
+    page = _render(
+        "frame.html.j2",
+        title=replay.title,
+        body=_replays([replay], traces=False),
+        style=_asset("style.css"),
+        scripts=[_asset(name) for name in ("scene.js", "replay.js")],
+    )
+    return str(page)
+
+
+def _replays(replays: Sequence[Replay], traces: bool) -> Markup:
     data = scene_data(replays[0].params) | {"episodes": [_replay_data(replay) for replay in replays]}
-    return Section(title, _render("replay.html.j2", data=data), lead, ("plotly", "scene.js", "replay.js"))
+    return _render("replay.html.j2", data=data, traces=traces)
 
 
 def scene_data(params: BallbotParams) -> dict[str, object]:

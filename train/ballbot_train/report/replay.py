@@ -276,14 +276,22 @@ def file_replay(paths: Sequence[Path]) -> Replay:
     """
     takes = []
     for i, path in enumerate(paths):
-        trajectory = Trajectory.load(path)
-        if not len(trajectory.u):
-            raise ValueError(f"{path} holds a single state: nothing moves")
-        if trajectory.xdot is not None or not trajectory.held:
-            trajectory = trajectory.resampled(_FILE_DT)
-        shifted = replace(trajectory, t=trajectory.t - trajectory.t[0])
-        takes.append(Take(_label(path, paths), shifted, labels.color(path.stem, i)))
+        trajectory = playable(Trajectory.load(path), str(path))
+        takes.append(Take(_label(path, paths), trajectory, labels.color(path.stem, i)))
     return Replay(", ".join(take.label for take in takes), tuple(takes))
+
+
+def playable(trajectory: Trajectory, name: str) -> Trajectory:
+    """A trajectory from time 0 on, with states that a replay can join by straight lines.
+
+    Raises:
+        ValueError: it holds a single state; the message says its name.
+    """
+    if not len(trajectory.u):
+        raise ValueError(f"{name} holds a single state: nothing moves")
+    if trajectory.xdot is not None or not trajectory.held:
+        trajectory = trajectory.resampled(_FILE_DT)
+    return replace(trajectory, t=trajectory.t - trajectory.t[0])
 
 
 def _label(path: Path, paths: Sequence[Path]) -> str:

@@ -101,6 +101,7 @@ class Replay {
   }
 
   drawTraces() {
+    if (!this.find("panels")) return;
     const { takes, dt } = this.episode;
     const plot = (name, title, valuesOf) => {
       const lines = takes.map((take) => {
@@ -124,6 +125,7 @@ class Replay {
     this.find("scrub").value = this.time;
     this.find("clock").textContent = this.time.toFixed(2) + " s";
     this.draw();
+    if (!this.find("panels")) return;
     const cursor = { "shapes[0].x0": this.time, "shapes[0].x1": this.time };
     await Promise.all(["tilts", "forces"].map((name) => Plotly.relayout(this.find(name), cursor)));
   }

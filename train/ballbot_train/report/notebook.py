@@ -1,0 +1,102 @@
+"""`show` and `plot` of trajectories, episodes, optima and rows: 3D replays, below a notebook's cell too, and figures."""
+
+import html
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
+
+from ballbot_gym import files
+from ballbot_gym.display import Moving
+from ballbot_gym.engines import default_physics
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import checked_robot
+from ballbot_gym.tasks.marker import Marker
+from ballbot_train.report import figures, labels
+from ballbot_train.report.page import replay_page
+from ballbot_train.report.replay import Replay, Take, certified_replay, playable
+
+if TYPE_CHECKING:
+    from ballbot_train.evaluation.results import Row
+
+_HEIGHT = 470  # px of a replay below a cell
+
+
+def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | BallbotParams) -> Path | None:
+    """See `ballbot_gym.display.Moving.show`."""
+    names = _names(shown, names)
+    takes = tuple(
+        Take(name, playable(one.motion, name), labels.color(name.lower(), i))
+        for i, (name, one) in enumerate(zip(names, shown, strict=True))
+    )
+    return _show(Replay(" and ".join(names), takes, _markers(shown), checked_robot(robot)))
+
+
+def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
+    """See `ballbot_gym.display.Moving.plot`."""
+    names = _names(shown, names)
+    curves = [
+        figures.Curve(name, one.motion, labels.color(name.lower(), i))
+        for i, (name, one) in enumerate(zip(names, shown, strict=True))
+    ]
+    return _figure(figures.trajectory_figure("", curves, figures.marker_circles(_markers(shown))))
+
+
+def show_row(row: "Row", episode: int, physics: str | None, robot: str) -> Path | None:
+    """See `ballbot_train.evaluation.results.Row.show`."""
+    return _show(certified_replay(row.task, [row.controller], episode, physics or default_physics(), robot=robot))
+
+
+def plot_rows(rows: "Sequence[Row]") -> Figure:
+    """See `ballbot_train.evaluation.results.Row.plot`."""
+    figure = Figure(figsize=(7, 1 + 0.4 * len(rows)), layout="constrained")
+    axis = figure.subplots()
+    for i, row in enumerate(rows):
+        middle, low, high = (100 * value for value in (row.regret_mean, row.regret_low, row.regret_high))
+        axis.errorbar(middle, i, xerr=[[middle - low], [high - middle]], fmt="o", color=labels.color(row.controller, i))
+    axis.set_yticks(range(len(rows)), [f"{row.controller}, {row.task}: {row.success:.0%} succeed" for row in rows])
+    axis.set(ylim=(len(rows) - 0.5, -0.5), xlabel="mean regret with its 95 % interval, %")
+    axis.grid(alpha=0.3)
+    return _figure(figure)
+
+
+def _names(shown: Sequence[Moving], names: Sequence[str]) -> list[str]:
+    if names and len(names) != len(shown):
+        raise ValueError(f"labels names {len(names)} of {len(shown)} motions; give one for each")
+    kinds = [type(one).__name__ for one in shown]
+    alone = len(kinds) == len(set(kinds))
+    return list(names) or [kind if alone else f"{kind} {i}" for i, kind in enumerate(kinds, 1)]
+
+
+def _markers(shown: Sequence[Moving]) -> tuple[Marker, ...]:
+    return tuple(dict.fromkeys(marker for one in shown for marker in getattr(one, "markers", ())))
+
+
+def _show(replay: Replay) -> Path | None:
+    page = replay_page(replay)
+    if _in_notebook():
+        style = f"width:100%;height:{_HEIGHT}px;border:0"
+        frame = f'<iframe srcdoc="{html.escape(page)}" title="replay" style="{style}"></iframe>'
+        display = import_module("IPython.display")
+        display.display(display.HTML(f"<div>{frame}</div>"))  # IPython warns of an iframe alone
+        return None
+    path = files.write(Path(tempfile.mkdtemp(prefix="ballbot-")) / "replay.html", page)
+    webbrowser.open(path.as_uri())
+    return path
+
+
+def _figure(figure: Figure) -> Figure:
+    figures.plain(figure)
+    if _in_notebook():  # so that it shows figures as pictures, also those that pyplot did not make
+        import_module("matplotlib_inline.backend_inline")
+    return figure
+
+
+def _in_notebook() -> bool:
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
