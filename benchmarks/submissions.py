@@ -30,7 +30,9 @@ HONEST = [
     for task in ("stabilize", "turn", "orbit", "weave")
     for physics in ("rk4", "bullet", "mujoco")
 ]
-HONEST += [(task, "sac", physics, "paper") for task in ("stabilize", "orbit") for physics in ("rk4", "bullet", "mujoco")]
+HONEST += [
+    (task, "sac", physics, "paper") for task in ("stabilize", "orbit") for physics in ("rk4", "bullet", "mujoco")
+]
 HONEST += [("turn", "dagger", "rk4", "rolling"), ("orbit", "nmpc", "mujoco", "paper")]
 
 
