@@ -77,7 +77,7 @@ def _output(output: dict[str, Any]) -> str:
 def settings_tables() -> str:
     """A table per learner, and one more of settings after a warm start, of every setting, its meaning and its values."""
     parts = []
-    for (name, algorithm), warm in itertools.product(LEARNERS.items(), (False, True)):
+    for (learner, algorithm), warm in itertools.product(LEARNERS.items(), (False, True)):
         columns = {task: algorithm.settings(task, warm) for task in TASKS}
         if warm and columns == {task: algorithm.settings(task) for task in TASKS}:
             continue
@@ -85,8 +85,9 @@ def settings_tables() -> str:
         meanings = _meanings(getattr(importlib.import_module(algorithm.module), algorithm.config))
         for field in fields(columns["turn"]):
             values = " | ".join(_shown(getattr(settings, field.name)) for settings in columns.values())
-            rows.append(f"| `{field.name}` | {meanings[field.name]} | {values} |")
-        title = f"`{name}`, from demonstrations or a policy" if warm else f"`{name}`"
+            name = field.name.replace("_", "\\_<wbr>")  # a narrow column breaks it there
+            rows.append(f"| {name} | {meanings[field.name]} | {values} |")
+        title = f"`{learner}`, from demonstrations or a policy" if warm else f"`{learner}`"
         parts.append(f"## {title}\n\n" + "\n".join(rows))
     return "\n\n".join(parts)
 
