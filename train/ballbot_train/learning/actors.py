@@ -1,5 +1,6 @@
 """The shapes of actors that respect the symmetry of their task, and running averages of actors."""
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -56,6 +57,17 @@ def spec_for(task: Task, symmetry: RoutedSymmetry, hidden: tuple[int, ...], line
             )
         fields |= {"frame": frame, "centred": True}
     return PolicySpec.of(task, **fields)
+
+
+def retargeted(start: PolicySpec, mine: PolicySpec) -> PolicySpec:
+    """The shape of a policy to start from, perhaps of another robot and its episodes, for the task and robot of `mine`."""
+    return replace(start, task=mine.task, robot=mine.robot)
+
+
+def check_start(start: PolicySpec, mine: PolicySpec) -> None:
+    """Raises a ValueError where a policy to start from differs in shape."""
+    if retargeted(start, mine) != mine:
+        raise ValueError(f"a policy of {start} cannot start one of {mine}; give --hidden or --symmetry")
 
 
 def average_of(actor: torch.nn.Module, updates: int) -> AveragedModel:

@@ -143,9 +143,8 @@ class CurriculumBatch(BallbotBatch):
         self.gamma, self._own, self._full = gamma, task, task if full is None else full
         self._short, self.backwards, self._pay = short_episodes, backwards, pay and not backwards
         self._goal_factor = _GOAL_FACTOR if backwards else 1.0
-        ramps = {name: ramp for name, ramp in _RAMPS.items() if backwards and hasattr(task, name)}
-        self._ramp_step = {name: step for name, (_, step) in ramps.items()}
-        self._ramp = {name: min(start, getattr(task, name)) for name, (start, _) in ramps.items()}
+        ramps = {name: start for name, (start, _) in _RAMPS.items() if backwards and hasattr(task, name)}
+        self._ramp = {name: min(start, getattr(task, name)) for name, start in ramps.items()}
         self._reach = _REACH
         self._own_episodes, self._on_optima = _Tally(), _Tally()  # that ended, by how they began
         self._has_settled = not backwards  # whether enough episodes of the task itself have succeeded
@@ -289,8 +288,8 @@ class CurriculumBatch(BallbotBatch):
         if self._goal_factor > 1:
             self._goal_factor = max(1.0, self._goal_factor * _GOAL_STEP)
         else:
-            for name, step in self._ramp_step.items():
-                self._ramp[name] = min(self._ramp[name] + step, getattr(self._own, name))
+            for name, reached in self._ramp.items():
+                self._ramp[name] = min(reached + _RAMPS[name][1], getattr(self._own, name))
         self._set_difficulty()
 
     def _set_difficulty(self) -> None:

@@ -22,7 +22,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import average_of, spec_for
+from ballbot_train.learning.actors import average_of, retargeted, spec_for
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.policy import PolicyNetwork
 
@@ -82,8 +82,7 @@ class WholeEpisodes:
 
     def start_from(self, network: PolicyNetwork) -> None:
         """Takes a policy of any shape, to be improved; it may have been trained on another robot and its episodes."""
-        mine = self._trained.spec
-        started = PolicyNetwork(replace(network.spec, task=mine.task, robot=mine.robot))
+        started = PolicyNetwork(retargeted(network.spec, self._trained.spec))
         started.load_state_dict(network.state_dict())
         self._make(started)
 

@@ -3,13 +3,14 @@
 A new learner is one file and one line in `LEARNERS`. Its file holds
 
 - a frozen dataclass of settings whose defaults suit any task, with a docstring under every field;
-- `TUNED`, settings by name of task, and by "" for any other task;
+- `TUNED`, settings by name of task, and by "" for any other task; `WARM`, where they differ after a warm start;
 - `make(task, params, settings, seed, demos, start)`, which returns the learner before its first iteration (see
   `training.Learner`).
 """
 
 import math
 from dataclasses import dataclass, fields
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +53,9 @@ class Algorithm:
         Returns:
             A frozen dataclass; `dataclasses.replace` changes some of its fields.
         """
-        table = load(f"{self.module}:{'WARM' if warm and self.name in _WITH_WARM else 'TUNED'}")
+        table = load(f"{self.module}:TUNED")
+        if warm:
+            table = getattr(import_module(self.module), "WARM", table)
         return table.get(task, table[""])
 
     def check(self, demos: object, start: object) -> None:
@@ -99,7 +102,6 @@ class Algorithm:
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
 
 
-_WITH_WARM = ("ppo", "sac")  # learners whose settings differ after a warm start
 _MAY_BE_ZERO = {
     "batch_episodes",
     "candidate_episodes",

@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import spec_for
+from ballbot_train.learning.actors import retargeted, spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
@@ -267,7 +267,7 @@ class Ppo(ModelFree):
             raise ValueError("backwards goes from scratch alone; give --no-backwards with --demos or --start")
         spec = spec_for(task, config.symmetry, config.hidden)
         if start is not None:
-            spec = replace(start.spec, task=spec.task, robot=spec.robot)
+            spec = retargeted(start.spec, spec)
         super().__init__(task, params, config, demos, warm, backwards=config.backwards)
         self.config = config
         model = PPO(

@@ -24,7 +24,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES, Frame
-from ballbot_train.learning.actors import spec_for
+from ballbot_train.learning.actors import check_start, spec_for
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
@@ -381,9 +381,7 @@ class Sac(ModelFree):
 
     def _start_from(self, start: PolicyNetwork) -> None:
         """Takes the weights of a policy."""
-        mine = self.network.spec
-        if replace(start.spec, task=mine.task, robot=mine.robot) != mine:
-            raise ValueError(f"a policy of {start.spec} cannot start one of {mine}; give --hidden or --symmetry")
+        check_start(start.spec, self.network.spec)
         given = [layer for layer in start.mlp if isinstance(layer, torch.nn.Linear)]
         for module in (self._actor, self._average.module):
             own = [layer for layer in module.modules() if isinstance(layer, torch.nn.Linear)]

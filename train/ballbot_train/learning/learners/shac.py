@@ -24,7 +24,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry, spec_for
+from ballbot_train.learning.actors import RoutedSymmetry, check_start, spec_for
 from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
@@ -192,9 +192,7 @@ class Shac:
         Raises:
             ValueError: its network differs in shape from this one.
         """
-        mine = self._network.spec
-        if replace(network.spec, task=mine.task, robot=mine.robot) != mine:
-            raise ValueError(f"a policy of {network.spec} cannot start one of {mine}; give --hidden or --symmetry")
+        check_start(network.spec, self._network.spec)
         self._network.load_state_dict(network.state_dict())
         self._finetuning = True
 
