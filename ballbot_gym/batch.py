@@ -27,7 +27,7 @@ except ImportError as error:
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.checks import LARGEST, check_num_envs, shown
 from ballbot_gym.env import fixed_error, limit_names, make_task
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.tasks import Task
@@ -169,43 +169,6 @@ class BatchEpisodes(NamedTuple):
     """(T, 8, B) states after each control step, where they were recorded. What follows the end of an episode is undefined."""
 
 
-class _Robot(NamedTuple):
-    """The parameters that `dynamics` reads, as plain values.
-
-    torch.compile cannot trace the cached properties of `BallbotParams`, because they take a lock.
-    """
-
-    total_mass: Any
-    moving_mass: Any
-    first_moment: Any
-    pivot_inertia: Any
-    axial_inertia: Any
-    gravity: Any
-    weight: Any
-    rolls: bool
-    ball_radius: Any
-    friction: Any
-    grips: bool
-
-    @classmethod
-    def of(cls, params: BallbotParams) -> "_Robot":
-        total_mass = params.ball_mass + params.body_mass
-        rolling = params.ball_inertia / params.ball_radius**2 if params.rolls else None
-        return cls(
-            total_mass=total_mass,
-            moving_mass=total_mass if rolling is None else total_mass + rolling,
-            first_moment=BallbotParams.first_moment.func(params),
-            pivot_inertia=BallbotParams.pivot_inertia.func(params),
-            axial_inertia=params.axial_inertia,
-            gravity=params.gravity,
-            weight=total_mass * params.gravity,
-            rolls=params.rolls,
-            ball_radius=params.ball_radius,
-            friction=params.friction,
-            grips=params.grips,
-        )
-
-
 class BallbotBatch:
     """B ballbots that do one task, in torch, differentiable from actions and states to rewards, costs and observations.
 
@@ -260,7 +223,7 @@ class BallbotBatch:
         self.randomization = checked_randomization(randomization)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
-        for name in _Robot._fields:
+        for name in ModelNumbers._fields:
             getattr(self.params, name)  # computed and kept, before torch.compile meets a lock there
         self._substeps = dynamics.substeps_for(self.task.control_dt)
         self._past_steps = self.randomization.delay_steps(self.task.control_dt)[1]
@@ -431,7 +394,7 @@ class BallbotBatch:
             total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
         robot: Any = self.params
         if noise.varies_robot:
-            robot = _Robot.of(noise.robot(self.params, now.drawn[:4]))
+            robot = ModelNumbers.of(noise.robot(self.params, now.drawn[:4]))
 
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
