@@ -376,7 +376,10 @@ def test_the_dynamics_of_a_task_depend_on_how_long_forces_are_held_and_on_the_ro
     for coarseness in (1, 2):
         p = shooting_parameters(task, params, np.zeros(len(task.constant_names)), Backoff(), coarseness)
         held = coarseness * task.control_dt
-        columns = [np.tile(column[:, None], compiled.LANES) for column in (np.append(x, a), np.array(p[: compiled_dynamics.params]))]
+        columns = [
+            np.tile(column[:, None], compiled.LANES)
+            for column in (np.append(x, a), np.array(p[: compiled_dynamics.params]))
+        ]
         reached = np.array(compiled_dynamics.value(*columns))[:, 0]
         np.testing.assert_allclose(
             reached, dynamics.step(params, x, params.force_limit * a, held), rtol=1e-13, atol=1e-13

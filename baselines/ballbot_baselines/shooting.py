@@ -152,9 +152,7 @@ def _symbolic_robot(rolls: bool, grips: bool, p: casadi.SX) -> tuple[Any, casadi
     return ModelNumbers(**numbers, rolls=rolls, grips=grips), limit
 
 
-def _after(
-    robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX, substeps: int
-) -> casadi.SX:
+def _after(robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX, substeps: int) -> casadi.SX:
     numbers, limit = robot
     return dynamics.step(numbers, x, limit * a, length, substeps)
 
