@@ -70,7 +70,7 @@ class BatchState(NamedTuple):
     seed: torch.Tensor
     """(B,) int64."""
     drawn: torch.Tensor
-    """(6, B) what `Randomization.draw` drew for the running episodes; (0, B) where it is off."""
+    """(6 or 14, B) what `Randomization.draw` drew for the running episodes; (0, B) where it draws nothing."""
     actuator: torch.Tensor
     """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
 
@@ -148,6 +148,8 @@ class StepInfo(NamedTuple):
     """(nc, B) constants."""
     grip: np.ndarray
     """(4, B), as of `BatchStep`; (0, B) where friction is unlimited."""
+    drawn: np.ndarray = np.zeros((0, 0))
+    """(6 or 14, B), as of `BatchState`; (0, B) where nothing is drawn."""
 
 
 class BatchEpisodes(NamedTuple):
@@ -189,7 +191,7 @@ class BallbotBatch:
         dtype: torch.dtype | str = torch.float32,
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
-        randomization: Randomization | None = None,
+        randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
         **task_fields: Any,
     ):
@@ -203,7 +205,7 @@ class BallbotBatch:
                 "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
                 warning and runs eagerly. False never compiles.
             params: the nominal robot as a BallbotParams; the same as robot.
-            randomization: what varies; default, nothing.
+            randomization: what varies, or a name in `TRACKS`; default, nothing.
             robot: a name in `ROBOTS`, or a BallbotParams.
             **task_fields: fields of the task that replace its defaults.
 
@@ -394,7 +396,7 @@ class BallbotBatch:
             total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
         robot: Any = self.params
         if noise.varies_robot:
-            robot = ModelNumbers.of(noise.robot(self.params, now.drawn[:4]))
+            robot = ModelNumbers.of(noise.robot(self.params, now.drawn))
 
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
@@ -449,7 +451,7 @@ class BallbotBatch:
             raise gymnasium.error.ResetNeeded("no episode before reset()")
         if not self.randomization.varies_robot:
             return self.params
-        return self.randomization.robot(self.params, tuple(self.state.drawn[:4, i].tolist()))
+        return self.randomization.robot(self.params, tuple(self.state.drawn[:, i].tolist()))
 
     def _start(
         self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
@@ -457,8 +459,8 @@ class BallbotBatch:
         """The starts of episodes; x and c are drawn where they are not given."""
         task, noise = self.task, self.randomization
         key = counter_rng.key(seed, episode, 0 * episode)
-        varied = noise.varies_robot or noise.varies_actuator
-        count = task.constant_draws + task.state_draws + Randomization.EPISODE_DRAWS * varied
+        varied = noise.varies_episodes
+        count = task.constant_draws + task.state_draws + noise.episode_draws * varied
         z = counter_rng.uniforms(key, count, self.dtype)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
         constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
@@ -474,6 +476,8 @@ class BallbotBatch:
         if not self.randomization.varies_actuator:
             return command, now.actuator
         pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
+        if len(now.drawn) > 6:
+            command = tuple(now.drawn[6] * part for part in command)
         force = actuate(command, pairs[1:], pairs[0], now.drawn[4], now.drawn[5])
         kept = (command, *pairs[1:])[: self._past_steps]
         return force, tuple(part for pair in (force, *kept) for part in pair)
@@ -484,7 +488,8 @@ class BallbotBatch:
         if self.randomization.is_noisy:
             key = counter_rng.key(now.seed, now.episode, now.steps + 1)
             z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
-            x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :])
+            time = now.steps.to(self.dtype) * self.task.control_dt
+            x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
         c = self.task.at(now.c, now.steps.to(self.dtype) * self.task.control_dt) if self.task.clock else now.c
         return torch.stack(self.task.observe(x, c)).T
 

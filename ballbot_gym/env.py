@@ -106,8 +106,9 @@ class BallbotEnv(gymnasium.Env):
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
     | grip | (4,) f_x, f_y, N of the floor on the ball as the step began, and the friction it needs (0 after `reset`) |
+    | drawn | (6,) or (14,) what a randomization drew for the episode; names in `Randomization.DRAWN` |
 
-    Only robots whose friction is limited have `grip`. Such a robot has lost its grip if it needs more friction, or a floor
+    Only envs with a randomization have `drawn`, and only robots whose friction is limited have `grip`. Such a robot has lost its grip if it needs more friction, or a floor
     that pulls, when a step begins or at its end. The closed form cannot say how it slips, so with physics="rk4" that is a
     failure, and `violated` is the index of "grip". PyBullet and MuJoCo simulate the contact of a rolling ball: it slips or
     leaves the floor, and that by itself is no failure. `grip` is then the force at the end of the step.
@@ -127,7 +128,7 @@ class BallbotEnv(gymnasium.Env):
         render_mode: str | None = None,
         params: BallbotParams | None = None,
         physics_dt: float | None = None,
-        randomization: Randomization | None = None,
+        randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
         **task_fields: Any,
     ):
@@ -142,7 +143,7 @@ class BallbotEnv(gymnasium.Env):
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
                 10 ms for rk4.
-            randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
+            randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
                 and 5 kB of memory that PyBullet never frees.
             robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
@@ -194,15 +195,16 @@ class BallbotEnv(gymnasium.Env):
 
         Args:
             seed: seeds the draw of this and the following episodes.
-            options: may hold "state", the (8,) initial state, and "constants", the (nc,) constants of the episode or a
-                dict of some of them by name. Everything else is drawn.
+            options: may hold "state", the (8,) initial state; "constants", the (nc,) constants of the episode or a dict of
+                some of them by name; and "drawn", what `info` has under that key. Everything else is drawn.
 
         Raises:
             ValueError: an unknown option, or a state or constants of the wrong shape, not finite, or unsafe.
         """
         self._check_open()
         super().reset(seed=seed)
-        x, c = self._draw(options)
+        state, constants, drawn = reset_options(options, "state", "constants", "drawn")
+        x, c = self._draw(state, constants)
         self._resets += 1
         self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
         judge, tilt = self._start(x, c)
@@ -210,6 +212,8 @@ class BallbotEnv(gymnasium.Env):
         self._state = x
         if self._disturbance is not None:
             self._disturbance.reset(self.np_random)
+            if drawn is not None:
+                self._disturbance.begin(_floats(finite_array(drawn, (self.randomization.episode_draws,), "drawn")))
             if self.randomization.varies_robot:
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
@@ -445,9 +449,8 @@ class BallbotEnv(gymnasium.Env):
             )
         return None, dynamics.tilt(x)
 
-    def _draw(self, options: dict[str, Any] | None) -> tuple[State, State]:
-        """Initial state and constants. Those that the options do not give are drawn."""
-        state, constants = reset_options(options, "state", "constants")
+    def _draw(self, state: Any, constants: Any) -> tuple[State, State]:
+        """Initial state and constants. Those that are not given are drawn."""
         task = self.task
         draws = self.np_random.random(task.constant_draws + task.state_draws).tolist()
         c = _floats(task.draw_constants(tuple(draws[: task.constant_draws]), self.params))
@@ -480,7 +483,7 @@ class BallbotEnv(gymnasium.Env):
         """(no) observation of the present state, with the sensors' noise."""
         x = self._state
         if self._disturbance is not None:
-            x = self._disturbance.sensed(x, self.np_random)
+            x = self._disturbance.sensed(x, self.np_random, self._taken * self.task.control_dt)
         return self.task.observe(x, self.task.at(self._constants, self._taken * self.task.control_dt))
 
     def _shown(
@@ -518,6 +521,8 @@ class BallbotEnv(gymnasium.Env):
         }
         if self._grips:
             info["grip"] = np.array(grip)
+        if self._disturbance is not None and self.randomization.varies_episodes:
+            info["drawn"] = np.array(self._disturbance.get_state().drawn)
         return seen, info
 
 

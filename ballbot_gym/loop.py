@@ -184,8 +184,8 @@ class _Single(BallbotEnv):
     def start(self, seed: int, episode: int, x: State | None = None, c: State | None = None) -> tuple:
         """The memory of an env that begins an episode: `remember` takes it. x and c are drawn where not given."""
         task, noise = self.task, self.randomization
-        varied = noise.varies_robot or noise.varies_actuator
-        count = task.constant_draws + task.state_draws + Randomization.EPISODE_DRAWS * varied
+        varied = noise.varies_episodes
+        count = task.constant_draws + task.state_draws + noise.episode_draws * varied
         z = counter_rng.floats(counter_rng.key(seed, episode, 0), count)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
         c = task.draw_constants(z_constants, self.params) if c is None else c
@@ -198,7 +198,7 @@ class _Single(BallbotEnv):
     def memory(self) -> tuple:
         """What the env remembers: a column of `BatchState`."""
         drawn, actuator, noise = (), (), self.randomization
-        if self._disturbance is not None and (noise.varies_robot or noise.varies_actuator):
+        if self._disturbance is not None and noise.varies_episodes:
             drawn, force, past = self._disturbance.get_state()
             pairs = (force, *past) if noise.varies_actuator else ()
             actuator = tuple(part for pair in pairs for part in pair)

@@ -140,7 +140,7 @@ def rollout(
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     _, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]
-    seen = _sensed(ballbot, x)
+    seen = _sensed(ballbot, x, 0.0)
     start = time.perf_counter()
     controller.reset(0.0, seen, c)
     reset_seconds = time.perf_counter() - start
@@ -152,7 +152,7 @@ def rollout(
         act_seconds.append(time.perf_counter() - start)
         _, _, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
         x, done = info["state"], terminated or truncated
-        seen = _sensed(ballbot, x)
+        seen = _sensed(ballbot, x, (len(forces) + 1) * dt)
         cost += info["cost"]
         states.append(x)
         forces.append(info["force"])
@@ -171,12 +171,13 @@ def rollout(
     )
 
 
-def _sensed(env: BallbotEnv, x: np.ndarray) -> np.ndarray:
-    """State x (8,) with the noise of the env's sensors. Each call draws new noise from the env's generator."""
-    if not env.randomization.is_noisy:
+def _sensed(env: BallbotEnv, x: np.ndarray, t: float) -> np.ndarray:
+    """State x (8,) as the env's sensors report it at time t, s. Each call draws new noise from the env's generator."""
+    state = env.get_state().disturbance if env.randomization.is_noisy else None
+    if state is None:
         return x
     z = tuple(env.np_random.random(Randomization.NOISE_DRAWS).tolist())
-    return np.array(env.randomization.sensed(tuple(x.tolist()), z))
+    return np.array(env.randomization.sensed(tuple(x.tolist()), z, state.drawn, t))
 
 
 def simulate(

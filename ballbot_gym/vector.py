@@ -122,7 +122,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         dtype: torch.dtype | str = torch.float32,
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
-        randomization: Randomization | None = None,
+        randomization: Randomization | str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         physics: str = "rk4",
         max_episode_steps: int | None = None,
@@ -234,7 +234,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         force, grip = np.zeros((2, size), self._dtype), np.zeros((4 * self.params.grips, size), self._dtype)
         success, failure, clipped = np.zeros((3, size), bool)
         parts = np.zeros((4, size))
-        now = StepInfo(x_now, parts[0], parts[1:], tilt, force, success, failure, self._none, clipped, c_now, grip)
+        flags = success, failure, self._none, clipped
+        now = StepInfo(x_now, parts[0], parts[1:], tilt, force, *flags, c_now, grip, self._drawn())
         infos = self._info(now, mask)
         return self._array(observation, np.float32), infos
 
@@ -377,7 +378,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             return self.batch.step_with_infos(actions, waiting, restart)
         check_finite(actions)
         actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
-        constants = self._x_and_c()[1]
+        constants, drawn = self._x_and_c()[1], self._drawn()
         if isinstance(self.batch, BallbotLoop):
             result: Any = self.batch.step(actions, waiting, restart)
         else:
@@ -388,7 +389,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         ended = (result.terminated | result.truncated).nonzero()[0]
         if isinstance(self.batch, BallbotBatch):
             result = result._replace(final_observation=result.final_observation[ended])
-        return result, *self._step_infos(result, constants, ended, waiting, restart), ended
+        return result, *self._step_infos(result, constants, drawn, ended, waiting, restart), ended
 
     def _cut(
         self, result: Any, now: StepInfo, end: StepInfo, ended: np.ndarray, restart: bool
@@ -410,12 +411,18 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         tilt[cut] = dynamics.tilt(tuple(x[:, cut]))
         now, ended = _begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
         result = result._replace(observation=observation, final_observation=final[ended])
-        return result, now._replace(x=x, c=c, tilt=tilt), end, ended
+        return result, now._replace(x=x, c=c, tilt=tilt, drawn=self._drawn()), end, ended
 
     def _step_infos(
-        self, result: Any, constants: np.ndarray, ended: np.ndarray, waiting: np.ndarray | None, restart: bool
+        self,
+        result: Any,
+        constants: np.ndarray,
+        drawn: np.ndarray,
+        ended: np.ndarray,
+        waiting: np.ndarray | None,
+        restart: bool,
     ) -> tuple[StepInfo, StepInfo]:
-        """What infos say of the envs now, and of a step, before which they had those constants (nc, B)."""
+        """What infos say of the envs now, and of a step, before which they had those constants (nc, B) and draws."""
         reward, cost, success, violated = result.reward, result.cost, result.success, result.violated
         parts = np.empty((3, self.num_envs))
         parts[0], parts[2] = self._survive, 0.0
@@ -429,10 +436,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * success[ended]
         x, c = self._x_and_c()
         flags = success, violated >= 0, violated, result.clipped
-        now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip)
+        now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip, self._drawn())
         if not (restart and ended.size):
             return now, now
-        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants)
+        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants, drawn=drawn)
         return _begun(now, ended), end
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
@@ -443,6 +450,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         return self._array(state.x), self._array(state.c)
+
+    def _drawn(self) -> np.ndarray:
+        """What the randomization drew for the running episodes, as of `BatchState`."""
+        state = self.batch.state if self.randomization.varies_episodes else None
+        return np.zeros((0, 0)) if state is None else self._array(state.drawn)
 
     @staticmethod
     def _array(part: Any, dtype: Any = None) -> np.ndarray:
@@ -468,6 +480,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             infos[name], infos[mask_name] = value, mask
         if self.params.grips:
             infos["grip"], infos["_grip"] = told.grip.T, mask
+        if self.randomization.varies_episodes:
+            infos["drawn"], infos["_drawn"] = told.drawn.T.copy(), mask
         return infos
 
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
