@@ -476,8 +476,8 @@ class BallbotBatch:
         if not self.randomization.varies_actuator:
             return command, now.actuator
         pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
-        if len(now.drawn) > 6:
-            command = tuple(now.drawn[6] * part for part in command)
+        for strength in now.drawn[6:7]:
+            command = tuple(strength * part for part in command)
         force = actuate(command, pairs[1:], pairs[0], now.drawn[4], now.drawn[5])
         kept = (command, *pairs[1:])[: self._past_steps]
         return force, tuple(part for pair in (force, *kept) for part in pair)

@@ -108,10 +108,11 @@ class BallbotEnv(gymnasium.Env):
     | grip | (4,) f_x, f_y, N of the floor on the ball as the step began, and the friction it needs (0 after `reset`) |
     | drawn | (6,) or (14,) what a randomization drew for the episode; names in `Randomization.DRAWN` |
 
-    Only envs with a randomization have `drawn`, and only robots whose friction is limited have `grip`. Such a robot has lost its grip if it needs more friction, or a floor
-    that pulls, when a step begins or at its end. The closed form cannot say how it slips, so with physics="rk4" that is a
-    failure, and `violated` is the index of "grip". PyBullet and MuJoCo simulate the contact of a rolling ball: it slips or
-    leaves the floor, and that by itself is no failure. `grip` is then the force at the end of the step.
+    Only envs with a randomization have `drawn`, and only robots whose friction is limited have `grip`. Such a robot has lost
+    its grip if it needs more friction, or a floor that pulls, when a step begins or at its end. The closed form cannot say
+    how it slips, so with physics="rk4" that is a failure, and `violated` is the index of "grip". PyBullet and MuJoCo simulate
+    the contact of a rolling ball: it slips or leaves the floor, and that by itself is no failure. `grip` is then the force at
+    the end of the step.
 
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
@@ -143,8 +144,8 @@ class BallbotEnv(gymnasium.Env):
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
                 10 ms for rk4.
-            randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
-                and 5 kB of memory that PyBullet never frees.
+            randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF,
+                which takes 2 ms and 5 kB of memory that PyBullet never frees.
             robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 

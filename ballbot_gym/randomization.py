@@ -130,6 +130,11 @@ class Randomization:
         return self.varies_robot or self.varies_actuator or self.is_biased
 
     @property
+    def moves_optima(self) -> bool:
+        """Whether an episode's optimum is another than that of the nominal robot with an ideal actuator."""
+        return self.varies_robot or self.varies_actuator
+
+    @property
     def episode_draws(self) -> int:
         """Uniform numbers that `draw` takes."""
         every = self.is_biased or self.force != (1.0, 1.0) or self.friction != (1.0, 1.0)
@@ -189,7 +194,7 @@ class Randomization:
         delay = 0.0 * z[5] + low
         for k in range(low, high):
             delay = ops.where(z[5] * (high - low + 1) >= k - low + 1, 0.0 * z[5] + (k + 1), delay)
-        if len(z) == 6:
+        if self.episode_draws == 6:
             return (*factors, gain, delay)
         deviations = (std for std in self._biases for _ in range(2))
         errors = (std * normal for std, normal in zip(deviations, normals(z[8:]), strict=True))
@@ -235,6 +240,11 @@ class Randomization:
         drift, lean, rate = drawn[8:10], drawn[10:12], drawn[12:14]
         errors = (*(time * part for part in drift), *lean, *drift, *rate)
         return tuple(value + error for value, error in zip(seen, errors, strict=True))
+
+
+def track_of(randomization: Randomization) -> str:
+    """Its name in `TRACKS`, or ""."""
+    return next((name for name, track in TRACKS.items() if track == randomization), "")
 
 
 def checked_randomization(randomization: Any) -> Randomization:

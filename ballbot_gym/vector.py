@@ -517,7 +517,7 @@ def _batch(
     dtype: torch.dtype,
     compile: bool | str,
     params: BallbotParams,
-    randomization: Randomization | None,
+    randomization: Randomization | str | None,
     engine: str,
 ) -> "BallbotBatch | BallbotLoop | BallbotNative":
     """The envs of an engine; see `BallbotVectorEnv`."""
