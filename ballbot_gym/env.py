@@ -204,7 +204,8 @@ class BallbotEnv(gymnasium.Env):
         """
         self._check_open()
         super().reset(seed=seed)
-        state, constants, drawn = reset_options(options, "state", "constants", "drawn")
+        draws = ("drawn",) if self.randomization.varies_episodes else ()
+        state, constants, *drawn = reset_options(options, "state", "constants", *draws)
         x, c = self._draw(state, constants)
         self._resets += 1
         self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
@@ -213,8 +214,10 @@ class BallbotEnv(gymnasium.Env):
         self._state = x
         if self._disturbance is not None:
             self._disturbance.reset(self.np_random)
-            if drawn is not None:
-                self._disturbance.begin(_floats(finite_array(drawn, (self.randomization.episode_draws,), "drawn")))
+            for given in drawn:
+                if given is not None:
+                    shape = (self.randomization.episode_draws,)
+                    self._disturbance.begin(_floats(finite_array(given, shape, "drawn")))
             if self.randomization.varies_robot:
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
