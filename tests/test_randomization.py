@@ -310,7 +310,7 @@ def test_track_is_the_same_for_all_kinds_of_envs(track, make_env):
     many = BallbotVectorEnv(3, engine="torch", compile=False, dtype="float64", randomization=track)
     one_by_one = BallbotVectorEnv(3, engine="loop", randomization=track)
     assert env.randomization == many.randomization == one_by_one.randomization == TRACKS[track]
-    (seen, infos), (_, looped) = many.reset(seed=5), one_by_one.reset(seed=5)
+    (_, infos), (_, looped) = many.reset(seed=5), one_by_one.reset(seed=5)
     assert len(infos["drawn"][0]) == TRACKS[track].episode_draws
     np.testing.assert_allclose(looped["drawn"], infos["drawn"], rtol=1e-6)
     assert len(np.unique(infos["drawn"], axis=0)) == (3 if track != "late" else len(np.unique(infos["drawn"][:, 5])))
