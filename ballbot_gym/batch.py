@@ -26,7 +26,7 @@ except ImportError as error:
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.checks import LARGEST, check_num_envs, shown
-from ballbot_gym.env import fixed_error, limit_names, make_task
+from ballbot_gym.env import check_history, fixed_error, limit_names, make_task
 from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
@@ -52,7 +52,7 @@ _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The fields of `BatchStep` that are bools."""
 
 
-_FIXED = ("task", "params", "randomization", "num_envs", "device", "dtype", "limit_names")
+_FIXED = ("task", "params", "randomization", "history", "num_envs", "device", "dtype", "limit_names")
 """Attributes of a batch that cannot be set once it is made: more is computed from them."""
 
 
@@ -73,6 +73,9 @@ class BatchState(NamedTuple):
     """(6 or 14, B) what `Randomization.draw` drew for the running episodes; (0, B) where it draws nothing."""
     actuator: torch.Tensor
     """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
+    past: torch.Tensor
+    """(history (no + 2), B) the last observations, each with the action that followed, the latest first; 0 before the
+    episode began."""
 
 
 class _Rows(NamedTuple):
@@ -85,6 +88,7 @@ class _Rows(NamedTuple):
     seed: torch.Tensor
     drawn: tuple[torch.Tensor, ...]
     actuator: tuple[torch.Tensor, ...]
+    past: tuple[torch.Tensor, ...]
 
 
 class BatchStep(NamedTuple):
@@ -193,6 +197,7 @@ class BallbotBatch:
         params: BallbotParams | None = None,
         randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
+        history: int = 0,
         **task_fields: Any,
     ):
         """Makes the batch; call `reset` first.
@@ -207,6 +212,7 @@ class BallbotBatch:
             params: the nominal robot as a BallbotParams; the same as robot.
             randomization: what varies, or a name in `TRACKS`; default, nothing.
             robot: a name in `ROBOTS`, or a BallbotParams.
+            history: as of `BallbotEnv`.
             **task_fields: fields of the task that replace its defaults.
 
         Raises:
@@ -222,7 +228,7 @@ class BallbotBatch:
         self.params = checked_robot(robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.limit_names = limit_names(self.task, self.params)
-        self.randomization = checked_randomization(randomization)
+        self.randomization, self.history = checked_randomization(randomization), check_history(history)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
         for name in ModelNumbers._fields:
@@ -413,7 +419,11 @@ class BallbotBatch:
         done = terminated | truncated
         reward = task.survival_reward * task.control_dt - did.running + did.goal
 
-        after = now._replace(x=end, steps=steps, actuator=actuator)
+        past = now.past
+        if past:
+            tried = (part.clamp(-1.0, 1.0) for part in asked)
+            past = (*self._seen(now), *tried, *past)[: len(past)]
+        after = now._replace(x=end, steps=steps, actuator=actuator, past=past)
         new, observed = after, self._observe(after)
         observation = observed
         # Drawing the next episodes takes as long as the dynamics. Compiled code has no branches that depend on numbers.
@@ -469,7 +479,8 @@ class BallbotBatch:
         drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
         actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
-        return _Rows(state, constants, zero, episode, seed, drawn, actuator)
+        past = (still,) * (self.history * (len(task.observation_scale) + 2))
+        return _Rows(state, constants, zero, episode, seed, drawn, actuator, past)
 
     def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
         """Force (2) that the actuator applies, and its new memory."""
@@ -483,7 +494,11 @@ class BallbotBatch:
         return force, tuple(part for pair in (force, *kept) for part in pair)
 
     def _observe(self, now: _Rows) -> torch.Tensor:
-        """(B, no) observations with the sensors' noise, which depends on the number of steps taken in the episode."""
+        """(B, no) observations, with those of the past behind the present one."""
+        return torch.stack((*self._seen(now), *now.past)).T
+
+    def _seen(self, now: _Rows) -> tuple[torch.Tensor, ...]:
+        """The present observation with the sensors' noise, which depends on the number of steps taken in the episode."""
         x = now.x
         if self.randomization.is_noisy:
             key = counter_rng.key(now.seed, now.episode, now.steps + 1)
@@ -491,7 +506,7 @@ class BallbotBatch:
             time = now.steps.to(self.dtype) * self.task.control_dt
             x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
         c = self.task.at(now.c, now.steps.to(self.dtype) * self.task.control_dt) if self.task.clock else now.c
-        return torch.stack(self.task.observe(x, c)).T
+        return tuple(self.task.observe(x, c))
 
     def _stacked(self, rows: _Rows) -> BatchState:
         """The rows as tensors."""
@@ -508,6 +523,7 @@ def run_episodes(
     x: np.ndarray | torch.Tensor,
     c: np.ndarray | torch.Tensor,
     record: bool = False,
+    drawn: np.ndarray | None = None,
 ) -> BatchEpisodes:
     """Runs one episode of each environment, all at once and without gradients.
 
@@ -519,9 +535,14 @@ def run_episodes(
         x: (B, 8) initial states.
         c: (B, nc) constants of the episodes.
         record: whether to keep the states of all control steps.
+        drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
     """
     start = (torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device) for part in (x, c))
     observation = batch.reset(0, None, *start)
+    if drawn is not None and batch.state is not None:
+        rows = torch.as_tensor(drawn.T, dtype=batch.dtype, device=batch.device).contiguous()
+        batch.state = batch.state._replace(drawn=rows)
+        observation = batch.observe(batch.state)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
     success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
     cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)

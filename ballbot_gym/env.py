@@ -31,6 +31,7 @@ from ballbot_gym.viewer import PageScene
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
+_LONGEST_HISTORY = 1000  # control steps
 
 
 _Kind = TypeVar("_Kind", bound=type)
@@ -77,9 +78,11 @@ class EnvState(NamedTuple):
     """Of the randomized robot and actuator; None where nothing varies."""
     memory: tuple[float, ...] = ()
     """What the simulator remembers besides the state; see `Simulator.memory`."""
+    past: tuple[float, ...] = ()
+    """What is observed of the present, and of the past behind it, where the env has a history."""
 
 
-@fixed("task", "params", "randomization", "physics", "render_mode", "action_space", "observation_space")
+@fixed("task", "params", "randomization", "history", "physics", "render_mode", "action_space", "observation_space")
 class BallbotEnv(gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
@@ -131,6 +134,7 @@ class BallbotEnv(gymnasium.Env):
         physics_dt: float | None = None,
         randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
+        history: int = 0,
         **task_fields: Any,
     ):
         """Makes the environment; usually through `gymnasium.make("BallbotStabilize-v0", ...)`.
@@ -147,6 +151,8 @@ class BallbotEnv(gymnasium.Env):
             randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF,
                 which takes 2 ms and 5 kB of memory that PyBullet never frees.
             robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
+            history: so many earlier observations follow the present one in each observation, the latest first, each with the
+                action (2) that was taken on it; all 0 before the episode began.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -176,7 +182,10 @@ class BallbotEnv(gymnasium.Env):
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )
         self._noisy = self.randomization.is_noisy
-        self.observation_space = observation_space(self.task, self.params)
+        self.history = check_history(history)
+        self.observation_space = observation_space(self.task, self.params, self.history)
+        own = len(self.task.observation_scale)
+        self._past = np.zeros(own + self.history * (own + 2), np.float32) if self.history else None
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: Judge | None = None  # in machine code
@@ -222,6 +231,8 @@ class BallbotEnv(gymnasium.Env):
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
         self._steps_left, self._taken = self._steps, 0
+        if self._past is not None:
+            self._past[:] = 0
         if self._human:
             self.render()
         return self._shown(judge, tilt)
@@ -247,6 +258,8 @@ class BallbotEnv(gymnasium.Env):
         if self._disturbance is not None:
             force = self._disturbance.actuate(force)
             total = self._disturbance.pushed(force, self.np_random)
+        if self._past is not None:
+            self._note(action)
         before = self._state
         self._state = x = self._simulator.step(total)
         self._steps_left -= 1
@@ -279,6 +292,14 @@ class BallbotEnv(gymnasium.Env):
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = spec_of(spec, self.task, self.params, self.randomization)
+
+    def _note(self, action: Any) -> None:
+        """Moves what was observed, and the action on it, into the past."""
+        past, own = self._past, len(self.task.observation_scale)
+        assert past is not None
+        past[2 * own + 2 :] = past[own : -(own + 2)].copy()
+        past[own : 2 * own] = past[:own]
+        past[2 * own : 2 * own + 2] = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
 
     @property
     def limit_names(self) -> tuple[str, ...]:
@@ -335,7 +356,8 @@ class BallbotEnv(gymnasium.Env):
         disturbance = None if self._disturbance is None else self._disturbance.get_state()
         rng = dict(self.np_random.bit_generator.state)
         memory = self._simulator.memory()
-        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance, memory)
+        past = () if self._past is None else tuple(self._past.tolist())
+        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance, memory, past)
 
     def set_state(self, state: EnvState) -> None:
         """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
@@ -353,6 +375,10 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError(f"the state is of {state.task}, and this env's task is {self.task}")
         if (state.disturbance is None) != (self._disturbance is None):
             raise ValueError("the state is of an env with other randomization")
+        if len(state.past) != (0 if self._past is None else len(self._past)):
+            raise ValueError("the state is of an env with another history")
+        if self._past is not None:
+            self._past[:] = state.past
         self._set_constants(state.constants)
         self._state, self._steps_left = state.x, state.steps_left
         self._taken = self.task.steps - state.steps_left
@@ -506,6 +532,9 @@ class BallbotEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Observation and `info` of a step that a judge judged last, or of one that Python judged; by default of a start."""
         seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
+        if self._past is not None:
+            self._past[: len(seen)] = seen
+            seen = self._past.copy()
         failure = violated >= 0
         info = {
             "state": np.array(self._state) if judge is None else judge.x.copy(),
@@ -537,9 +566,17 @@ GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
 
 
-def observation_space(task: Task, params: BallbotParams) -> spaces.Box:
-    """What a robot can observe in a task."""
-    bounds = np.array(task.observation_bounds(params), np.float32)
+def check_history(history: Any) -> int:
+    """history, or a ValueError."""
+    if isinstance(history, bool) or not isinstance(history, int | np.integer) or not 0 <= history <= _LONGEST_HISTORY:
+        raise ValueError(f"history must be a whole number of control steps, 0 to {_LONGEST_HISTORY}, not {history!r}")
+    return int(history)
+
+
+def observation_space(task: Task, params: BallbotParams, history: int = 0) -> spaces.Box:
+    """What a robot can observe in a task, with so many earlier observations and actions."""
+    own = task.observation_bounds(params)
+    bounds = np.array((*own, *(history * (*own, 1.0, 1.0))), np.float32)
     return spaces.Box(-bounds, bounds, dtype=np.float32)
 
 

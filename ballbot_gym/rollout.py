@@ -69,26 +69,33 @@ class ActionController:
     This is the one place where an observation is turned into a force.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray]):
+    def __init__(
+        self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray], history: int = 0
+    ):
         """Wraps a function.
 
         Args:
             task: what is observed.
             params: the robot, whose force limit is the unit of actions.
             action: gets an observation (no,) float32 and whether an episode begins; returns an action (2,) in [−1, 1].
+            history: of the observations, as of `BallbotEnv`.
         """
-        self._task, self._params, self._action = task, params, action
+        self._task, self._params, self._action, self._history = task, params, action, history
         self._c: tuple[float, ...] = ()
         self._begins = True
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
+        self._past = np.zeros(self._history * (len(self._task.observation_scale) + 2), np.float32)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         seen = self._task.observe(tuple(np.asarray(x).tolist()), self._task.at(self._c, t))
-        observation = np.array(seen, np.float32)
+        own = np.array(seen, np.float32)
+        observation = np.concatenate([own, self._past]) if self._history else own
         action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
+        if self._history:
+            self._past = np.concatenate([own, action.clip(-1.0, 1.0).astype(np.float32), self._past])[: len(self._past)]
         return self._params.force_limit * action
 
 

@@ -88,7 +88,7 @@ class VectorState(NamedTuple):
     """(B,) bool: the episode has ended, and the next one has not begun."""
 
 
-@fixed("task", "params", "randomization", "num_envs", "render_mode", "autoreset_mode")
+@fixed("task", "params", "randomization", "history", "num_envs", "render_mode", "autoreset_mode")
 @fixed("action_space", "observation_space", "single_action_space", "single_observation_space")
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.
@@ -128,6 +128,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         max_episode_steps: int | None = None,
         engine: str = "auto",
         robot: str | BallbotParams = PAPER,
+        history: int = 0,
         **task_fields: Any,
     ):
         """Makes the environments. Arguments that are not listed are those of `BallbotBatch`.
@@ -139,11 +140,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
-                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization`. "torch" computes
-                them in torch, and `compile` says whether that is compiled. "loop" computes one after the other in float64,
-                whatever dtype is returned. "auto" takes "native" where it can on a CPU, unless compile is True or
-                False; else "loop" for fewer than `LOOP_BELOW` envs on a CPU, unless compile is True; else "torch". All run
-                the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotLoop`.
+                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization` and no history.
+                "torch" computes them in torch, and `compile` says whether that is compiled. "loop" computes one after the
+                other in float64, whatever dtype is returned. "auto" takes "native" where it can on a CPU, unless compile is
+                True or False; else "loop" for fewer than `LOOP_BELOW` envs on a CPU, unless compile is True; else "torch".
+                All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotLoop`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -163,20 +164,21 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         real: torch.dtype = dtype_named(dtype)
         self._dtype = np.float32 if real == torch.float32 else np.float64
-        self.batch = _batch(task, num_envs, device, real, compile, params, randomization, engine)
+        self.batch = _batch(task, num_envs, device, real, compile, params, randomization, engine, history)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
+        self.history = self.batch.history
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
         fps = round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._ended = np.zeros(self.num_envs, np.bool_)  # whose episodes have ended and not begun anew
         self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.single_observation_space = observation_space(self.task, self.params)
+        self.single_observation_space = observation_space(self.task, self.params, self.history)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._most_steps = _most_steps(max_episode_steps, self.task)
         self._none, self._nothing = np.full(self.num_envs, -1), np.zeros(self.num_envs)
         self._everywhere = np.ones(self.num_envs, np.bool_)
-        self._ends = sparse_rows(self.num_envs, len(self.task.observation_scale))
+        self._ends = sparse_rows(self.num_envs, self.single_observation_space.shape[0])
         for array in (self._none, self._nothing, self._everywhere):
             array.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
@@ -519,28 +521,29 @@ def _batch(
     params: BallbotParams,
     randomization: Randomization | str | None,
     engine: str,
+    history: int,
 ) -> "BallbotBatch | BallbotLoop | BallbotNative":
     """The envs of an engine; see `BallbotVectorEnv`."""
     numbers = np.float32 if dtype == torch.float32 else np.float64
     on_cpu = torch.device(device).type == "cpu"
     if engine == "native" or (engine == "auto" and on_cpu and compile == "auto"):
         # made in any case, because it checks the arguments; it allocates nothing
-        checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization)
+        checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization, history=history)
         native = _native(checked, numbers, must=engine == "native")
         if native is not None:
             return native
-    batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization)
+    batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, history=history)
     small = engine == "auto" and on_cpu and batch.num_envs < LOOP_BELOW and compile is not True
     if engine == "loop" or small:
-        return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization)
+        return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization, batch.history)
     return batch
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
     """The envs of a batch in machine code. Where that is not possible: None, or an error if it must be."""
-    if batch.randomization != Randomization():
+    if batch.randomization != Randomization() or batch.history:
         if must:
-            raise ValueError('engine="native" knows no Randomization; take engine="torch" or "loop"')
+            raise ValueError('engine="native" knows no Randomization and no history; take engine="torch" or "loop"')
         return None
     try:
         from ballbot_gym.native import BallbotNative, NativeUnavailableError

@@ -351,3 +351,45 @@ def test_biased_sensors_are_wrong_by_the_same_all_the_time_and_odometry_drifts(m
 def test_unknown_track_is_refused_with_the_names_of_all(make_env):
     with pytest.raises(ValueError, match="unknown randomization 'windy'; known: 'unknown', 'late', 'noisy', 'real'"):
         make_env(randomization="windy")
+
+
+# --- observations for memory ---
+
+
+@pytest.mark.parametrize("task", ["stabilize", "orbit"])
+def test_history_shows_the_last_observations_with_their_actions_in_every_kind_of_env(task, make_env):
+    plain, env = make_env(task, physics="rk4"), make_env(task, physics="rk4", history=2)
+    own = plain.observation_space.shape[0]
+    assert env.observation_space.shape == (own + 2 * (own + 2),)
+    many = BallbotVectorEnv(2, task, engine="torch", compile=False, dtype="float64", history=2)
+    looped = BallbotVectorEnv(2, task, engine="loop", history=2)
+    (seen, infos), _ = many.reset(seed=0), looped.reset(seed=0)
+    options = {"state": infos["state"][0], "constants": infos["constants"][0]}
+    observed, actions = [plain.reset(options=options)[0]], []
+    assert (env.reset(options=options)[0] == [*observed[0], *np.zeros(2 * (own + 2))]).all()
+    for action in np.random.default_rng(0).uniform(-0.1, 0.1, (5, 2)).astype(np.float32):
+        observed.append(plain.step(action)[0])
+        actions.append(action)
+        before = [*zip(observed[:-1], actions, strict=True)][::-1][:2]
+        wanted = np.concatenate([observed[-1], *(part for pair in before for part in pair)])
+        wanted = np.pad(wanted, (0, own + 2 * (own + 2) - len(wanted)))
+        kept = env.get_state()
+        np.testing.assert_array_equal(env.step(action)[0], wanted)
+        env.set_state(kept)
+        np.testing.assert_array_equal(env.step(action)[0], wanted)
+        for vector in (many, looped):
+            np.testing.assert_allclose(vector.step(np.tile(action, (2, 1)))[0][0], wanted, atol=1e-5)
+
+
+def test_history_of_an_ended_episode_is_forgotten(make_env):
+    env = make_env(physics="rk4", history=1)
+    own = len(env.task.observation_scale)
+    many = BallbotVectorEnv(2, engine="torch", compile=False, history=1, duration=0.04)
+    env.reset(seed=0)
+    env.step(np.ones(2))
+    assert not env.reset()[0][own:].any()
+    many.reset(seed=0)
+    many.step(np.ones((2, 2), np.float32))
+    seen, *_, infos = many.step(np.ones((2, 2), np.float32))
+    assert not seen[:, own:].any()
+    assert infos["final_obs"][0][own:].all()

@@ -16,7 +16,8 @@ from ballbot_train.commands.benchmark import benchmark
 def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):
     options = {"tasks": ("orbit",), "controllers": ("trajopt", "lqr"), "episodes": 3, "physics": "rk4", "workers": 1}
     benchmark(**options, randomization=("unknown", "late"), out=tmp_path)
-    rows = {(row["track"], row["controller"]): row for row in csv.DictReader(open(tmp_path / "tracks.csv"))}
+    table = csv.DictReader((tmp_path / "tracks.csv").read_text().splitlines())
+    rows = {(row["track"], row["controller"]): row for row in table}
     assert len(rows) == 4
     for (track, controller), row in rows.items():
         same = evaluate(controller, "orbit", 3, "rk4", randomization=track)
