@@ -363,7 +363,7 @@ def test_history_shows_the_last_observations_with_their_actions_in_every_kind_of
     assert env.observation_space.shape == (own + 2 * (own + 2),)
     many = BallbotVectorEnv(2, task, engine="torch", compile=False, dtype="float64", history=2)
     looped = BallbotVectorEnv(2, task, engine="loop", history=2)
-    (seen, infos), _ = many.reset(seed=0), looped.reset(seed=0)
+    (_, infos), _ = many.reset(seed=0), looped.reset(seed=0)
     options = {"state": infos["state"][0], "constants": infos["constants"][0]}
     observed, actions = [plain.reset(options=options)[0]], []
     assert (env.reset(options=options)[0] == [*observed[0], *np.zeros(2 * (own + 2))]).all()
