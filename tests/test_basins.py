@@ -43,6 +43,7 @@ def test_the_full_force_rights_what_is_within_the_boundary_and_not_what_is_beyon
         assert (leans.min() < 0) == righted
 
 
+@pytest.mark.slow  # it compiles twice
 def test_a_floor_that_lets_the_ball_slip_allows_less_lean_and_that_much_can_be_planned(limits):
     task, robot = make_task("stabilize", "rolling", duration=4.0), named_robot("rolling")
     (lean,) = np.degrees(largest_leans(task, robot, LEAN_RATE, np.array([0.0])))
