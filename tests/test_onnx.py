@@ -35,8 +35,7 @@ def observations_of_an_episode(env, policy):
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name == "orbit-sac" else pytest.mark.slow) for name in SHIPPED_NAMES],
+    "name", [pytest.param(name, marks=[] if name == "orbit-sac" else pytest.mark.slow) for name in SHIPPED_NAMES]
 )
 def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path):
     task, *others, learner = name.split("-")

@@ -45,10 +45,7 @@ class Axis:
     label: str
 
 
-AXES: dict[str, Axis] = {
-    "speed": Axis(4, 15.0, "speed ẋ, m/s"),
-    "lean rate": Axis(6, 15.0, "lean rate γ̇, rad/s"),
-}
+AXES: dict[str, Axis] = {"speed": Axis(4, 15.0, "speed ẋ, m/s"), "lean rate": Axis(6, 15.0, "lean rate γ̇, rad/s")}
 
 
 @dataclass(frozen=True)
@@ -185,10 +182,7 @@ def _cells(
 
 
 def maps_of(
-    bounds: Mapping[str, np.ndarray],
-    entries: Iterable[jobs.Entry],
-    controllers: Sequence[str],
-    points: int,
+    bounds: Mapping[str, np.ndarray], entries: Iterable[jobs.Entry], controllers: Sequence[str], points: int
 ) -> list[BasinMap]:
     """The maps that finished states make up."""
     recovered = {name: {c: np.zeros((points, points), bool) for c in controllers} for name in bounds}

@@ -145,10 +145,7 @@ def read(path: str | Path) -> Recording:
     if not isinstance(facts, dict):
         raise files.FileError(f"{path} is no recording: about holds no object")
     return Recording(
-        facts,
-        lengths.astype(np.int64),
-        GRID * _unpacked(arrays["states"]),
-        ACTION_GRID * _unpacked(arrays["actions"]),
+        facts, lengths.astype(np.int64), GRID * _unpacked(arrays["states"]), ACTION_GRID * _unpacked(arrays["actions"])
     )
 
 

@@ -357,12 +357,7 @@ class Dagger:
             sides = self.network.routes(torch.as_tensor(np.asarray(self._task.observe(x, c)), dtype=torch.float32))
         return [self._task.routed_path(x, c, tuple(map(int, sides.tolist())))]
 
-    def _track(
-        self,
-        plans: Sequence[_Plan],
-        gains: Sequence[np.ndarray],
-        rng: np.random.Generator,
-    ) -> None:
+    def _track(self, plans: Sequence[_Plan], gains: Sequence[np.ndarray], rng: np.random.Generator) -> None:
         """Rolls the learner out along plans; TVLQR at the nearest point of the plan labels each state."""
         config = self.config
         tracked = [episode for episode in plans for _ in range(config.tracked_rollouts_per_plan)]

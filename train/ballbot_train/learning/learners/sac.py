@@ -200,12 +200,7 @@ class Critics(ContinuousCritic):
     ):
         """Args: network: makes one critic's network; the others are SB3's."""
         super().__init__(
-            observation_space,
-            action_space,
-            net_arch,
-            features_dim=features_dim,
-            activation_fn=activation_fn,
-            **kwargs,
+            observation_space, action_space, net_arch, features_dim=features_dim, activation_fn=activation_fn, **kwargs
         )
         inputs = features_dim + get_action_dim(action_space)
         self.q_networks = [network(inputs, net_arch, activation_fn) for _ in range(self.n_critics)]
