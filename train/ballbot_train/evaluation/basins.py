@@ -30,9 +30,7 @@ BOUNDARY = "boundary"
 LEAN_LIMIT = 75.0  # degrees, either side
 _BOUNDARY_POINTS = 31  # its search goes from value to value, in steps that it can follow
 _ARENA_RADIUS = 1000.0  # m: a map asks whether the robot comes back, not how far it goes meanwhile
-_DOUBT = (
-    2.0  # degrees beyond the boundary that are run too, because the boundary is only as exact as its regularization
-)
+_DOUBT = 2.0  # degrees beyond the boundary that are run too, because it is only as exact as its regularization
 
 
 @dataclass(frozen=True)

@@ -122,9 +122,7 @@ WARM: dict[str, SacConfig] = {
 }
 """The same with demonstrations, or from a policy; "" is any other task. Demonstrations are single steps of the task."""
 
-_CONTROL_DT = (
-    0.05  # s, how long each force is held from scratch: an action changes more, and critics tell actions apart
-)
+_CONTROL_DT = 0.05  # s, how long each force is held from scratch: an action changes more, so critics tell actions apart
 TAU = 0.005  # share by which the target critics move to the critics at each gradient step
 ENT_COEF = 0.01  # entropy coefficient at the start, in scaled rewards per nat
 _IMITATION_WEIGHT = 300.0
