@@ -22,7 +22,7 @@ from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.controllers import make_controller, policy_digest
-from ballbot_train.evaluation.results import Result, Row, summarize, write_leaderboard
+from ballbot_train.evaluation.results import UNMEASURED, Result, Row, summarize, write_leaderboard
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.provenance import provenance
@@ -132,11 +132,8 @@ def evaluate(
         results = list(iterate_episodes(env, controller, *named, indices, 0, known, keep))
         row = summarize(results)
         if out is not None:
-            facts = provenance() | {
-                "physics": env.physics,
-                "randomization": repr(env.randomization),
-                "robot": repr(env.params),
-            }
+            ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
+            facts = provenance() | ran
             write_leaderboard([row], results, facts, Path(out))
             if indices == list(range(len(indices))) and not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
@@ -158,15 +155,13 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
         ValueError: none, more than there are, or one of them twice.
         TypeError: they are no whole numbers.
     """
-    if isinstance(episodes, bool | str):
+    if isinstance(episodes, bool | str) or not isinstance(episodes, numbers.Integral | Iterable):
         raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
     if isinstance(episodes, numbers.Integral):
         count = int(episodes)
         if not 1 <= count <= available:
             raise ValueError(f"episodes must be 1 to {available}, or a list of indices, not {count}")
         return list(range(count))
-    if not isinstance(episodes, Iterable):
-        raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
     indices = list(itertools.islice(episodes, available + 1))  # it may be endless
     if len(indices) > available:
         raise ValueError(f"episodes names more than the {available} episodes that there are; give each once")
@@ -183,11 +178,9 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
 
 
 def _name(policy: Any) -> str:
-    return (
-        Path(policy).name
-        if isinstance(policy, str | Path)
-        else getattr(policy, "__name__", type(policy).__name__.lower())
-    )
+    if isinstance(policy, str | Path):
+        return Path(policy).name
+    return getattr(policy, "__name__", type(policy).__name__.lower())
 
 
 def task_name(task: Task) -> str:
@@ -228,30 +221,17 @@ def iterate_episodes(
 ) -> Iterator[Result]:
     """As `run_episodes`, one by one, compared with the optima of any set; `keep` gets what was done in each."""
     for i in episodes:
-        optimum = float(episode_set.costs[i])
-        common: dict[str, Any] = {
-            "task": task,
-            "controller": name,
-            "episode": i,
-            "physics": env.physics,
-            "optimum": optimum,
-        }
         run = None
         try:
             run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=episode_set.options(i))
         except PlanError as error:
-            outcome: dict[str, Any] = {
-                "cost": env.task.survival_pay,
-                "success": False,
-                "failure": True,
-                "note": str(error),
-            }
-            measures: dict[str, Any] = dict.fromkeys(
-                ("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), math.nan
-            )
+            measures: dict[str, Any] = UNMEASURED | {"cost": env.task.survival_pay, "note": str(error)}
+            measures |= {"success": False, "failure": True}
         else:
-            outcome = {"cost": run.cost, "success": run.success, "failure": run.failure}
             measures = {
+                "cost": run.cost,
+                "success": run.success,
+                "failure": run.failure,
                 "peak_tilt": math.degrees(run.peak_tilt),
                 "settle_time": run.settle_time,
                 "duration": run.trajectory.duration,
@@ -261,4 +241,4 @@ def iterate_episodes(
             }
         if keep is not None:
             keep(recordings.rounded(None if run is None else run.trajectory, env.params))
-        yield Result(**common, **outcome, **measures)
+        yield Result(task, name, i, env.physics, optimum=float(episode_set.costs[i]), **measures)

@@ -137,11 +137,7 @@ class RelativeRollouts(RolloutBuffer):
     """A rollout buffer of advantages relative to the cost to go."""
 
     def __init__(
-        self,
-        *args: Any,
-        living: Callable[[float], float],
-        potential: Callable[[], np.ndarray],
-        **kwargs: Any,
+        self, *args: Any, living: Callable[[float], float], potential: Callable[[], np.ndarray], **kwargs: Any
     ):
         """Makes an empty one.
 

@@ -299,12 +299,7 @@ class Shac:
         return schedules.cosine(rate, _FINAL_LEARNING_RATE_FRACTION, progress)
 
     def _one_step(
-        self,
-        state: BatchState,
-        start: torch.Tensor,
-        alive: torch.Tensor,
-        discount: torch.Tensor,
-        loss: torch.Tensor,
+        self, state: BatchState, start: torch.Tensor, alive: torch.Tensor, discount: torch.Tensor, loss: torch.Tensor
     ) -> tuple[Any, ...]:
         """One control step of every env; compiled."""
         config, task = self.config, self.task
