@@ -5,13 +5,10 @@ the learners' settings. Notebooks are pages with their outputs. The playground's
 the report's tables sorts the site's too.
 """
 
-import ast
 import importlib
-import inspect
 import itertools
 import json
 import re
-import textwrap
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from typing import Any
 from mkdocs.structure.files import File
 
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import meanings_of
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.report.playground import write_playground
 
@@ -82,7 +80,7 @@ def settings_tables() -> str:
         if warm and columns == {task: algorithm.settings(task) for task in TASKS}:
             continue
         rows = [f"| setting | meaning | {' | '.join(columns)} |", f"|---|---|{'---|' * len(columns)}"]
-        meanings = _meanings(getattr(importlib.import_module(algorithm.module), algorithm.config))
+        meanings = meanings_of(getattr(importlib.import_module(algorithm.module), algorithm.config))
         for field in fields(columns["turn"]):
             values = " | ".join(_shown(getattr(settings, field.name)) for settings in columns.values())
             name = field.name.replace("_", "\\_<wbr>")  # a narrow column breaks it there
@@ -90,17 +88,6 @@ def settings_tables() -> str:
         title = f"`{learner}`, from demonstrations or a policy" if warm else f"`{learner}`"
         parts.append(f"## {title}\n\n" + "\n".join(rows))
     return "\n\n".join(parts)
-
-
-def _meanings(config: type) -> dict[str, str]:
-    """What the docstrings under the fields of a dataclass and its bases say, by field."""
-    found: dict[str, str] = {}
-    for kind in reversed(config.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
-        for field, after in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                found[field.target.id] = " ".join(ast.literal_eval(after.value).split())
-    return found
 
 
 def _shown(value: Any) -> str:
