@@ -9,7 +9,7 @@ pytest.importorskip("casadi")
 pytest.importorskip("torch")
 
 from ballbot_gym import certified
-from ballbot_gym.env import make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import TRACKS
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
@@ -65,6 +65,21 @@ def test_policy_of_a_track_is_what_its_file_says(name, learner, track):
     row = evaluate(learner, name, 10, "rk4", randomization=track)
     assert row.success >= described["measured"]["success"] - 0.3
     assert sum(part.numel() for part in load_network(path, make_task(name)).parameters()) <= 50_000
+
+
+def test_model_of_another_library_is_shown_the_past_that_it_was_trained_with():
+    class Model:
+        observation_space = BallbotEnv(physics="rk4", history=2).observation_space
+
+        def predict(self, observation, **_):
+            seen.append(observation)
+            return np.zeros(2), None
+
+    seen = []
+    evaluate(Model(), "stabilize", 1, "rk4", randomization="late")
+    assert seen[2].shape == Model.observation_space.shape
+    np.testing.assert_array_equal(seen[2][8:16], seen[1][:8])
+    np.testing.assert_array_equal(seen[2][18:26], seen[0][:8])
 
 
 def test_fresh_episodes_of_a_track_draw_robots_and_say_what_each_costs():

@@ -81,7 +81,8 @@ def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> No
     Raises:
         PolicyError: they differ; the message says what to evaluate instead.
     """
-    own = {"observation": observation_space(task, params), "action": spaces.Box(-1.0, 1.0, (2,), np.float32)}
+    seen = observation_space(task, params, history_of(model, task))
+    own = {"observation": seen, "action": spaces.Box(-1.0, 1.0, (2,), np.float32)}
     for kind, wanted in own.items():
         found = getattr(model, f"{kind}_space", None)
         if found is not None and not _alike(found, wanted):
@@ -91,6 +92,13 @@ def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> No
                 "RescaleAction to ±350: lambda observation: model.predict(observation, deterministic=True)[0] / 350. Give a "
                 "function too, or train anew, where the training had another robot, duration or arena"
             )
+
+
+def history_of(model: Any, task: Task) -> int:
+    """How many earlier observations and actions a model saw in training, by the size of its observations; else 0."""
+    shape, own = getattr(getattr(model, "observation_space", None), "shape", None), len(task.observation_scale)
+    more = shape[0] - own if shape and len(shape) == 1 else 0
+    return more // (own + 2) if more > 0 and more % (own + 2) == 0 else 0
 
 
 def _alike(found: Any, wanted: spaces.Box) -> bool:

@@ -47,7 +47,8 @@ def as_controller(policy: Any, task: Task, params: BallbotParams) -> Controller:
     if callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None)):
         return policy
     if callable(getattr(policy, "predict", None)):
-        return ActionController(task, params, Predictor(policy, task, params))
+        predictor = Predictor(policy, task, params)
+        return ActionController(task, params, predictor, predictor.history)
     if callable(policy):
         function = cast(Callable[[np.ndarray], np.ndarray], policy)
         return ActionController(task, params, lambda observation, begins: function(observation))
@@ -63,10 +64,11 @@ class Predictor:
     """
 
     def __init__(self, model: Any, task: Task, params: BallbotParams):
-        self._model, self._state = model, None
+        self._model, self._state, self.history = model, None, 0
         if hasattr(model, "observation_space"):
-            from ballbot_train.saved_models import check_spaces  # it imports torch
+            from ballbot_train.saved_models import check_spaces, history_of  # it imports torch
 
+            self.history = history_of(model, task)
             check_spaces(type(model).__name__, model, task, params)
         normalization = getattr(model, "get_vec_normalize_env", lambda: None)()
         # only on-policy algorithms leave this empty where there was no VecNormalize
