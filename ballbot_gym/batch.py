@@ -74,8 +74,8 @@ class BatchState(NamedTuple):
     actuator: torch.Tensor
     """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
     past: torch.Tensor
-    """(history (no + 2), B) the last observations, each with the action that followed, the latest first; 0 before the
-    episode began."""
+    """(history (no + 2), B) the last observations, each with the action that followed, the latest first; before the
+    episode began the first one, with no force."""
 
 
 class _Rows(NamedTuple):
@@ -479,8 +479,8 @@ class BallbotBatch:
         drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
         actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
-        past = (still,) * (self.history * (len(task.observation_scale) + 2))
-        return _Rows(state, constants, zero, episode, seed, drawn, actuator, past)
+        begun = _Rows(state, constants, zero, episode, seed, drawn, actuator, ())
+        return begun._replace(past=self.history * (*self._seen(begun), still, still)) if self.history else begun
 
     def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
         """Force (2) that the actuator applies, and its new memory."""

@@ -152,7 +152,7 @@ class BallbotEnv(gymnasium.Env):
                 which takes 2 ms and 5 kB of memory that PyBullet never frees.
             robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
             history: so many earlier observations follow the present one in each observation, the latest first, each with the
-                action (2) that was taken on it; all 0 before the episode began.
+                action (2) that was taken on it. Before the episode began they are the first one, with the action 0.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -231,8 +231,6 @@ class BallbotEnv(gymnasium.Env):
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
         self._steps_left, self._taken = self._steps, 0
-        if self._past is not None:
-            self._past[:] = 0
         if self._human:
             self.render()
         return self._shown(judge, tilt)
@@ -292,6 +290,12 @@ class BallbotEnv(gymnasium.Env):
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = spec_of(spec, self.task, self.params, self.randomization)
+
+    def _forget(self) -> None:
+        """Makes the past what it is when an episode begins."""
+        past, own = self._past, len(self.task.observation_scale)
+        assert past is not None
+        past[own:] = np.tile(np.append(past[:own], (0.0, 0.0)), self.history)
 
     def _note(self, action: Any) -> None:
         """Moves what was observed, and the action on it, into the past."""
@@ -534,6 +538,8 @@ class BallbotEnv(gymnasium.Env):
         seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
         if self._past is not None:
             self._past[: len(seen)] = seen
+            if not self._taken:
+                self._forget()
             seen = self._past.copy()
         failure = violated >= 0
         info = {

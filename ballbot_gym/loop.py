@@ -227,6 +227,8 @@ class _Single(BallbotEnv):
         if self._past is not None:
             self._past[len(self.task.observation_scale) :] = past
             self._past[: len(self.task.observation_scale)] = self._observed()
+            if not taken:
+                self._forget()
 
     def observed(self) -> Any:
         """The present observation, with those of the past behind it."""

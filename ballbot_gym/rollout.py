@@ -86,11 +86,12 @@ class ActionController:
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
-        self._past = np.zeros(self._history * (len(self._task.observation_scale) + 2), np.float32)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         seen = self._task.observe(tuple(np.asarray(x).tolist()), self._task.at(self._c, t))
         own = np.array(seen, np.float32)
+        if self._begins:
+            self._past = np.tile(np.append(own, np.zeros(2, np.float32)), self._history)
         observation = np.concatenate([own, self._past]) if self._history else own
         action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False

@@ -342,13 +342,14 @@ def test_history_shows_the_last_observations_with_their_actions_in_every_kind_of
     (_, infos), _ = many.reset(seed=0), looped.reset(seed=0)
     options = {"state": infos["state"][0], "constants": infos["constants"][0]}
     observed, actions = [plain.reset(options=options)[0]], []
-    assert (env.reset(options=options)[0] == [*observed[0], *np.zeros(2 * (own + 2))]).all()
+    first = np.append(observed[0], np.zeros(2, np.float32))
+    np.testing.assert_array_equal(env.reset(options=options)[0], [*observed[0], *first, *first])
     for action in np.random.default_rng(0).uniform(-0.1, 0.1, (5, 2)).astype(np.float32):
         observed.append(plain.step(action)[0])
         actions.append(action)
         before = [*zip(observed[:-1], actions, strict=True)][::-1][:2]
         wanted = np.concatenate([observed[-1], *(part for pair in before for part in pair)])
-        wanted = np.pad(wanted, (0, own + 2 * (own + 2) - len(wanted)))
+        wanted = np.append(wanted, np.tile(first, 2 - len(before)))
         kept = env.get_state()
         np.testing.assert_array_equal(env.step(action)[0], wanted)
         env.set_state(kept)
@@ -363,9 +364,11 @@ def test_history_of_an_ended_episode_is_forgotten(make_env):
     many = BallbotVectorEnv(2, engine="torch", compile=False, history=1, duration=0.04)
     env.reset(seed=0)
     env.step(np.ones(2))
-    assert not env.reset()[0][own:].any()
+    seen = env.reset()[0]
+    np.testing.assert_array_equal(seen[own:], [*seen[:own], 0, 0])
     many.reset(seed=0)
     many.step(np.ones((2, 2), np.float32))
     seen, *_, infos = many.step(np.ones((2, 2), np.float32))
-    assert not seen[:, own:].any()
+    np.testing.assert_array_equal(seen[:, own : 2 * own], seen[:, :own])
+    assert not seen[:, 2 * own :].any()
     assert infos["final_obs"][0][own:].all()

@@ -80,6 +80,7 @@ def test_model_of_another_library_is_shown_the_past_that_it_was_trained_with():
     assert seen[2].shape == Model.observation_space.shape
     np.testing.assert_array_equal(seen[2][8:16], seen[1][:8])
     np.testing.assert_array_equal(seen[2][18:26], seen[0][:8])
+    np.testing.assert_array_equal(seen[0][8:16], seen[0][:8])
 
 
 def test_fresh_episodes_of_a_track_draw_robots_and_say_what_each_costs():
