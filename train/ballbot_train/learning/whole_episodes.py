@@ -38,6 +38,7 @@ _AVERAGED_ITERATIONS = 20  # over which the policy is a running average
 _GOAL_PENALTY, _GOAL_CLEARANCE = 30.0, 0.1
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training. It has no gradient
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
+_RESTING = 25  # last control steps that lack the goal, where noise keeps the robot from resting in it
 _PATIENCE = 5  # control steps for which episodes go on when all have reached the goal
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
 
@@ -148,9 +149,11 @@ class WholeEpisodes:
         total = torch.zeros(config.num_envs)
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
         ends, patience, ahead = [], _PATIENCE, int(self._batch.randomization.is_noisy)  # noise changes with the steps
-        for _ in range(task.steps):
+        for k in range(task.steps):
             step = self._step(state)
             total = total + torch.where(alive, step.cost, 0.0)
+            if ahead and not task.first_exit and k >= task.steps - _RESTING:
+                total = total + torch.where(alive, _GOAL_PENALTY / _RESTING * step.lacking, 0.0)
             alive = alive & ~(step.failed & ~reached)
             if task.first_exit:
                 ends.append(torch.where(alive, total + _GOAL_PENALTY * step.lacking, math.inf))
