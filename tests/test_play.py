@@ -548,3 +548,16 @@ def test_a_job_that_raises_gives_its_error():
     background = Background()
     assert isinstance(background.submit(lambda: 1 / 0).exception(5), ZeroDivisionError)
     background.close()
+
+
+def test_every_episode_of_a_track_has_a_robot_of_its_own(play):
+    playground = play("turn", episode=0, randomization="unknown")
+    masses = []
+    for episode in range(3):
+        playground.start_certified(episode)
+        masses.append(playground.main.true.body_mass / playground.world.params.body_mass)
+    assert len(set(masses)) == 3
+    assert 0.7 <= min(masses) < max(masses) <= 1.4
+    playground.set_plant("mass", 10.0)  # a slider takes its place
+    playground.start_certified(3)
+    assert playground.main.true.body_mass == pytest.approx(1.1 * playground.world.params.body_mass)

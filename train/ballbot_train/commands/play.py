@@ -26,6 +26,7 @@ def play(
     host: str = HOST,
     port: int = PORT,
     out: Path = Path("runs/play"),
+    randomization: str | None = None,
 ) -> None:
     """Opens a page on which you push the robot, change it, drive it, and compare controllers.
 
@@ -43,13 +44,14 @@ def play(
         host: address to bind. Everybody but this machine needs the token that is printed.
         port: where the page is; the next free one, if it is taken.
         out: folder of saved files.
+        randomization: name of a track, as "unknown": every episode has a robot of it, which the controllers are not told.
     """
     task = task_name(controller or "", task, robot)
     import_viser()
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"
     start = None if episode == "random" else episode
-    playground = Playground(task, controller, ghosts, physics, start, seed, robot, policies, other_process=True)
+    playground = Playground(task, controller, ghosts, physics, start, seed, robot, policies, True, randomization)
     viewer = Viewer(host, port, "ballbot play")
     page = PlayPage(playground, viewer, out)
     signal.signal(signal.SIGTERM, lambda *_: page.stop())

@@ -12,13 +12,13 @@ import numpy as np
 
 from ballbot_gym.engines import default_physics
 from ballbot_gym.params import default_params
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.crew import Crew
 from ballbot_train.play.driving import DRIVERS, Stick
 from ballbot_train.play.runner import Runner, failure_word
-from ballbot_train.play.world import PLANT, World, randomization, severity
+from ballbot_train.play.world import PLANT, World, drawn_robot, randomization, severity
 from ballbot_train.report import labels
 
 AtEnd = Literal["go on", "again", "next", "stop"]
@@ -81,6 +81,7 @@ class Playground:
         robot: str = PAPER,
         policies: Sequence[str] = (),
         other_process: bool = False,
+        randomization: str | None = None,
     ):
         """Begins an episode.
 
@@ -96,9 +97,10 @@ class Playground:
             policies: paths of more policies that can be chosen in the tasks that they are made for.
             other_process: whether another process plans, so that planning takes no time from a simulation in real time. A
                 script that asks for it needs the guard `if __name__ == "__main__":`.
+            randomization: name of a track: every episode has a robot of it, which the controllers are not told.
 
         Raises:
-            ValueError: an unknown task, robot, controller or episode.
+            ValueError: an unknown task, robot, controller, episode or track.
             PolicyError: one of `policies` is missing or damaged.
         """
         world = World(task, robot, policies)
@@ -111,6 +113,7 @@ class Playground:
         self.plant = dict.fromkeys(PLANT, 0.0)
         """Severity of each hidden change."""
         self._rng = np.random.default_rng(seed)
+        self._track = checked_randomization(randomization)
         self._randomization = Randomization()
         self.crew = Crew(default_physics() if physics is None else physics, self.stick, other_process)
         self._open(world, controller, ghosts, episode)
@@ -294,6 +297,9 @@ class Playground:
         self.start, self.episode, self._at_rest = start, episode, at_rest
         self.elapsed = self._pause_left = self._push_until = 0
         self._pending_push = self._push = np.zeros(2)
+        if self._track.active and not any(self.plant.values()):  # a slider takes the track's place
+            self._randomization = drawn_robot(self._track, self._rng, self.world.task.control_dt)
+            self.crew.set_plant(self._randomization)
         self._first_push_at = -1 if not at_rest else round(_FIRST_PUSH_AFTER / self.world.task.control_dt)
         self.crew.begin(tuple(map(float, start[0])), self.world.constants(start[1]))
 
@@ -308,7 +314,7 @@ class Playground:
             return
         best = self.optimum_cost
         regret = main.cost / best - 1 if best > _LEAST_COST else math.nan
-        changed = any(self.plant.values())
+        changed = any(self.plant.values()) or self._track.active
         score = Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated, changed)
         self.scores = [*self.scores, score][-_EPISODES_KEPT:]
         if goes_on:

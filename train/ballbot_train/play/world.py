@@ -142,6 +142,15 @@ def severity(stress: str, value: float) -> float:
     return span.step * round(value / span.step)
 
 
+def drawn_robot(track: Randomization, rng: np.random.Generator, control_dt: float) -> Randomization:
+    """One robot of a track, as a randomization that varies nothing any more."""
+    low, high = track.delay_steps(control_dt)
+    late = control_dt * int(rng.integers(low, high + 1))
+    ranges = {f.name: getattr(track, f.name) for f in fields(track) if not isinstance(f.default, float)}
+    drawn = {name: (value, value) for name, ends in ranges.items() for value in [float(rng.uniform(*ends))]}
+    return replace(track, **drawn | {"actuator_delay": (late, late)})
+
+
 def randomization(severities: Mapping[str, float]) -> Randomization:
     """All hidden changes together: of each stress the fields that it changes."""
     changes = [STRESSES[stress].at(value) for stress, value in severities.items() if value]
