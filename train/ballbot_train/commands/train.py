@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ballbot_gym import certified
+from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import NONE, WorkersOption
@@ -34,6 +35,10 @@ class Run:
     """Dataset of `ballbot demos`, or the URL of shards."""
     start: Annotated[Path | None, NONE] = None
     """Policy file to train on from; ppo, sac, shac."""
+    randomization: Annotated[str | None, NONE] = None
+    """Track: unknown, late, noisy or real; ppo, shac."""
+    history: int = 0
+    """Earlier observations and actions that are seen."""
     seed: int = 0
     """Seed of all that is drawn."""
     seeds: Annotated[str | None, NONE] = None
@@ -74,6 +79,8 @@ def train(
     seeds: str | None = None,
     workers: int | Workers = 1,
     robot: RobotName = PAPER,
+    randomization: str | None = None,
+    history: int = 0,
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
@@ -93,6 +100,8 @@ def train(
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
         workers: how many runs of `seeds` go on at once, or `Workers`.
         robot: name of a robot.
+        randomization: name of the track on which the policy is trained and measured, for ppo and shac.
+        history: how many earlier observations and actions the policy sees, for ppo and shac.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
@@ -115,6 +124,8 @@ def train(
         robot,
         _text(demos),
         start,
+        randomization,
+        history,
         seed,
         threads=threads,
         out=out,
@@ -157,11 +168,15 @@ def train(
         "command": " && ".join([*reversed(inputs), command]),
         **({"inputs": inputs} if inputs else {}),
         **robot_setting(robot),
+        **({} if randomization is None else {"randomization": randomization}),
+        **({"history": history} if history else {}),
         **({} if validation_episodes == VALIDATION_EPISODES else {"validation_episodes": validation_episodes}),
     }
-    optima.known(problem, robot, workers=workers)  # by which it is scored while it learns
+    varied = checked_randomization(randomization)
+    optima.known(problem, robot, workers=workers, randomization=varied)  # by which it is scored while it learns
     begun = None if start is None else load_network(start, problem, robot=None)
-    made = algorithm.make(problem, named_robot(robot), settings, seed, demos, begun)
+    world = None if randomization is None else varied
+    made = algorithm.make(problem, named_robot(robot), settings, seed, demos, begun, world, history)
     physics = physics_or_default(None)
     row = training.train(made, problem, config, out, resume, test_episodes)
     console.print(
@@ -262,6 +277,7 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
     words = ["ballbot", "train", learner]
     defaults = {  # settings of which older records know nothing
         "robot": PAPER,
+        "history": 0,
         "threads": 1,
         "test_episodes": certified.EPISODES,
         "validation_episodes": VALIDATION_EPISODES,

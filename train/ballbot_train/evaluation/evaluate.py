@@ -93,7 +93,7 @@ def evaluate(
     episodes: int | Iterable[int] = certified.EPISODES,
     physics: str | None = None,
     name: str | None = None,
-    randomization: Randomization | None = None,
+    randomization: Randomization | str | None = None,
     robot: str | BallbotParams = PAPER,
     workers: int | Workers | None = None,
     out: str | Path | None = None,
@@ -109,21 +109,23 @@ def evaluate(
         episodes: how many of the certified episodes, from the first, or their indices, each once.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         name: of the row; default, the policy's own.
-        randomization: what disturbs it; default, nothing. The regret is over the optimum of the undisturbed robot.
+        randomization: what the policy is not told, or a name in `TRACKS`; default, nothing. The regret is over the optimum
+            of each episode's own robot and delay, which a policy could only reach that knows them.
         robot: a name in `ROBOTS`, or any BallbotParams.
         workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
             does: what it does must be under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
 
     Raises:
-        TypeError, ValueError: no such policy, task, physics or episodes.
+        TypeError, ValueError: no such policy, task, physics or episodes; or a randomization with an actuator that lags, under
+            which no optimum is known.
         PlanError: an episode has no optimum that can be found.
     """
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = episode_indices(episodes, certified.EPISODES)
         controller = as_controller(policy, env.task, env.params)
-        known = optima.known(env.task, env.params, indices, workers)
+        known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), task_name(env.task)
         motions: list[recordings.Motion] = []
         keep = None if out is None else motions.append
@@ -203,7 +205,7 @@ def run_episodes(
         PlanError: an episode has no optimum that can be found.
     """
     indices = list(episodes)
-    known = optima.known(env.task, env.params, indices)
+    known = optima.known(env.task, env.params, indices, randomization=env.randomization)
     return list(iterate_episodes(env, controller, name, task, indices, seed, known))
 
 
