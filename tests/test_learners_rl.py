@@ -415,8 +415,8 @@ def test_sac_sees_and_acts_in_the_frame_of_its_task_and_keeps_the_steady_motion(
     monkeypatch.setattr(model_free, "_AVERAGED_ITERATIONS", 1)
     settings = replace(TINY["sac"], symmetry=symmetry)
     learner = run(LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None))
-    assert learner.network.spec.frame == make_task(task).frame
-    assert learner.network.spec.centred == (symmetry == "centred")
+    expected = spec_for(make_task(task), symmetry, (16, 8))
+    assert (learner.network.spec.frame, learner.network.spec.centred) == (expected.frame, expected.centred)
     batch = learner._env.batch
     seen = learner._env._seen(batch.observe(batch.state).numpy())
     learner._env.step_async(learner._model.predict(seen, deterministic=True)[0])
