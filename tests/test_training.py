@@ -22,6 +22,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
+from ballbot_train.commands.options import meanings_of
 from ballbot_train.commands.train import Run, command_with, parse
 from ballbot_train.learning import training
 from ballbot_train.learning.demonstrations import DemoConfig
@@ -282,14 +283,24 @@ def test_a_command_with_all_settings_gives_them_again(learner, task):
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_help_lists_every_setting_with_the_defaults_of_the_task(learner, capsys):
+def test_help_lists_every_setting_with_the_defaults_of_the_task_and_what_newcomers_need_first(
+    learner, capsys, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
         parse([learner, "--task", "weave", "--help"], lambda *call: None)
     printed = capsys.readouterr().out
+    first, recipe = printed.split("recipe, tuned for --task:")
     for field in fields(LEARNERS[learner].settings("weave")):
-        if field.name != "backoff":
-            assert field.name.replace("_", "-") in printed
-    assert "256 256" in " ".join(printed.split()) or learner != "shac"
+        assert f"--{field.name.replace('_', '-')}" in (first if field.name == "iterations" else recipe)
+    assert "256 256" in printed or learner != "shac"
+    assert len(printed.splitlines()) <= 60
+
+
+def test_every_setting_says_what_it_is():
+    for algorithm in LEARNERS.values():
+        config = getattr(importlib.import_module(algorithm.module), algorithm.config)
+        assert {field.name for field in fields(config)} <= set(meanings_of(config))
 
 
 def test_help_of_train_imports_no_torch():

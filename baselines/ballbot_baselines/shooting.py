@@ -39,19 +39,20 @@ _checked: set[tuple[Task, bool, bool]] = set()
 class Backoff:
     """How far a plan stays from its limits, so that a controller that tracks it stays within them.
 
-    `margin` is in the unit of the task's margins (obstacles: m). `goal` is the fraction of the goal's tolerance that the plan
-    leaves unused. `force` is the fraction of the force limit that the plan leaves for feedback. `grip` is the fraction
-    of the robot's weight that it leaves of the normal force, and so of the friction, where friction is limited.
+    The defaults make up for the solvers' tolerance, so that optimal forces and states obey the limits exactly.
 
     Raises:
         ValueError: a field is negative or not finite, or a fraction is not below 1.
     """
 
-    # The defaults make up for the solvers' tolerance, so that optimal forces and states obey the limits exactly.
     margin: float = 1e-7
+    """From margins, in their unit."""
     goal: float = 1e-6
+    """Share of the goal's tolerance."""
     force: float = 1e-7
+    """Share of the force limit."""
     grip: float = 1e-5
+    """Share of the weight, of the normal force."""
 
     def __post_init__(self) -> None:
         for name, below in (("margin", math.inf), ("goal", 1.0), ("force", 1.0), ("grip", 1.0)):

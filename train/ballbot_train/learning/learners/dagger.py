@@ -72,7 +72,7 @@ class DaggerConfig:
     episodes_per_iteration: int = 6
     """Episodes planned per gathering iteration."""
     candidate_episodes: int = 64
-    """Drawn to choose from, half where it fails; 0: random."""
+    """To choose from, half where it fails; 0: random."""
     max_guesses: int = 5
     """Guesses tried for an optimum."""
     rollouts_per_plan: int = 2
@@ -80,13 +80,13 @@ class DaggerConfig:
     max_rollout_seconds: float = 2.0
     """Longest of these in the end, s."""
     start_noise: float = 0.0
-    """Disturbance of their starts, in units of the tube's."""
+    """Noise of their starts, in units of the tube's."""
     tube_samples: int = 1
     """States around an optimum that TVLQR labels."""
     tracked_rollouts_per_plan: int = 0
     """Rollouts along a plan that TVLQR labels."""
     max_distance: float = 2.0
-    """Farthest from it, in standard deviations of the tube."""
+    """Farthest from it, in deviations of the tube."""
     batch_episodes: int = 0
     """Optima found at once in place of one by one."""
     label_seconds: float = 4.0
