@@ -20,19 +20,19 @@ from ballbot_train.policy_files import read_description, shipped_policies, track
 
 
 def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):
-    options = {"tasks": ("orbit",), "controllers": ("trajopt", "lqr"), "episodes": 3, "physics": "rk4", "workers": 1}
+    options = {"tasks": ("orbit",), "controllers": ("trajopt", "lqr"), "episodes": 2, "physics": "rk4", "workers": 1}
     benchmark(**options, randomization=("unknown", "late"), out=tmp_path)
     table = csv.DictReader((tmp_path / "tracks.csv").read_text().splitlines())
     rows = {(row["track"], row["controller"]): row for row in table}
     assert len(rows) == 4
     for (track, controller), row in rows.items():
-        same = evaluate(controller, "orbit", 3, "rk4", randomization=track)
+        same = evaluate(controller, "orbit", 2, "rk4", randomization=track)
         assert float(row["regret_mean"]) == pytest.approx(same.regret_mean, nan_ok=True)
         if row["falls"] == "0" and rows[track, row["best"]]["falls"] == "0":
             parts = float(row["not_knowing_costs"]) + float(row["controller_loses"])
             assert parts == pytest.approx(same.regret_mean)
         known = certified.load("orbit", "paper", randomization=TRACKS[track])
-        delay = (1 - known.ideal[:3] / known.costs[:3]).mean()
+        delay = (1 - known.ideal[:2] / known.costs[:2]).mean()
         assert float(row["delay_costs"]) == pytest.approx(delay)
         assert (delay > 0) == (track == "late")
     best = rows["unknown", rows["unknown", "lqr"]["best"]]
@@ -68,10 +68,8 @@ def test_policy_of_a_track_is_what_its_file_says(name, learner, track):
 
 
 def test_fresh_episodes_of_a_track_draw_robots_and_say_what_each_costs():
-    result = evaluate_fresh("shac", "stabilize", 40, randomization="unknown")
-    again = evaluate_fresh("shac", "stabilize", 20, randomization="unknown")
-    np.testing.assert_array_equal(result.costs[:20], again.costs)
-    plain = evaluate_fresh("shac", "stabilize", 40)
+    result = evaluate_fresh("shac", "turn", 20, randomization="unknown")
+    plain = evaluate_fresh("shac", "turn", 20)
     np.testing.assert_array_equal(result.states, plain.states)
     assert (result.costs != plain.costs).all()
     assert set(result.measures) > {"body_mass", "com_height", "force"}
