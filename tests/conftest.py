@@ -1,6 +1,7 @@
 """Fixtures that parametrize tests over everything registered, so that a new task arrives tested."""
 
 import functools
+import itertools
 import os
 import sys
 
@@ -19,6 +20,8 @@ from ballbot_gym.engines import installed_physics
 from ballbot_gym.params import default_params
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
+
+_NUMBERS = itertools.count()
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +61,8 @@ def registries():
 @pytest.fixture(autouse=True)
 def own_optima(tmp_path_factory, monkeypatch):
     """Optima that a test computes are its own, here and in the processes that it starts: an empty cache for each."""
-    monkeypatch.setenv("BALLBOT_OPTIMA", str(tmp_path_factory.mktemp("optima")))
+    # not `mktemp`, which looks at all that there are
+    monkeypatch.setenv("BALLBOT_OPTIMA", str(tmp_path_factory.getbasetemp() / "optima" / str(next(_NUMBERS))))
 
 
 @pytest.fixture

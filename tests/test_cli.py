@@ -106,7 +106,7 @@ def test_the_commands_that_continue_are_those_that_do_much_work():
     ("arguments", "how"),
     [
         (("evaluate", "lqr", "--task", "turn", "--episodes", 2, "--workers", 1, "--out", "a folder"), "continues"),
-        (("paper", "--only", "stabilize-1"), "starts again"),
+        (("optimize", "stabilize", "--duration", 1), "starts again"),
     ],
 )
 def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, how, typed, monkeypatch):
@@ -254,6 +254,7 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     assert certified.path_of(make_task("turn")).read_bytes() == packaged
 
 
+@pytest.mark.slow  # of workers that die, test_jobs.py says what is quick to find out
 def test_certify_goes_on_when_a_worker_dies(tmp_path):
     options = ["--tasks", "turn", "--episodes", "4", "--workers", "1", "--out", "out"]
     environment = {key: value for key, value in os.environ.items() if key != "BALLBOT_IN_PROCESS"}

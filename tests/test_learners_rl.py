@@ -134,40 +134,27 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
     np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
 
 
-def test_the_discount_of_ppo_rises_and_takes_all_values_with_it():
-    learner = make("ppo", gamma=0.99, final_gamma=0.999)
-    policy, seen = learner._model.policy, observed(20)
-    with torch.no_grad():
-        before = policy.predict_values(seen)
-        learner._raise_gamma(0.999)
-        after = policy.predict_values(seen)
-    task, scale = make_task("stabilize"), SCALE
-    change = value_of_living(task, scale, 0.999) - value_of_living(task, scale, 0.99)
-    torch.testing.assert_close(after, before + change)
+@pytest.mark.parametrize("products", [False, True])
+def test_the_discount_rises_and_takes_all_values_with_it(name, products):
+    learner = make(name, gamma=0.99, final_gamma=0.999, **({"products": products} if name == "sac" else {}))
+    model, seen = learner._model, observed(20)
+
+    def values():
+        with torch.no_grad():
+            return model.critic(seen, torch.zeros(20, 2)) if name == "sac" else (model.policy.predict_values(seen),)
+
+    before = values()
+    learner._raise_gamma(0.999)
+    change = value_of_living(make_task("stabilize"), SCALE, 0.999) - value_of_living(
+        make_task("stabilize"), SCALE, 0.99
+    )
+    for ours, value in zip(values(), before, strict=True):
+        torch.testing.assert_close(ours, value + change)
     learner._raise_gamma(0.99)
     logged = [learner.iterate()["train/gamma"] for _ in range(3)]
     assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
-    assert learner._model.rollout_buffer.gamma == learner._env.batch.gamma == learner._model.gamma
-
-
-@pytest.mark.parametrize("products", [False, True])
-def test_the_discount_of_sac_rises_and_takes_all_values_with_it(products):
-    learner = make("sac", gamma=0.99, final_gamma=0.999, products=products)
-    seen, acted = observed(20), torch.zeros(20, 2)
-    with torch.no_grad():
-        before = learner._model.critic(seen, acted)
-        learner._raise_gamma(0.999)
-        after = learner._model.critic(seen, acted)
-        highest = learner._highest()
-        learner._raise_gamma(0.99)
-    task, scale = make_task("stabilize"), SCALE
-    change = value_of_living(task, scale, 0.999) - value_of_living(task, scale, 0.99)
-    for ours, value in zip(after, before, strict=True):
-        torch.testing.assert_close(ours, value + change)
-    assert highest == pytest.approx(value_of_living(task, scale, 0.999))
-    logged = [learner.iterate()["train/gamma"] for _ in range(3)]
-    assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
-    assert learner._replay.gamma == learner._env.batch.gamma == learner._model.gamma
+    buffer = learner._replay if name == "sac" else model.rollout_buffer
+    assert buffer.gamma == learner._env.batch.gamma == model.gamma
 
 
 def test_learning_rate_and_deviation_fall_as_they_are_set(name):
@@ -420,35 +407,22 @@ def test_sac_holds_forces_longer_from_scratch_and_living_pays_as_much(monkeypatc
     assert learner._value_of_living(0.9) == pytest.approx(paid / 0.1)
 
 
-def assert_envs_act_as_its_policy(learner):
-    """What SAC's envs do is what its policy says of what they show."""
+@pytest.mark.parametrize(
+    ("task", "symmetry"),
+    [("turn", "frame"), ("orbit", "frame"), ("stabilize", "centred"), ("orbit", "centred"), ("weave", "centred")],
+)
+def test_sac_sees_and_acts_in_the_frame_of_its_task_and_keeps_the_steady_motion(task, symmetry, monkeypatch):
+    monkeypatch.setattr(model_free, "_AVERAGED_ITERATIONS", 1)
+    settings = replace(TINY["sac"], symmetry=symmetry)
+    learner = run(LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None))
+    expected = spec_for(make_task(task), symmetry, (16, 8))
+    assert (learner.network.spec.frame, learner.network.spec.centred) == (expected.frame, expected.centred)
     batch = learner._env.batch
     seen = learner._env._seen(batch.observe(batch.state).numpy())
-    action, _ = learner._model.predict(seen, deterministic=True)
-    learner._env.step_async(action)
+    learner._env.step_async(learner._model.predict(seen, deterministic=True)[0])
     with torch.no_grad():
         expected = learner.network(batch.observe(batch.state))
     np.testing.assert_allclose(learner._env.venv._actions, expected, atol=1e-6)  # float32
-
-
-@pytest.mark.parametrize("task", ["turn", "orbit", "weave"])
-def test_sac_sees_and_acts_in_the_frame_of_its_task(task, monkeypatch):
-    monkeypatch.setattr(model_free, "_AVERAGED_ITERATIONS", 1)
-    settings = replace(TINY["sac"], symmetry=LEARNERS["sac"].settings(task).symmetry)
-    learner = LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None)
-    run(learner)
-    assert learner.network.spec.frame == make_task(task).frame
-    assert_envs_act_as_its_policy(learner)
-
-
-@pytest.mark.parametrize("task", ["stabilize", "orbit", "weave"])
-def test_sac_with_a_centred_actor_acts_as_its_policy_does_and_keeps_the_steady_motion(task, monkeypatch):
-    monkeypatch.setattr(model_free, "_AVERAGED_ITERATIONS", 1)
-    made = make_task(task)
-    learner = LEARNERS["sac"].make(made, default_params(), replace(TINY["sac"], symmetry="centred"), 0, None)
-    run(learner)
-    assert learner.network.spec.centred
-    assert_envs_act_as_its_policy(learner)
     if task == "stabilize":
         with torch.no_grad():
             assert learner.network(torch.zeros(8)).tolist() == [0.0, 0.0]

@@ -60,8 +60,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     [
         ("orbit", {"frame": "radial", "squash": "tanh_in_frame", "centred": True}),
         ("weave", {"frame": "routed_slalom", "routes": (8,)}),
-        ("stabilize", {"odd": True, "linear": False, "squash": "clip"}),
-        ("stabilize", {"mirrors": True, "activation": "silu"}),
+        ("stabilize", {"mirrors": True, "odd": True, "linear": False, "squash": "clip"}),
     ],
 )
 def test_frame_routes_mirrors_and_oddness_are_inside_the_graph(task, fields, tmp_path):

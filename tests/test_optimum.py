@@ -21,10 +21,8 @@ from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.weave import Weave, split_constants
 
-SEEDS = (3,)
 
-
-def episode(task, seed):
+def episode(task, seed=3):
     return task.sample(np.random.default_rng(seed), default_params())
 
 
@@ -33,17 +31,12 @@ def optimum_of():
     """The optimum of each episode is found once."""
     optima = {}
 
-    def find(task, seed):
-        if (task, seed) not in optima:
-            optima[task, seed] = find_optimum(task, default_params(), *episode(task, seed))
-        return optima[task, seed]
+    def find(task):
+        if task not in optima:
+            optima[task] = find_optimum(task, default_params(), *episode(task))
+        return optima[task]
 
     return find
-
-
-@pytest.fixture(params=SEEDS)
-def seed(request):
-    return request.param
 
 
 def bump(steps):
@@ -55,28 +48,17 @@ def bump(steps):
 # --- every task's optimum ---
 
 
-def test_each_state_of_a_plan_follows_from_the_one_before(task, seed, optimum_of, params):
-    trajectory = optimum_of(task, seed).trajectory
+def test_a_plan_is_an_episode_of_its_cost_that_obeys_the_limits_and_ends_at_the_goal(task, optimum_of, params):
+    optimum, (x0, c) = optimum_of(task), episode(task)
+    trajectory = optimum.trajectory
     after = dynamics.step(params, trajectory.x[:-1], trajectory.u, task.control_dt)
     np.testing.assert_allclose(after, trajectory.x[1:], atol=1e-6)
-    np.testing.assert_array_equal(trajectory.x[0], episode(task, seed)[0])
+    np.testing.assert_array_equal(trajectory.x[0], x0)
     np.testing.assert_allclose(np.diff(trajectory.t), task.control_dt, rtol=1e-9)
-
-
-def test_cost_of_a_plan_is_the_tasks(task, seed, optimum_of):
-    optimum, (_, c) = optimum_of(task, seed), episode(task, seed)
-    cost = task.cost(optimum.trajectory.x[:-1], optimum.trajectory.u, c).sum() * task.control_dt
+    cost = task.cost(trajectory.x[:-1], trajectory.u, c).sum() * task.control_dt
     assert optimum.cost == pytest.approx(cost, rel=1e-9)
-
-
-def test_plan_stays_within_forces_and_margins(task, seed, optimum_of, params):
-    trajectory, (_, c) = optimum_of(task, seed).trajectory, episode(task, seed)
     assert np.abs(trajectory.u).max() <= params.force_limit
     assert min(np.min(margin) for margin in task.margins(trajectory.x, c)) >= 0
-
-
-def test_plan_lasts_the_episode_or_reaches_the_goal_at_its_end(task, seed, optimum_of):
-    trajectory, (_, c) = optimum_of(task, seed).trajectory, episode(task, seed)
     reached = [task.is_goal(tuple(x), tuple(c)) for x in trajectory.x]
     assert reached[-1]
     if task.first_exit:
@@ -86,8 +68,8 @@ def test_plan_lasts_the_episode_or_reaches_the_goal_at_its_end(task, seed, optim
         assert len(trajectory.u) == task.steps
 
 
-def test_optimum_says_how_it_was_found(task, seed, optimum_of):
-    optimum = optimum_of(task, seed)
+def test_optimum_says_how_it_was_found(task, optimum_of):
+    optimum = optimum_of(task)
     assert optimum.status == "optimal"
     assert optimum.solver_status == "Solve_Succeeded"
     assert optimum.violation < FEASIBLE
@@ -95,25 +77,22 @@ def test_optimum_says_how_it_was_found(task, seed, optimum_of):
     assert optimum.iterations > 0
 
 
-def test_optimum_costs_no_more_than_lqr(task, seed, optimum_of, make_env, params):
-    x0, c = episode(task, seed)
+def test_optimum_costs_no_more_than_lqr_and_less_than_a_fall(task, optimum_of, make_env, params):
+    x0, c = episode(task)
     lqr = rollout(make_env(task, physics="rk4"), LqrController(task, params), options={"state": x0, "constants": c})
-    assert optimum_of(task, seed).cost <= lqr.cost * (1 + 1e-6)
+    assert optimum_of(task).cost <= lqr.cost * (1 + 1e-6)
+    assert optimum_of(task).cost < task.survival_pay
 
 
-def test_optimum_is_cheaper_than_a_fall(task, seed, optimum_of):
-    assert optimum_of(task, seed).cost < task.survival_pay
-
-
-def test_perturbed_guess_leads_back_to_the_same_optimum(task, seed, optimum_of, params):
-    optimum, (x0, c) = optimum_of(task, seed), episode(task, seed)
+def test_perturbed_guess_leads_back_to_the_same_optimum(task, optimum_of, params):
+    optimum, (x0, c) = optimum_of(task), episode(task)
     path = optimum.trajectory.x[:, :2] + bump(len(optimum.trajectory.u))
     again = find_optimum(task, params, x0, c, paths=[path])
     assert again.cost == pytest.approx(optimum.cost, rel=1e-4)
 
 
-def test_no_other_guess_finds_anything_better(task, seed, optimum_of, params):
-    optimum, (x0, c) = optimum_of(task, seed), episode(task, seed)
+def test_no_other_guess_finds_anything_better(task, optimum_of, params):
+    optimum, (x0, c) = optimum_of(task), episode(task)
     paths = [path + bump(len(path) - 1) for path in task.guess_paths(x0, c, params)[:3]]
     assert find_optimum(task, params, x0, c, paths=paths).cost >= optimum.cost * (1 - 1e-4)
 
@@ -122,7 +101,7 @@ def test_small_changes_of_the_forces_gain_nothing(optimum_of, params, rng):
     # first-order optimality, checked by simulation: 0.5 s only, because the plant is unstable
     task = Stabilize(duration=0.5)
     x0 = episode(task, 3)[0]
-    optimum = optimum_of(task, 3)
+    optimum = optimum_of(task)
     assert simulated_cost(task, params, x0, optimum.trajectory.u) == pytest.approx(optimum.cost, rel=1e-9)
     for _ in range(20):
         u = optimum.trajectory.u + rng.normal(size=optimum.trajectory.u.shape)

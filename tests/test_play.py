@@ -267,14 +267,6 @@ def test_a_stick_reaches_no_farther_than_one():
     assert stick.value == (0.0, 0.0)
 
 
-def test_another_task_keeps_the_controllers_that_it_has(play):
-    playground = play(controller="lqr", ghosts=["you"])
-    playground.set_task("orbit")
-    playground.settle()
-    assert playground.step()
-    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
-
-
 @pytest.mark.parametrize(("physics", "seed"), [("rk4", 0), ("bullet", 1)])
 def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
     if physics == "bullet":
@@ -290,13 +282,17 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
     assert (score.failure != "") == expected.failure
 
 
-def test_another_robot_keeps_the_controllers_that_it_has(play, interpreted):
+def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, interpreted):
     playground = play(controller="lqr", ghosts=["you", "shac"])
     playground.set_robot("kugle")
     playground.settle()
     assert playground.step()
     assert (playground.world.robot, playground.main.wanted, playground.crew.ghosts) == ("kugle", "lqr", ("you",))
     assert playground.world.params.total_mass == pytest.approx(1.478 + 16.154)
+    playground.set_task("orbit")
+    playground.settle()
+    assert playground.step()
+    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
 
 
 # --- bad input ---

@@ -274,9 +274,8 @@ def test_every_function_of_every_task_is_what_python_computes(engine, tmp_path, 
     ("name", "fields"),
     [
         ("orbit", {"frame": "radial", "squash": "clip"}),
-        ("stabilize", {"odd": True, "linear": False}),
-        ("weave", {"activation": "silu", "mirrors": True}),
-        ("orbit", {"frame": "radial", "squash": "tanh_in_frame", "centred": True}),
+        ("stabilize", {"mirrors": True, "odd": True, "linear": False}),
+        ("orbit", {"frame": "radial", "squash": "tanh_in_frame", "centred": True, "activation": "silu"}),
         ("weave", {"frame": "routed_slalom", "routes": (8,)}),
     ],
 )

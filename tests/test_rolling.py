@@ -377,9 +377,8 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
     monkeypatch.setattr(certification, "find_optimum", found)
     entries = list(certification.entries("stabilize", range(2), "rolling", 5))
     assert [entry.get("draw") for entry in entries] == [None, 2]
-    made = certification.evaluation_set(task, rolling, entries)
-    np.testing.assert_array_equal(made.states[1], certification.episode(task, rolling, 1, 2)[0])
-    np.testing.assert_array_equal(certification.arrays(entries, task, rolling)["states"], made.states)
+    states = certification.arrays(entries, task, rolling)["states"]
+    np.testing.assert_array_equal(states[1], certification.episode(task, rolling, 1, 2)[0])
     refused.append(certification.episode(Stabilize(), default_params(), 0)[0])
     assert "error" in next(certification.entries("stabilize", [0], "paper", 5))
 

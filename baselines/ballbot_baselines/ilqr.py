@@ -15,7 +15,7 @@ Where a task ends at rest, LQR's cost-to-go can stand for the end of an episode.
 import ctypes
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,27 +41,12 @@ _LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
 _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
 
 
-_READ = (
-    "width",
-    "least_width",
-    "shrink",
-    "factor",
-    "tolerance",
-    "violation",
-    "iterations",
-    "bends",
-    "multiplier",
-)  # by ilqr.c
-
-
 @dataclass(frozen=True)
 class Options:
-    """Of the solver. Widths are in the unit of the constraints."""
+    """Of the solver, in the order in which ilqr.c reads them. Widths are in the unit of the constraints."""
 
     width: float = 0.2
     """Of the constraints' prices, at first."""
-    multiplier: float = 0.1
-    """Of every constraint, at first."""
     least_width: float = 2e-4
     """Where it ends."""
     shrink: float = 0.5
@@ -76,6 +61,8 @@ class Options:
     """After which it gives up."""
     bends: float = 3
     """Newton steps on the dynamics, for guesses that are no motions; 0 for those that are."""
+    multiplier: float = 0.1
+    """Of every constraint, at first."""
 
 
 @dataclass(frozen=True)
@@ -171,19 +158,8 @@ class Ilqr:
         costs, missed = np.zeros(jobs), np.zeros(jobs)
         status, iterations = np.zeros(jobs, np.int64), np.zeros(jobs, np.int64)
         each = (np.ascontiguousarray(np.broadcast_to(steps, jobs), np.int64), *self._given(jobs, lengths, given))
-        arrays = (
-            np.array([getattr(options, name) for name in _READ]),
-            *each,
-            x,
-            a,
-            gains,
-            slopes,
-            costs,
-            missed,
-            status,
-            iterations,
-        )
-        self._solve(jobs, n, *(array.ctypes.data for array in arrays))
+        after = x, a, gains, slopes, costs, missed, status, iterations
+        self._solve(jobs, n, *(array.ctypes.data for array in (np.array(astuple(options)), *each, *after)))
         return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, iterations)
 
     def follow(
@@ -257,11 +233,8 @@ class _Stage:
     """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
 
     def __init__(self, task: Task, params: BallbotParams, free_time: bool):
-        self._ocp, self._params, self._substeps = (
-            shooting_ocp(task, params),
-            params,
-            dynamics.substeps_for(task.control_dt),
-        )
+        self._ocp, self._params = shooting_ocp(task, params), params
+        self._substeps = dynamics.substeps_for(task.control_dt)
         self._free, self.ns = free_time, 9 if free_time else 8
         self.rest = None if free_time else rest(task, params)
         symbol = casadi.SX.sym
@@ -311,11 +284,8 @@ class _Stage:
         """
         x, a, ns = self._x, self._a, self.ns
         z, squares = casadi.vertcat(x, a), len(self._upper)
-        ahead, damping, open_ = (
-            casadi.SX.sym("ahead", squares + ns + 1),
-            casadi.SX.sym("damping"),
-            casadi.SX.sym("open"),
-        )
+        ahead = casadi.SX.sym("ahead", squares + ns + 1)
+        damping, open_ = casadi.SX.sym("damping"), casadi.SX.sym("open")
         reached, cost, limits = self._after(x, a, _SUBSTEPS), self._rate(a), self._path(a)
         linear, of_limits = casadi.jacobian(reached, z), casadi.jacobian(limits, z)
         push, stiffness = _price_slopes(limits, self._multipliers, self._width)
