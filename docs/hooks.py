@@ -1,17 +1,14 @@
 """What mkdocs does for the site besides its pages.
 
 `<!-- file: README.md -->` in a page stands for that file of the repository's root, and `<!-- settings -->` for the tables of
-the learners' settings. Notebooks are pages with their outputs. The playground's page is written anew. The script that sorts
-the report's tables sorts the site's too.
+the learners' settings. Pictures are loaded when they come into view. Notebooks are pages with their outputs. The playground's
+page is written anew. The script that sorts the report's tables sorts the site's too.
 """
 
-import ast
 import importlib
-import inspect
 import itertools
 import json
 import re
-import textwrap
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from typing import Any
 from mkdocs.structure.files import File
 
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import meanings_of
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.report.playground import write_playground
 
@@ -38,6 +36,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     markdown = markdown.replace("<!-- settings -->", settings_tables()) if "<!-- settings -->" in markdown else markdown
     markdown = _NOTEBOOK.sub(r"](\1.md)", markdown)
     return _FILE.sub(lambda match: _with_links_of_the_site((_ROOT / match[1]).read_text(encoding="utf-8")), markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Called by mkdocs with each page as HTML: pictures are loaded when they are scrolled to."""
+    return html.replace("<img ", '<img loading="lazy" ')
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:
@@ -82,7 +85,7 @@ def settings_tables() -> str:
         if warm and columns == {task: algorithm.settings(task) for task in TASKS}:
             continue
         rows = [f"| setting | meaning | {' | '.join(columns)} |", f"|---|---|{'---|' * len(columns)}"]
-        meanings = _meanings(getattr(importlib.import_module(algorithm.module), algorithm.config))
+        meanings = meanings_of(getattr(importlib.import_module(algorithm.module), algorithm.config))
         for field in fields(columns["turn"]):
             values = " | ".join(_shown(getattr(settings, field.name)) for settings in columns.values())
             name = field.name.replace("_", "\\_<wbr>")  # a narrow column breaks it there
@@ -90,17 +93,6 @@ def settings_tables() -> str:
         title = f"`{learner}`, from demonstrations or a policy" if warm else f"`{learner}`"
         parts.append(f"## {title}\n\n" + "\n".join(rows))
     return "\n\n".join(parts)
-
-
-def _meanings(config: type) -> dict[str, str]:
-    """What the docstrings under the fields of a dataclass and its bases say, by field."""
-    found: dict[str, str] = {}
-    for kind in reversed(config.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
-        for field, after in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                found[field.target.id] = " ".join(ast.literal_eval(after.value).split())
-    return found
 
 
 def _shown(value: Any) -> str:

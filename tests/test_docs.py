@@ -65,6 +65,7 @@ def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: MEASURED_AS)
     monkeypatch.setattr(model_free, "_CLONE_ITERATIONS", 1)
+    monkeypatch.setattr("ballbot_train.report.sections.playground_section", lambda *given: None)  # a second per report
     monkeypatch.setattr("ballbot_train.commands.benchmark.checked_episodes", lambda *given, few: 2)
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():
@@ -171,6 +172,21 @@ def test_the_leaderboard_s_page_is_made_from_its_rows():
 
     sys.path.remove(str(ROOT / "docs"))
     assert make_leaderboard.page() == make_leaderboard.PAGE.read_text()
+
+
+def test_the_films_are_of_the_submissions_that_the_leaderboard_has_and_small():
+    """Where this fails, `make gallery` makes them anew."""
+    sys.path.insert(0, str(ROOT / "docs"))
+    import make_gallery
+
+    sys.path.remove(str(ROOT / "docs"))
+    films = {make_gallery.make_leaderboard.film(row, episode): row for row, episode in make_gallery.films()}
+    made = json.loads(make_gallery.MADE.read_text())
+    for name, film in made.items():  # a row that is sent may come without films
+        assert film["submission"] == films[name].submission
+        assert (make_gallery.FILMS / name).stat().st_size <= 90e3
+    assert {path.name for path in make_gallery.FILMS.glob("*.webp")} == set(made)
+    assert make_gallery.page(made) == make_gallery.PAGE.read_text()
 
 
 def test_the_readme_s_results_are_rows_of_the_leaderboard():

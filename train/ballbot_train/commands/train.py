@@ -1,17 +1,21 @@
 """`ballbot train LEARNER`: trains a policy. Every setting of the learner is an option; see `ballbot train LEARNER --help`."""
 
 import argparse
+import itertools
 import math
 import shlex
+import shutil
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_args, get_type_hints
 
 from ballbot_gym import certified
+from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import NONE, WorkersOption
+from ballbot_train.commands.options import WorkersOption, meanings_of
 from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
@@ -20,6 +24,26 @@ from ballbot_train.policy_files import paths_of
 
 _MOST_THREADS = 1024
 _MOST_VALIDATION_EPISODES = 100_000
+
+_FIRST = ("task", "out", "seed", "iterations", "seeds", "workers", "ray", "resume")  # what newcomers need
+_LAST = (
+    "robot",
+    "threads",
+    "evaluations",
+    "validation_episodes",
+    "test_episodes",
+)  # all that is in neither is the recipe
+_OPTION_WIDTH = 28
+_WORDS = {
+    int: "N",
+    float: "X",
+    tuple[float, float]: "X X",
+    tuple[int, ...]: "N ...",
+    int | None: "N",
+    str | None: "TEXT",
+    Path | None: "PATH",
+}
+"""What stands for a value in the help, by its type."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +54,23 @@ class Run:
     """Name of a task."""
     robot: RobotName = PAPER
     """Name of a robot."""
-    demos: Annotated[str | None, NONE] = None
+    demos: str | None = None
     """Dataset of `ballbot demos`, or the URL of shards."""
-    start: Annotated[Path | None, NONE] = None
+    start: Path | None = None
     """Policy file to train on from; ppo, sac, shac."""
+    randomization: str | None = None
+    """Track: unknown, late, noisy or real; ppo, shac."""
+    history: int = 0
+    """Earlier observations and actions that are seen."""
     seed: int = 0
     """Seed of all that is drawn."""
-    seeds: Annotated[str | None, NONE] = None
+    seeds: str | None = None
     """Several, as 0:5 or 0,3,7: a queue of one-core runs."""
     workers: WorkersOption = Workers()
     """Who does the runs of --seeds."""
     threads: int = 1
     """Threads of torch."""
-    out: Annotated[Path | None, NONE] = None
+    out: Path | None = None
     """Folder; default runs/train/TASK-LEARNER."""
     test_episodes: int = certified.EPISODES
     """Certified episodes that measure the kept policy."""
@@ -50,6 +78,17 @@ class Run:
     """Fresh episodes that choose the policy to keep."""
     resume: bool = False
     """Continue the run in this folder."""
+
+    def check(self) -> None:
+        """Raises a ValueError that names the first number out of its range."""
+        for name, least, most in (
+            ("threads", 1, _MOST_THREADS),
+            ("seed", 0, 2**32 - 1),
+            ("test_episodes", 1, certified.EPISODES),
+            ("validation_episodes", 1, _MOST_VALIDATION_EPISODES),
+        ):
+            if not least <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must be {least} to {most}, not {getattr(self, name)}")
 
     @property
     def warm(self) -> bool:
@@ -74,6 +113,8 @@ def train(
     seeds: str | None = None,
     workers: int | Workers = 1,
     robot: RobotName = PAPER,
+    randomization: str | None = None,
+    history: int = 0,
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
@@ -93,90 +134,100 @@ def train(
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
         workers: how many runs of `seeds` go on at once, or `Workers`.
         robot: name of a robot.
+        randomization: name of the track on which the policy is trained and measured, for ppo and shac.
+        history: how many earlier observations and actions the policy sees, for ppo and shac.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
-    algorithm = LEARNERS[learner]
-    if not 1 <= threads <= _MOST_THREADS:
-        raise ValueError(f"threads must be 1 to {_MOST_THREADS}, not {threads}")
-    if not 0 <= seed < 2**32:
-        raise ValueError(f"seed must be 0 to {2**32 - 1}, not {seed}")
-    if not 1 <= test_episodes <= certified.EPISODES:
-        raise ValueError(f"test_episodes must be 1 to {certified.EPISODES}, not {test_episodes}")
-    if not 1 <= validation_episodes <= _MOST_VALIDATION_EPISODES:
-        raise ValueError(f"validation_episodes must be 1 to {_MOST_VALIDATION_EPISODES}, not {validation_episodes}")
-    algorithm.check(demos, start)
-    workers = Workers.of(workers)
-    if workers.ray is not None and seeds is None:
-        raise ValueError("--ray does the runs of --seeds; a single training runs here")
-    out = Path("runs") / "train" / f"{file_name(task, robot)}-{learner}" if out is None else out
+    LEARNERS[learner].check(demos, start)
     run = Run(
         task,
         robot,
         _text(demos),
         start,
+        randomization,
+        history,
         seed,
         threads=threads,
-        out=out,
+        out=Path("runs") / "train" / f"{file_name(task, robot)}-{learner}" if out is None else out,
         test_episodes=test_episodes,
         validation_episodes=validation_episodes,
+        resume=resume,
     )
+    run.check()
+    settings = LEARNERS[learner].settings(task, run.warm) if settings is None else settings
+    check_settings(settings)
+    workers = Workers.of(workers)
     if seeds is not None:
-        _train_seeds(learner, run, out, settings, seeds, workers)
-        return
+        _train_seeds(learner, run, settings, seeds, workers)
+    elif workers.ray is not None:
+        raise ValueError("--ray does the runs of --seeds; a single training runs here")
+    else:
+        _train_one(learner, run, settings, command or command_with(learner, run, settings), workers)
 
+
+def _train_one(learner: str, run: Run, settings: Any, command: str, workers: Workers) -> None:
+    """Trains on one seed, and prints what the policy reached."""
     import torch
 
     from ballbot_gym.engines import PHYSICS_NAMES
     from ballbot_gym.env import make_task
     from ballbot_train.evaluation import optima
     from ballbot_train.learning import training
-    from ballbot_train.learning.datasets import command_of
-    from ballbot_train.policy import load_network, read_description
+    from ballbot_train.policy import load_network
 
-    torch.set_num_threads(threads)
-    problem = make_task(task, robot)
-    settings = algorithm.settings(task, warm=run.warm) if settings is None else settings
-    check_settings(settings)
-    if command is None:
-        command = command_with(learner, run, settings)
-    # the record also says how the demonstrations, or the policy to start from, were made
-    inputs = [] if demos is None else [command_of(demos)]
-    if start is not None:
-        trained = read_description(start).get("training")
-        if not isinstance(trained, dict) or not isinstance(trained.get("command"), str):
-            raise ValueError(f"{start} does not say by which command it was trained; give a policy of ballbot train")
-        inputs.append(trained["command"])
-    config = {
-        "learner": learner,
-        "task": task,
-        "seed": seed,
-        "demos": None if demos is None else str(demos),
-        "settings": asdict(settings),
-        "start": None if start is None else str(start),
-        "command": " && ".join([*reversed(inputs), command]),
-        **({"inputs": inputs} if inputs else {}),
-        **robot_setting(robot),
-        **({} if validation_episodes == VALIDATION_EPISODES else {"validation_episodes": validation_episodes}),
-    }
-    optima.known(problem, robot, workers=workers)  # by which it is scored while it learns
-    begun = None if start is None else load_network(start, problem, robot=None)
-    made = algorithm.make(problem, named_robot(robot), settings, seed, demos, begun)
+    torch.set_num_threads(run.threads)
+    problem, out, varied = make_task(run.task, run.robot), cast(Path, run.out), checked_randomization(run.randomization)
+    config = _config(learner, run, settings, command)
+    # by which it is scored while it learns
+    optima.known(problem, run.robot, workers=workers, randomization=varied)
+    start = None if run.start is None else load_network(run.start, problem, robot=None)
+    world = None if run.randomization is None else varied
+    given = settings, run.seed, run.demos, start, world, run.history
+    made = LEARNERS[learner].make(problem, named_robot(run.robot), *given)
     physics = physics_or_default(None)
-    row = training.train(made, problem, config, out, resume, test_episodes)
+    row = training.train(made, problem, config, out, run.resume, run.test_episodes)
     console.print(
         f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
         f"{_share(row.regret_mean)} mean, {_share(row.regret_median)} median\npolicy: {out / 'policy.json'}"
     )
 
 
-def _train_seeds(learner: str, run: Run, out: Path, settings: Any, named: str, workers: Workers) -> None:
+def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, Any]:
+    """The record of a run; it also says how the demonstrations, or the policy to start from, were made."""
+    from ballbot_train.learning.datasets import command_of
+    from ballbot_train.policy import read_description
+
+    inputs = [] if run.demos is None else [command_of(run.demos)]
+    if run.start is not None:
+        trained = read_description(run.start).get("training")
+        if not isinstance(trained, dict) or not isinstance(trained.get("command"), str):
+            raise ValueError(
+                f"{run.start} does not say by which command it was trained; give a policy of ballbot train"
+            )
+        inputs.append(trained["command"])
+    more = run.validation_episodes
+    return {
+        "learner": learner,
+        "task": run.task,
+        "seed": run.seed,
+        "demos": run.demos,
+        "settings": asdict(settings),
+        "start": _text(run.start),
+        "command": " && ".join([*reversed(inputs), command]),
+        **({"inputs": inputs} if inputs else {}),
+        **robot_setting(run.robot),
+        **({} if run.randomization is None else {"randomization": run.randomization}),
+        **({"history": run.history} if run.history else {}),
+        **({} if more == VALIDATION_EPISODES else {"validation_episodes": more}),
+    }
+
+
+def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Workers) -> None:
     """Trains on several seeds, and prints what each reached."""
     from ballbot_train.learning import seeds as queue
 
-    seeds = queue.parse_seeds(named)
-    settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
-    check_settings(settings)
+    seeds, out = queue.parse_seeds(named), cast(Path, run.out)
 
     def command_of(seed: int) -> str:
         return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
@@ -246,6 +297,9 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     if named is not None:
         check_names("learner", [named], LEARNERS)
         check_names("task", [task], TASKS)
+        if {"-h", "--help"} & set(arguments):
+            _print_help(named, LEARNERS[named].settings(task, warm))
+            raise SystemExit(0)
         tyro.cli(_command(named, task, warm, call), prog=f"ballbot train {named}", args=list(arguments[1:]))
         return
     tyro.extras.subcommand_cli_from_dict(
@@ -257,11 +311,49 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     )
 
 
+def _print_help(learner: str, settings: Any) -> None:
+    """Prints the options in groups, with their defaults; tyro has no groups whose options keep their names."""
+    options = _options(Run()) | _options(settings)
+    groups = {
+        "first": [options[name] for name in _FIRST],
+        "recipe, tuned for --task": [text for name, text in options.items() if name not in (*_FIRST, *_LAST)],
+        "more": [options[name] for name in _LAST],
+    }
+    console.print(f"usage: ballbot train {learner} [OPTIONS]\n\nTrains by {LEARNERS[learner].description}.")
+    for title, texts in groups.items():
+        console.print(f"\n{title}:")
+        for option, meaning in texts:
+            lines = textwrap.wrap(meaning, max(shutil.get_terminal_size().columns, 60) - _OPTION_WIDTH)
+            if len(option) > _OPTION_WIDTH - 2:
+                lines = ["", *lines]
+            for head, line in itertools.zip_longest([option], lines, fillvalue=""):
+                console.print(f"{head:{_OPTION_WIDTH}}{line}".rstrip())
+
+
+def _options(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
+    """How to type each field of a dataclass, and what it means, by name."""
+    found: dict[str, tuple[str, str]] = {}
+    meanings, types = meanings_of(type(values)), get_type_hints(type(values))
+    for name, value in _shallow(values).items():
+        typed, word = (prefix + name).replace("_", "-"), _WORDS.get(types[name], "NAME")
+        default = " ".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
+        meaning = meanings[name] if value is None or value is False else f"{meanings[name]} [{default}]"
+        if is_dataclass(value):
+            found |= _options(value, "" if name == "workers" else f"{name}.")
+        elif isinstance(value, bool):
+            found[name] = f"  --{typed}, --no-{typed}", meaning
+        else:
+            choices = ", ".join(map(str, get_args(types[name]))) if word == "NAME" else ""
+            found[prefix + name] = f"  --{typed} {word}", f"{meaning} ({choices})" if choices else meaning
+    return found
+
+
 def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
     defaults = {  # settings of which older records know nothing
         "robot": PAPER,
+        "history": 0,
         "threads": 1,
         "test_episodes": certified.EPISODES,
         "validation_episodes": VALIDATION_EPISODES,

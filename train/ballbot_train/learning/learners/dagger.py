@@ -72,7 +72,7 @@ class DaggerConfig:
     episodes_per_iteration: int = 6
     """Episodes planned per gathering iteration."""
     candidate_episodes: int = 64
-    """Drawn to choose from, half where it fails; 0: random."""
+    """To choose from, half where it fails; 0: random."""
     max_guesses: int = 5
     """Guesses tried for an optimum."""
     rollouts_per_plan: int = 2
@@ -80,13 +80,13 @@ class DaggerConfig:
     max_rollout_seconds: float = 2.0
     """Longest of these in the end, s."""
     start_noise: float = 0.0
-    """Disturbance of their starts, in units of the tube's."""
+    """Noise of their starts, in units of the tube's."""
     tube_samples: int = 1
     """States around an optimum that TVLQR labels."""
     tracked_rollouts_per_plan: int = 0
     """Rollouts along a plan that TVLQR labels."""
     max_distance: float = 2.0
-    """Farthest from it, in standard deviations of the tube."""
+    """Farthest from it, in deviations of the tube."""
     batch_episodes: int = 0
     """Optima found at once in place of one by one."""
     label_seconds: float = 4.0
@@ -165,9 +165,7 @@ TUNED: dict[str, DaggerConfig] = {
 """Exceptions by name of task; every other task takes the defaults."""
 
 _BETA = 0.8  # share of rollouts that start on the plan and not at its beginning; falls to 0.2 of it
-_HARD_SHARE = (
-    0.25  # of the beginnings of optima found at once: those that cost the learner most among many that are drawn
-)
+_HARD_SHARE = 0.25  # of the beginnings of optima found at once: those of many drawn that cost the learner most
 _BATCH_STATES = 32  # of each of these optima that become samples, each with `tube_samples` around it
 _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
@@ -357,12 +355,7 @@ class Dagger:
             sides = self.network.routes(torch.as_tensor(np.asarray(self._task.observe(x, c)), dtype=torch.float32))
         return [self._task.routed_path(x, c, tuple(map(int, sides.tolist())))]
 
-    def _track(
-        self,
-        plans: Sequence[_Plan],
-        gains: Sequence[np.ndarray],
-        rng: np.random.Generator,
-    ) -> None:
+    def _track(self, plans: Sequence[_Plan], gains: Sequence[np.ndarray], rng: np.random.Generator) -> None:
         """Rolls the learner out along plans; TVLQR at the nearest point of the plan labels each state."""
         config = self.config
         tracked = [episode for episode in plans for _ in range(config.tracked_rollouts_per_plan)]
