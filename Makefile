@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 # imports anew: one that trains takes 6 s to start in place of 2.5.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types pytest test-slow verify bench soak faults fuzz docs notebooks pictures certify clients pythons ray clean
+.PHONY: demo test types pytest test-slow verify bench soak faults fuzz docs notebooks pictures gallery certify clients pythons ray clean
 
 demo: $(VENV)/runs
 	$(BIN)/ballbot benchmark --episodes 10 --out runs/demo
@@ -61,6 +61,10 @@ notebooks: $(VENV)/installed
 # the pictures and films of the documentation that show other policies than the shipped ones, or were made by another command
 pictures: $(VENV)/installed
 	$(BIN)/python docs/make_pictures.py
+
+# the films of the leaderboard's rows, and the pages that show them
+gallery: $(VENV)/installed
+	$(BIN)/python docs/make_gallery.py
 
 # RLlib is tested where it is installed; it pins another Gymnasium, so that it cannot be here. RL Zoo wants an older dateutil,
 # and torchrl an older tensordict; without this minimum pip takes a torchrl from before Gymnasium 1.

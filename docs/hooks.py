@@ -1,8 +1,8 @@
 """What mkdocs does for the site besides its pages.
 
 `<!-- file: README.md -->` in a page stands for that file of the repository's root, and `<!-- settings -->` for the tables of
-the learners' settings. Notebooks are pages with their outputs. The playground's page is written anew. The script that sorts
-the report's tables sorts the site's too.
+the learners' settings. Pictures are loaded when they come into view. Notebooks are pages with their outputs. The playground's
+page is written anew. The script that sorts the report's tables sorts the site's too.
 """
 
 import importlib
@@ -36,6 +36,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     markdown = markdown.replace("<!-- settings -->", settings_tables()) if "<!-- settings -->" in markdown else markdown
     markdown = _NOTEBOOK.sub(r"](\1.md)", markdown)
     return _FILE.sub(lambda match: _with_links_of_the_site((_ROOT / match[1]).read_text(encoding="utf-8")), markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Called by mkdocs with each page as HTML: pictures are loaded when they are scrolled to."""
+    return html.replace("<img ", '<img loading="lazy" ')
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:

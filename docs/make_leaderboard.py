@@ -14,6 +14,7 @@ from ballbot_train.evaluation import comparison
 from ballbot_train.evaluation.submissions import Entry, read_entries
 
 PAGE = Path(__file__).parent / "leaderboard.md"
+FILMS = Path(__file__).parent / "pictures" / "films"
 _TABLES = re.compile(r"(<!-- tables -->\n).*(<!-- end of tables -->)", flags=re.DOTALL)
 _HEADER = ["controller", "regret, 95 %", "failed", "group", "best", "worst"]
 
@@ -25,7 +26,8 @@ def page() -> str:
         boards.setdefault((entry.task, entry.robot, entry.physics), []).append(entry)
     tasks = list(TASKS)
     order = sorted(boards, key=lambda board: (board[1] != PAPER, *board[1:], tasks.index(board[0])))
-    text = "\n".join(f"## {_title(*board)}\n\n{_table(boards[board])}" for board in order)
+    parts = (f"## {_title(*board)}\n\n{_table(boards[board])}{_films(boards[board])}" for board in order)
+    text = "\n".join(parts)
     return _TABLES.sub(lambda match: f"{match[1]}\n{text}\n{match[2]}", PAGE.read_text(encoding="utf-8"))
 
 
@@ -33,16 +35,20 @@ def _title(task: str, robot: str, physics: str) -> str:
     return task.capitalize() + (f", {robot}" if robot != PAPER else "") + f", in {PHYSICS_NAMES[physics]}"
 
 
-def _table(entries: Sequence[Entry]) -> str:
+def _ranked(entries: Sequence[Entry]) -> list[Entry]:
     """Fewer failures first, then less regret."""
-    ranked = sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
+    return sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
+
+
+def _table(entries: Sequence[Entry]) -> str:
+    ranked = _ranked(entries)
     lines = [
         [
             entry.name,
             regret(entry),
             f"{round(len(entry.costs) * (1 - entry.success))}",
             str(group),
-            *map(str, _extremes(entry)),
+            *map(str, extremes(entry)),
         ]
         for entry, group in zip(ranked, _groups(ranked), strict=True)
     ]
@@ -51,6 +57,29 @@ def _table(entries: Sequence[Entry]) -> str:
         if entry.link:
             table = table.replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |")
     return table
+
+
+def _films(entries: Sequence[Entry]) -> str:
+    """The films of best and worst episodes, folded."""
+    lines = []
+    for entry in _ranked(entries):
+        films = [
+            (film(entry, episode), which, episode)
+            for which, episode in zip(("best", "worst"), extremes(entry), strict=True)
+        ]
+        if all((FILMS / name).exists() for name, *_ in films):
+            shown = (f"![{which}, {episode}](pictures/films/{name})" for name, which, episode in films)
+            lines.append(f"| {entry.name} | {' | '.join(shown)} |\n")
+    if not lines:
+        return ""
+    head = "| controller | best episode | worst episode |\n| --- | --- | --- |\n"
+    summary = "<summary>Films of best and worst episodes</summary>"
+    return f'\n<details markdown="1">{summary}\n\n{head}{"".join(lines)}\n</details>\n'
+
+
+def film(entry: Entry, episode: int) -> str:
+    """Name of a film."""
+    return f"{Path(entry.file).stem}-{episode}.webp"
 
 
 def _groups(ranked: Sequence[Entry]) -> list[int]:
@@ -69,7 +98,7 @@ def _groups(ranked: Sequence[Entry]) -> list[int]:
     return groups
 
 
-def _extremes(entry: Entry) -> tuple[int, int]:
+def extremes(entry: Entry) -> tuple[int, int]:
     """The episodes that are nearest to and farthest from their optima, the price of failures included."""
     ratios = [result.cost / result.optimum for result in entry.results()]
     return ratios.index(min(ratios)), ratios.index(max(ratios))

@@ -52,7 +52,10 @@ def page(tmp_path_factory):
     """A page with every kind of section."""
     folder = tmp_path_factory.mktemp("report")
     markers = (Marker((1.0, 0.5), 0.3, 0.25, (0.7, 0.1, 0.1, 1.0)), Marker((0, 0), 1.0, 0.03, (0.8, 0.1, 0.1, 1), True))
-    takes = (Take("LQR", leaning(1.0, 0.6), "#c0392b", "fails"), Take("NMPC", leaning(0.3, 1.0), "#e08a00"))
+    takes = (
+        Take("LQR", leaning(1.0, 0.6), "#c0392b", "fails", failed=True),
+        Take("NMPC", leaning(0.3, 1.0), "#e08a00"),
+    )
     replays = [Replay("first", takes, markers), Replay("second", takes[1:])]
     curve = figures.Curve("a", leaning(0.3, 1.0), "#1f6fb2")
     picture = figures.save(figures.trajectory_figure("a figure", [curve]), folder / "pictures" / "some-figure.png")
@@ -250,7 +253,12 @@ def test_the_table_filters_by_task(opened):
     assert len(column(opened, 0)) == 4
 
 
+def test_the_first_picture_is_the_greatest_lean_of_a_robot_that_does_not_fall(opened):
+    assert tilts(opened) == ["57°", "17°"]
+
+
 def test_scrubbing_moves_every_robot_and_the_cursors_of_its_traces(opened):
+    scrub(opened, 0)
     assert tilts(opened) == ["0°", "0°"]
     before = opened.execute_script(PICTURES)
     scrub(opened, 0.8)
@@ -262,6 +270,7 @@ def test_scrubbing_moves_every_robot_and_the_cursors_of_its_traces(opened):
 
 
 def test_playing_moves_until_the_end_and_pauses_where_it_is_told(opened):
+    scrub(opened, 0)  # from where the film takes four seconds, time enough to press
     opened.execute_script("document.querySelector('.speed').value = '0.25'")
     press(opened, "Play")
     wait_for(opened, "return parseFloat(document.querySelector('.clock').textContent) > 0.05")
@@ -290,7 +299,7 @@ def test_another_episode_has_its_own_scenes(opened):
     press(opened, "second")
     wait_for(opened, "return document.querySelectorAll('.view').length === 1")
     wait_for(opened, "return document.querySelector('.tilts').data.length === 1")
-    assert tilts(opened) == ["0°"]
+    assert tilts(opened) == ["17°"]
 
 
 def test_a_scene_shows_robot_floor_and_obstacles(opened):

@@ -222,7 +222,8 @@ def _panel(panel: Panel) -> Figure:
         )
     figure.update_layout(
         title={"text": plotly_text(panel.title), "font": {"size": 14}, "x": 0.02, "y": 0.97},
-        plot_bgcolor="white",
+        plot_bgcolor="rgba(0,0,0,0)",
+        paper_bgcolor="rgba(0,0,0,0)",
         margin={"l": 52, "r": 12, "t": 34, "b": 44},
         showlegend=False,
         height=300,
@@ -234,16 +235,26 @@ def _panel(panel: Panel) -> Figure:
 
 def _axis(label: str, log: bool) -> dict[str, object]:
     kind = {"type": "log", "dtick": 1} if log else {"type": "linear"}
-    return {"title": label, "gridcolor": "#eef0f3", "zerolinecolor": "#d5d9e0", "linecolor": "#c3cad6", **kind}
+    return {"title": label, "linecolor": "#8a93a3", **kind}
 
 
 def _replay_data(replay: Replay) -> dict[str, object]:
     return {
         "title": replay.title,
         "dt": _REPLAY_DT,
+        "poster": _poster(replay),
         "markers": [asdict(marker) for marker in replay.markers],
         "takes": [_take_data(take) for take in replay.takes],
     }
+
+
+def _poster(replay: Replay) -> float:
+    """The moment that a replay shows first: that of the greatest lean of a robot that does not fall, s."""
+    standing = [take.trajectory for take in replay.takes if not take.failed] or [
+        take.trajectory for take in replay.takes
+    ]
+    leaning = max(standing, key=lambda trajectory: trajectory.tilt.max())
+    return float(leaning.t[leaning.tilt.argmax()])
 
 
 def _take_data(take: Take) -> dict[str, object]:

@@ -107,7 +107,10 @@ def replay_of(
 
 def playground_section() -> Section:
     """The playground, which runs in the page."""
-    frame = Markup('<iframe class="playground" title="the playground" loading="lazy" srcdoc="{}"></iframe>')
+    fit = "this.style.height = this.contentDocument.documentElement.scrollHeight + 'px'"  # so that nothing of it is cut off
+    frame = Markup(
+        f'<iframe class="playground" title="the playground" loading="lazy" onload="{fit}" srcdoc="{{}}"></iframe>'
+    )
     lead = "A learned policy and LQR, computed in this page. Push them."
     return Section("Push them yourself", frame.format(playground_page()), lead)
 

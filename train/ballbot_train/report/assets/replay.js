@@ -24,6 +24,8 @@ class Replay {
     this.find = (name) => root.querySelector("." + name);
     this.addControls();
     window.addEventListener("resize", () => this.draw());
+    this.night = matchMedia("(prefers-color-scheme: dark)");
+    this.night.onchange = () => this.draw();
     this.choose(0);
   }
 
@@ -53,7 +55,7 @@ class Replay {
     this.find("scrub").max = this.end;
     this.find("stages").replaceChildren(...takes.map((take, n) => this.stage(take, n)));
     this.drawTraces();
-    await this.seek(0);
+    await this.seek(this.episode.poster);
     this.root.dataset.ready = "true";
   }
 
@@ -110,9 +112,9 @@ class Replay {
       });
       const layout = {
         title: { text: title, font: { size: 13 }, x: 0.02, y: 0.97 }, margin: { l: 42, r: 10, t: 28, b: 36 }, showlegend: false,
-        xaxis: { title: { text: "time, s", standoff: 4 }, range: [0, this.end], fixedrange: true, gridcolor: "#eef0f3" },
-        yaxis: { rangemode: "tozero", fixedrange: true, gridcolor: "#eef0f3" }, hovermode: "x unified",
-        shapes: [{ type: "line", x0: 0, x1: 0, yref: "paper", y0: 0, y1: 1, line: { color: "#1d2430", width: 1.5 } }],
+        xaxis: { title: { text: "time, s", standoff: 4 }, range: [0, this.end], fixedrange: true },
+        yaxis: { rangemode: "tozero", fixedrange: true }, hovermode: "x unified", paper_bgcolor: "#0000", plot_bgcolor: "#0000",
+        shapes: [{ type: "line", x0: 0, x1: 0, yref: "paper", y0: 0, y1: 1, line: { width: 1.5 } }],
       };
       return Plotly.react(this.find(name), lines, layout, { displayModeBar: false, responsive: true });
     };
@@ -137,6 +139,7 @@ class Replay {
       const now = sample(take, dt, this.time);
       stage.querySelector(".tilt").textContent = tiltOf(now.x[2], now.x[3]).toFixed(0) + "°";
       if (!scene) return;
+      scene.theme = THEMES[this.night.matches ? "dark" : "light"];
       const way = take.x.map((x, k) => [x, take.y[k]]);
       const [across, along] = [0, 1].map((i) => way.map((point) => point[i]));
       const [low, high] = [Math.min, Math.max].map((of) => [of(...across), of(...along)]);
@@ -151,7 +154,7 @@ class Replay {
   }
 
   play() {
-    if (this.time >= this.end) this.time = 0;
+    if ([this.end, this.episode.poster].includes(this.time)) this.time = 0;
     this.playing = true;
     this.find("play").textContent = "Pause";
     let last = performance.now();

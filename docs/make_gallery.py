@@ -1,0 +1,170 @@
+"""Films of certified episodes for gallery.md and leaderboard.md, which list them, and regret.png: make gallery.
+
+Each row of the leaderboard has a film of its best and of its worst episode. The gallery shows one episode of each task under
+four rows, and the worst one of the best policy. A film is made where there is none of the row's submission. It shows what the
+submission beside the row holds, or else the shipped controller of the row's name. pictures/films/made.json says of which
+submission each film is, and how the episode ended.
+"""
+
+import io
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import make_leaderboard
+import numpy as np
+from PIL import Image
+
+from ballbot_baselines import CONTROLLERS, find_optimum
+from ballbot_gym import certified, files
+from ballbot_gym.engines import PHYSICS
+from ballbot_gym.env import make_task
+from ballbot_gym.picture import picture
+from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.rollout import PlanError
+from ballbot_gym.tasks import TASKS
+from ballbot_gym.trajectory import Trajectory
+from ballbot_train.evaluation import recordings
+from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries
+from ballbot_train.policy_files import SHIPPED
+from ballbot_train.report import figures, labels
+from ballbot_train.report.replay import Ghost, Replay, Take, certified_replay
+
+PAGE = Path(__file__).parent / "gallery.md"
+FILMS = make_leaderboard.FILMS
+MADE = FILMS / "made.json"
+EPISODES = {"stabilize": 7, "turn": 34, "orbit": 122, "weave": 12}
+"""The telling episode of each task."""
+_LISTS = re.compile(r"(<!-- films -->\n).*(<!-- end of films -->)", flags=re.DOTALL)
+_SIZE, _FPS, _QUALITY = (240, 180), 10, 30  # of 50 to 80 kB
+_LONGEST, _AFTER = 5.0, 0.4  # s: of the motion; shown of a robot that has fallen
+_TOLERANCE = 1e-3  # of the optimum's cost beside the certified one
+_LAST_MS = 1500  # for which the last picture is shown
+
+
+def shown(task: str) -> list[Entry]:
+    """The rows of a task in the gallery: the experts, and the best shipped policy last."""
+    rows = [row for row in read_entries() if (row.task, row.robot) == (task, PAPER)]
+    experts = [row for name in CONTROLLERS for row in rows if row.name == name]
+    policies = [row for row in rows if (SHIPPED / f"{task}-{row.name}.json").exists()]
+    return [*experts, min(policies, key=lambda row: (-row.success, row.regret_mean or 0.0))]
+
+
+def films() -> Iterator[tuple[Entry, int]]:
+    """Every row and episode that is filmed, each once."""
+    found = {}
+    for row in read_entries():
+        found |= {make_leaderboard.film(row, i): (row, i) for i in make_leaderboard.extremes(row)}
+    for task, episode in EPISODES.items():
+        found |= {make_leaderboard.film(row, episode): (row, episode) for row in shown(task)}
+    yield from found.values()
+
+
+def page(notes: dict[str, dict[str, str]]) -> str:
+    """The gallery as the films make it."""
+    parts = []
+    for task, episode in EPISODES.items():
+        parts.append(f"## {task.capitalize()}, episode {episode}\n")
+        rows = shown(task)
+        worst = make_leaderboard.extremes(rows[-1])[1]
+        for row, i, lead in [
+            *((row, episode, "") for row in rows),
+            (rows[-1], worst, f"Its worst of 200 episodes, {worst}: "),
+        ]:
+            name = make_leaderboard.film(row, i)
+            label = labels.label(row.name)
+            text = f"{label[0].upper()}{label[1:]} {notes[name]['note']}."
+            parts.append(f"![{row.name}, episode {i}](pictures/films/{name})\n{lead}{text}\n")
+    text = "\n".join(parts)
+    return _LISTS.sub(lambda match: f"{match[1]}\n{text}\n{match[2]}", PAGE.read_text(encoding="utf-8"))
+
+
+def _has_motion(row: Entry) -> bool:
+    """Whether a submission lies beside the row, or a shipped controller has its name."""
+    shipped = row.name in CONTROLLERS or (SHIPPED / f"{row.task}-{row.name}.json").exists()
+    return shipped or (LEADERBOARD / row.file).with_suffix(".npz").exists()
+
+
+def take_of(row: Entry, episode: int) -> Replay:
+    """What a row did in an episode, with the optimum as its ghost."""
+    path = (LEADERBOARD / row.file).with_suffix(".npz")
+    replay = certified_replay(row.task, ["lqr" if path.exists() else row.name], episode, row.physics, robot=row.robot)
+    (take,) = replay.takes
+    if path.exists():
+        take = Take(
+            row.name, _recorded(path, row, episode), labels.color(row.name, 0), failed=row.results()[episode].failure
+        )
+    known, task, params = certified.load(row.task, row.robot), make_task(row.task, row.robot), named_robot(row.robot)
+    optimum = find_optimum(task, params, known.states[episode], known.constants[episode])
+    if optimum.cost > (1 + _TOLERANCE) * known.costs[episode]:
+        raise PlanError(
+            f"{row.task} {episode}: the search found {optimum.cost}, and {known.costs[episode]} is certified"
+        )
+    return replace(replay, takes=(replace(take, ghosts=(Ghost("optimum", optimum.trajectory, labels.OPTIMUM),)),))
+
+
+def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
+    """An episode of a submission."""
+    held = recordings.read(path)
+    steps = held.lengths[:episode].sum()
+    states, n = steps + np.count_nonzero(held.lengths[:episode]), held.lengths[episode]
+    forces = held.actions[steps : steps + n] * named_robot(row.robot).force_limit
+    return Trajectory(
+        make_task(row.task, row.robot).control_dt * np.arange(n + 1), held.states[states : states + n + 1], forces
+    )
+
+
+def film(replay: Replay) -> bytes:
+    """An animated WebP."""
+    (take,) = replay.takes
+    end = min(take.trajectory.duration + (_AFTER if take.failed else 0), _LONGEST)
+    first, *others = (
+        Image.fromarray(picture(replay.drawing(take, t), *_SIZE)) for t in np.arange(0, end + 1e-6, 1 / _FPS)
+    )
+    durations = [1000 // _FPS] * len(others) + [_LAST_MS]
+    buffer = io.BytesIO()
+    options = {"save_all": True, "append_images": others, "duration": durations, "loop": 0}
+    first.save(buffer, "WEBP", quality=_QUALITY, method=6, **options)
+    return buffer.getvalue()
+
+
+def note(row: Entry, episode: int) -> str:
+    """How an episode ended, as the end of a sentence."""
+    result = row.results()[episode]
+    if result.failure:
+        end = row.ends[episode]
+        return "falls" if end == "tilt" else "touches an obstacle" if end.startswith("obstacle") else f"fails: {end}"
+    regret = round(100 * (result.cost / result.optimum - 1), 1)
+    than = f"{abs(regret)} % {'more' if regret > 0 else 'less'} than" if regret else "as much as"
+    return f"costs {than} the optimum"
+
+
+def main() -> None:
+    """Makes the films that are missing, removes those that nothing shows, and writes both pages."""
+    made = json.loads(MADE.read_text()) if MADE.exists() else {}
+    known = {}
+    for row, episode in films():
+        name = make_leaderboard.film(row, episode)
+        held = made.get(name, {}).get("submission") == row.submission
+        if not held and not _has_motion(row):
+            continue
+        known[name] = {"submission": row.submission, "note": note(row, episode)}
+        if not held:
+            files.write(FILMS / name, film(take_of(row, episode)))
+            print(f"{name}: {(FILMS / name).stat().st_size / 1000:.0f} kB, {known[name]['note']}", flush=True)
+            files.write(MADE, json.dumps(made := made | {name: known[name]}, indent=1) + "\n")
+    for path in FILMS.glob("*.webp"):
+        if path.name not in known:
+            path.unlink()
+    files.write(MADE, json.dumps(dict(sorted(known.items())), indent=1) + "\n")
+    rows = [row for row in read_entries() if (row.robot, row.physics) == (PAPER, next(iter(PHYSICS)))]
+    results = [result for task in TASKS for row in rows if row.task == task for result in row.results()]
+    figures.save(figures.regret_figure(results), FILMS.parent / "regret.png")
+    files.write(PAGE, page(known))
+    files.write(make_leaderboard.PAGE, make_leaderboard.page())
+
+
+if __name__ == "__main__":
+    main()
