@@ -26,8 +26,8 @@ except ImportError as error:
 
 from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.checks import LARGEST, check_num_envs, shown
-from ballbot_gym.env import fixed_error, limit_names, make_task
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.env import check_history, fixed_error, limit_names, make_task
+from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.tasks import Task
@@ -52,7 +52,7 @@ _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The fields of `BatchStep` that are bools."""
 
 
-_FIXED = ("task", "params", "randomization", "num_envs", "device", "dtype", "limit_names")
+_FIXED = ("task", "params", "randomization", "history", "num_envs", "device", "dtype", "limit_names")
 """Attributes of a batch that cannot be set once it is made: more is computed from them."""
 
 
@@ -70,9 +70,12 @@ class BatchState(NamedTuple):
     seed: torch.Tensor
     """(B,) int64."""
     drawn: torch.Tensor
-    """(6, B) what `Randomization.draw` drew for the running episodes; (0, B) where it is off."""
+    """(6 or 14, B) what `Randomization.draw` drew for the running episodes; (0, B) where it draws nothing."""
     actuator: torch.Tensor
     """(2 + 2d, B) N, the force last applied, then the last d commands; (0, B) where the actuator is ideal."""
+    past: torch.Tensor
+    """(history (no + 2), B) the last observations, each with the action that followed, the latest first; 0 before the
+    episode began."""
 
 
 class _Rows(NamedTuple):
@@ -85,6 +88,7 @@ class _Rows(NamedTuple):
     seed: torch.Tensor
     drawn: tuple[torch.Tensor, ...]
     actuator: tuple[torch.Tensor, ...]
+    past: tuple[torch.Tensor, ...]
 
 
 class BatchStep(NamedTuple):
@@ -148,6 +152,8 @@ class StepInfo(NamedTuple):
     """(nc, B) constants."""
     grip: np.ndarray
     """(4, B), as of `BatchStep`; (0, B) where friction is unlimited."""
+    drawn: np.ndarray = np.zeros((0, 0))
+    """(6 or 14, B), as of `BatchState`; (0, B) where nothing is drawn."""
 
 
 class BatchEpisodes(NamedTuple):
@@ -167,43 +173,6 @@ class BatchEpisodes(NamedTuple):
     """(B,) int64, control steps taken."""
     states: torch.Tensor | None
     """(T, 8, B) states after each control step, where they were recorded. What follows the end of an episode is undefined."""
-
-
-class _Robot(NamedTuple):
-    """The parameters that `dynamics` reads, as plain values.
-
-    torch.compile cannot trace the cached properties of `BallbotParams`, because they take a lock.
-    """
-
-    total_mass: Any
-    moving_mass: Any
-    first_moment: Any
-    pivot_inertia: Any
-    axial_inertia: Any
-    gravity: Any
-    weight: Any
-    rolls: bool
-    ball_radius: Any
-    friction: Any
-    grips: bool
-
-    @classmethod
-    def of(cls, params: BallbotParams) -> "_Robot":
-        total_mass = params.ball_mass + params.body_mass
-        rolling = params.ball_inertia / params.ball_radius**2 if params.rolls else None
-        return cls(
-            total_mass=total_mass,
-            moving_mass=total_mass if rolling is None else total_mass + rolling,
-            first_moment=BallbotParams.first_moment.func(params),
-            pivot_inertia=BallbotParams.pivot_inertia.func(params),
-            axial_inertia=params.axial_inertia,
-            gravity=params.gravity,
-            weight=total_mass * params.gravity,
-            rolls=params.rolls,
-            ball_radius=params.ball_radius,
-            friction=params.friction,
-            grips=params.grips,
-        )
 
 
 class BallbotBatch:
@@ -226,8 +195,9 @@ class BallbotBatch:
         dtype: torch.dtype | str = torch.float32,
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
-        randomization: Randomization | None = None,
+        randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
+        history: int = 0,
         **task_fields: Any,
     ):
         """Makes the batch; call `reset` first.
@@ -240,8 +210,9 @@ class BallbotBatch:
                 "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
                 warning and runs eagerly. False never compiles.
             params: the nominal robot as a BallbotParams; the same as robot.
-            randomization: what varies; default, nothing.
+            randomization: what varies, or a name in `TRACKS`; default, nothing.
             robot: a name in `ROBOTS`, or a BallbotParams.
+            history: as of `BallbotEnv`.
             **task_fields: fields of the task that replace its defaults.
 
         Raises:
@@ -257,10 +228,10 @@ class BallbotBatch:
         self.params = checked_robot(robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.limit_names = limit_names(self.task, self.params)
-        self.randomization = checked_randomization(randomization)
+        self.randomization, self.history = checked_randomization(randomization), check_history(history)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
-        for name in _Robot._fields:
+        for name in ModelNumbers._fields:
             getattr(self.params, name)  # computed and kept, before torch.compile meets a lock there
         self._substeps = dynamics.substeps_for(self.task.control_dt)
         self._past_steps = self.randomization.delay_steps(self.task.control_dt)[1]
@@ -431,7 +402,7 @@ class BallbotBatch:
             total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
         robot: Any = self.params
         if noise.varies_robot:
-            robot = _Robot.of(noise.robot(self.params, now.drawn[:4]))
+            robot = ModelNumbers.of(noise.robot(self.params, now.drawn))
 
         end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
@@ -448,7 +419,11 @@ class BallbotBatch:
         done = terminated | truncated
         reward = task.survival_reward * task.control_dt - did.running + did.goal
 
-        after = now._replace(x=end, steps=steps, actuator=actuator)
+        past = now.past
+        if past:
+            tried = (part.clamp(-1.0, 1.0) for part in asked)
+            past = (*self._seen(now), *tried, *past)[: len(past)]
+        after = now._replace(x=end, steps=steps, actuator=actuator, past=past)
         new, observed = after, self._observe(after)
         observation = observed
         # Drawing the next episodes takes as long as the dynamics. Compiled code has no branches that depend on numbers.
@@ -486,7 +461,7 @@ class BallbotBatch:
             raise gymnasium.error.ResetNeeded("no episode before reset()")
         if not self.randomization.varies_robot:
             return self.params
-        return self.randomization.robot(self.params, tuple(self.state.drawn[:4, i].tolist()))
+        return self.randomization.robot(self.params, tuple(self.state.drawn[:, i].tolist()))
 
     def _start(
         self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
@@ -494,8 +469,8 @@ class BallbotBatch:
         """The starts of episodes; x and c are drawn where they are not given."""
         task, noise = self.task, self.randomization
         key = counter_rng.key(seed, episode, 0 * episode)
-        varied = noise.varies_robot or noise.varies_actuator
-        count = task.constant_draws + task.state_draws + Randomization.EPISODE_DRAWS * varied
+        varied = noise.varies_episodes
+        count = task.constant_draws + task.state_draws + noise.episode_draws * varied
         z = counter_rng.uniforms(key, count, self.dtype)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
         constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
@@ -504,26 +479,34 @@ class BallbotBatch:
         drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
         actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
-        return _Rows(state, constants, zero, episode, seed, drawn, actuator)
+        past = (still,) * (self.history * (len(task.observation_scale) + 2))
+        return _Rows(state, constants, zero, episode, seed, drawn, actuator, past)
 
     def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
         """Force (2) that the actuator applies, and its new memory."""
         if not self.randomization.varies_actuator:
             return command, now.actuator
         pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
+        for strength in now.drawn[6:7]:
+            command = tuple(strength * part for part in command)
         force = actuate(command, pairs[1:], pairs[0], now.drawn[4], now.drawn[5])
         kept = (command, *pairs[1:])[: self._past_steps]
         return force, tuple(part for pair in (force, *kept) for part in pair)
 
     def _observe(self, now: _Rows) -> torch.Tensor:
-        """(B, no) observations with the sensors' noise, which depends on the number of steps taken in the episode."""
+        """(B, no) observations, with those of the past behind the present one."""
+        return torch.stack((*self._seen(now), *now.past)).T
+
+    def _seen(self, now: _Rows) -> tuple[torch.Tensor, ...]:
+        """The present observation with the sensors' noise, which depends on the number of steps taken in the episode."""
         x = now.x
         if self.randomization.is_noisy:
             key = counter_rng.key(now.seed, now.episode, now.steps + 1)
             z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
-            x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :])
+            time = now.steps.to(self.dtype) * self.task.control_dt
+            x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
         c = self.task.at(now.c, now.steps.to(self.dtype) * self.task.control_dt) if self.task.clock else now.c
-        return torch.stack(self.task.observe(x, c)).T
+        return tuple(self.task.observe(x, c))
 
     def _stacked(self, rows: _Rows) -> BatchState:
         """The rows as tensors."""
@@ -540,6 +523,7 @@ def run_episodes(
     x: np.ndarray | torch.Tensor,
     c: np.ndarray | torch.Tensor,
     record: bool = False,
+    drawn: np.ndarray | None = None,
 ) -> BatchEpisodes:
     """Runs one episode of each environment, all at once and without gradients.
 
@@ -551,9 +535,14 @@ def run_episodes(
         x: (B, 8) initial states.
         c: (B, nc) constants of the episodes.
         record: whether to keep the states of all control steps.
+        drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
     """
     start = (torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device) for part in (x, c))
     observation = batch.reset(0, None, *start)
+    if drawn is not None and batch.state is not None:
+        rows = torch.as_tensor(drawn.T, dtype=batch.dtype, device=batch.device).contiguous()
+        batch.state = batch.state._replace(drawn=rows)
+        observation = batch.observe(batch.state)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
     success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
     cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)

@@ -31,6 +31,7 @@ from ballbot_gym.viewer import PageScene
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
+_LONGEST_HISTORY = 1000  # control steps
 
 
 _Kind = TypeVar("_Kind", bound=type)
@@ -77,9 +78,11 @@ class EnvState(NamedTuple):
     """Of the randomized robot and actuator; None where nothing varies."""
     memory: tuple[float, ...] = ()
     """What the simulator remembers besides the state; see `Simulator.memory`."""
+    past: tuple[float, ...] = ()
+    """What is observed of the present, and of the past behind it, where the env has a history."""
 
 
-@fixed("task", "params", "randomization", "physics", "render_mode", "action_space", "observation_space")
+@fixed("task", "params", "randomization", "history", "physics", "render_mode", "action_space", "observation_space")
 class BallbotEnv(gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
@@ -106,11 +109,13 @@ class BallbotEnv(gymnasium.Env):
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
     | grip | (4,) f_x, f_y, N of the floor on the ball as the step began, and the friction it needs (0 after `reset`) |
+    | drawn | (6,) or (14,) what a randomization drew for the episode; names in `Randomization.DRAWN` |
 
-    Only robots whose friction is limited have `grip`. Such a robot has lost its grip if it needs more friction, or a floor
-    that pulls, when a step begins or at its end. The closed form cannot say how it slips, so with physics="rk4" that is a
-    failure, and `violated` is the index of "grip". PyBullet and MuJoCo simulate the contact of a rolling ball: it slips or
-    leaves the floor, and that by itself is no failure. `grip` is then the force at the end of the step.
+    Only envs with a randomization have `drawn`, and only robots whose friction is limited have `grip`. Such a robot has lost
+    its grip if it needs more friction, or a floor that pulls, when a step begins or at its end. The closed form cannot say
+    how it slips, so with physics="rk4" that is a failure, and `violated` is the index of "grip". PyBullet and MuJoCo simulate
+    the contact of a rolling ball: it slips or leaves the floor, and that by itself is no failure. `grip` is then the force at
+    the end of the step.
 
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
@@ -127,8 +132,9 @@ class BallbotEnv(gymnasium.Env):
         render_mode: str | None = None,
         params: BallbotParams | None = None,
         physics_dt: float | None = None,
-        randomization: Randomization | None = None,
+        randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
+        history: int = 0,
         **task_fields: Any,
     ):
         """Makes the environment; usually through `gymnasium.make("BallbotStabilize-v0", ...)`.
@@ -142,9 +148,11 @@ class BallbotEnv(gymnasium.Env):
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
                 10 ms for rk4.
-            randomization: what varies; default, nothing. In Bullet each new `com_height` loads a URDF, which takes 2 ms
-                and 5 kB of memory that PyBullet never frees.
+            randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF,
+                which takes 2 ms and 5 kB of memory that PyBullet never frees.
             robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
+            history: so many earlier observations follow the present one in each observation, the latest first, each with the
+                action (2) that was taken on it; all 0 before the episode began.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -174,7 +182,10 @@ class BallbotEnv(gymnasium.Env):
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )
         self._noisy = self.randomization.is_noisy
-        self.observation_space = observation_space(self.task, self.params)
+        self.history = check_history(history)
+        self.observation_space = observation_space(self.task, self.params, self.history)
+        own = len(self.task.observation_scale)
+        self._past = np.zeros(own + self.history * (own + 2), np.float32) if self.history else None
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: Judge | None = None  # in machine code
@@ -194,15 +205,17 @@ class BallbotEnv(gymnasium.Env):
 
         Args:
             seed: seeds the draw of this and the following episodes.
-            options: may hold "state", the (8,) initial state, and "constants", the (nc,) constants of the episode or a
-                dict of some of them by name. Everything else is drawn.
+            options: may hold "state", the (8,) initial state; "constants", the (nc,) constants of the episode or a dict of
+                some of them by name; and "drawn", what `info` has under that key. Everything else is drawn.
 
         Raises:
             ValueError: an unknown option, or a state or constants of the wrong shape, not finite, or unsafe.
         """
         self._check_open()
         super().reset(seed=seed)
-        x, c = self._draw(options)
+        draws = ("drawn",) if self.randomization.varies_episodes else ()
+        state, constants, *drawn = reset_options(options, "state", "constants", *draws)
+        x, c = self._draw(state, constants)
         self._resets += 1
         self._use_code(start=self._resets > 1)  # an env of one episode is not worth a compilation
         judge, tilt = self._start(x, c)
@@ -210,10 +223,16 @@ class BallbotEnv(gymnasium.Env):
         self._state = x
         if self._disturbance is not None:
             self._disturbance.reset(self.np_random)
+            for given in drawn:
+                if given is not None:
+                    shape = (self.randomization.episode_draws,)
+                    self._disturbance.begin(_floats(finite_array(given, shape, "drawn")))
             if self.randomization.varies_robot:
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
         self._steps_left, self._taken = self._steps, 0
+        if self._past is not None:
+            self._past[:] = 0
         if self._human:
             self.render()
         return self._shown(judge, tilt)
@@ -239,6 +258,8 @@ class BallbotEnv(gymnasium.Env):
         if self._disturbance is not None:
             force = self._disturbance.actuate(force)
             total = self._disturbance.pushed(force, self.np_random)
+        if self._past is not None:
+            self._note(action)
         before = self._state
         self._state = x = self._simulator.step(total)
         self._steps_left -= 1
@@ -271,6 +292,14 @@ class BallbotEnv(gymnasium.Env):
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = spec_of(spec, self.task, self.params, self.randomization)
+
+    def _note(self, action: Any) -> None:
+        """Moves what was observed, and the action on it, into the past."""
+        past, own = self._past, len(self.task.observation_scale)
+        assert past is not None
+        past[2 * own + 2 :] = past[own : -(own + 2)].copy()
+        past[own : 2 * own] = past[:own]
+        past[2 * own : 2 * own + 2] = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
 
     @property
     def limit_names(self) -> tuple[str, ...]:
@@ -327,7 +356,8 @@ class BallbotEnv(gymnasium.Env):
         disturbance = None if self._disturbance is None else self._disturbance.get_state()
         rng = dict(self.np_random.bit_generator.state)
         memory = self._simulator.memory()
-        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance, memory)
+        past = () if self._past is None else tuple(self._past.tolist())
+        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance, memory, past)
 
     def set_state(self, state: EnvState) -> None:
         """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
@@ -345,6 +375,10 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError(f"the state is of {state.task}, and this env's task is {self.task}")
         if (state.disturbance is None) != (self._disturbance is None):
             raise ValueError("the state is of an env with other randomization")
+        if len(state.past) != (0 if self._past is None else len(self._past)):
+            raise ValueError("the state is of an env with another history")
+        if self._past is not None:
+            self._past[:] = state.past
         self._set_constants(state.constants)
         self._state, self._steps_left = state.x, state.steps_left
         self._taken = self.task.steps - state.steps_left
@@ -445,9 +479,8 @@ class BallbotEnv(gymnasium.Env):
             )
         return None, dynamics.tilt(x)
 
-    def _draw(self, options: dict[str, Any] | None) -> tuple[State, State]:
-        """Initial state and constants. Those that the options do not give are drawn."""
-        state, constants = reset_options(options, "state", "constants")
+    def _draw(self, state: Any, constants: Any) -> tuple[State, State]:
+        """Initial state and constants. Those that are not given are drawn."""
         task = self.task
         draws = self.np_random.random(task.constant_draws + task.state_draws).tolist()
         c = _floats(task.draw_constants(tuple(draws[: task.constant_draws]), self.params))
@@ -480,7 +513,7 @@ class BallbotEnv(gymnasium.Env):
         """(no) observation of the present state, with the sensors' noise."""
         x = self._state
         if self._disturbance is not None:
-            x = self._disturbance.sensed(x, self.np_random)
+            x = self._disturbance.sensed(x, self.np_random, self._taken * self.task.control_dt)
         return self.task.observe(x, self.task.at(self._constants, self._taken * self.task.control_dt))
 
     def _shown(
@@ -499,6 +532,9 @@ class BallbotEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Observation and `info` of a step that a judge judged last, or of one that Python judged; by default of a start."""
         seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
+        if self._past is not None:
+            self._past[: len(seen)] = seen
+            seen = self._past.copy()
         failure = violated >= 0
         info = {
             "state": np.array(self._state) if judge is None else judge.x.copy(),
@@ -518,6 +554,8 @@ class BallbotEnv(gymnasium.Env):
         }
         if self._grips:
             info["grip"] = np.array(grip)
+        if self._disturbance is not None and self.randomization.varies_episodes:
+            info["drawn"] = np.array(self._disturbance.get_state().drawn)
         return seen, info
 
 
@@ -528,9 +566,17 @@ GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
 
 
-def observation_space(task: Task, params: BallbotParams) -> spaces.Box:
-    """What a robot can observe in a task."""
-    bounds = np.array(task.observation_bounds(params), np.float32)
+def check_history(history: Any) -> int:
+    """history, or a ValueError."""
+    if isinstance(history, bool) or not isinstance(history, int | np.integer) or not 0 <= history <= _LONGEST_HISTORY:
+        raise ValueError(f"history must be a whole number of control steps, 0 to {_LONGEST_HISTORY}, not {history!r}")
+    return int(history)
+
+
+def observation_space(task: Task, params: BallbotParams, history: int = 0) -> spaces.Box:
+    """What a robot can observe in a task, with so many earlier observations and actions."""
+    own = task.observation_bounds(params)
+    bounds = np.array((*own, *(history * (*own, 1.0, 1.0))), np.float32)
     return spaces.Box(-bounds, bounds, dtype=np.float32)
 
 

@@ -24,7 +24,7 @@ _NOMINAL = (1.0, 1.0, 1.0, 1.0, 1.0, 0.0)
 """What `Randomization.draw` draws where neither robot nor actuator varies."""
 
 
-@fixed("task", "params", "randomization", "num_envs", "dtype")
+@fixed("task", "params", "randomization", "history", "num_envs", "dtype")
 class BallbotLoop:
     """B ballbots that do one task, with `state`, `initial_state`, `step` and `robot` as of `BallbotBatch`.
 
@@ -40,6 +40,7 @@ class BallbotLoop:
         dtype: type[np.floating],
         params: BallbotParams | None = None,
         randomization: Randomization | None = None,
+        history: int = 0,
     ):
         """Args: as of `BallbotBatch`; dtype: np.float32 or np.float64, of what is returned.
 
@@ -47,9 +48,10 @@ class BallbotLoop:
             ValueError: num_envs out of range.
         """
         self.num_envs, self.dtype = check_num_envs(num_envs), dtype
-        self._singles = [_Single(task, params, randomization) for _ in range(self.num_envs)]
+        self._singles = [_Single(task, params, randomization, history) for _ in range(self.num_envs)]
         first = self._singles[0]
         self.task, self.params, self.randomization = first.task, first.params, first.randomization
+        self.history = first.history
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._started = False
         self._shown: tuple[np.ndarray, np.ndarray] | None = None  # x and c, until they change
@@ -103,7 +105,7 @@ class BallbotLoop:
     def observe(self, state: BatchState) -> np.ndarray:
         """(B, no) observations of a state, which becomes that of the loop."""
         self.state = state
-        return np.array([single._observed() for single in self._singles], np.float32)
+        return np.array([single.observed() for single in self._singles], np.float32)
 
     def tilt(self, state: BatchState) -> np.ndarray:
         """(B,) rad, of a state."""
@@ -143,7 +145,7 @@ class BallbotLoop:
         if restart and begun:
             observation, tilt = observation.copy(), tilt.copy()
             for i in begun:
-                observation[i], tilt[i] = self._singles[i]._observed(), dynamics.tilt(self._singles[i]._state)
+                observation[i], tilt[i] = self._singles[i].observed(), dynamics.tilt(self._singles[i]._state)
         grips = self.params.grips
         fields: Any = {name: info[name] for name in names} | {
             "observation": observation,
@@ -165,18 +167,18 @@ class BallbotLoop:
 
     def _stacked(self, memories: list[tuple]) -> BatchState:
         """The envs' memories as arrays with the components first."""
-        x, c, steps, episode, seed, drawn, actuator = (list(column) for column in zip(*memories, strict=True))
-        x, c, drawn, actuator = (np.array(rows, np.float64).T for rows in (x, c, drawn, actuator))
+        x, c, steps, episode, seed, *more = (list(column) for column in zip(*memories, strict=True))
+        x, c, *more = (np.array(rows, np.float64).T for rows in (x, c, *more))
         steps, episode, seed = (np.array(column, np.int64) for column in (steps, episode, seed))
-        fields: Any = (x, c, steps, episode, seed, drawn, actuator)
+        fields: Any = (x, c, steps, episode, seed, *more)
         return BatchState(*fields)
 
 
 class _Single(BallbotEnv):
     """One environment of the loop: a `BallbotEnv` whose random numbers are those of `counter_rng`."""
 
-    def __init__(self, task: Task, params: BallbotParams | None, randomization: Randomization | None):
-        super().__init__(task, "rk4", params=params, randomization=randomization)
+    def __init__(self, task: Task, params: BallbotParams | None, randomization: Randomization | None, history: int):
+        super().__init__(task, "rk4", params=params, randomization=randomization, history=history)
         self.seed, self.episode = 0, 0
         self._rng: Any = _Counter()
         self._np_random = self._rng
@@ -184,8 +186,8 @@ class _Single(BallbotEnv):
     def start(self, seed: int, episode: int, x: State | None = None, c: State | None = None) -> tuple:
         """The memory of an env that begins an episode: `remember` takes it. x and c are drawn where not given."""
         task, noise = self.task, self.randomization
-        varied = noise.varies_robot or noise.varies_actuator
-        count = task.constant_draws + task.state_draws + Randomization.EPISODE_DRAWS * varied
+        varied = noise.varies_episodes
+        count = task.constant_draws + task.state_draws + noise.episode_draws * varied
         z = counter_rng.floats(counter_rng.key(seed, episode, 0), count)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
         c = task.draw_constants(z_constants, self.params) if c is None else c
@@ -193,18 +195,22 @@ class _Single(BallbotEnv):
         drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
         past = noise.delay_steps(task.control_dt)[1]
         actuator = (0.0,) * (2 + 2 * past) if noise.varies_actuator else ()
-        return x, c, 0, episode, seed, drawn, actuator
+        own = len(task.observation_scale)
+        return x, c, 0, episode, seed, drawn, actuator, (0.0,) * (self.history * (own + 2))
 
     def memory(self) -> tuple:
         """What the env remembers: a column of `BatchState`."""
         drawn, actuator, noise = (), (), self.randomization
-        if self._disturbance is not None and (noise.varies_robot or noise.varies_actuator):
+        if self._disturbance is not None and noise.varies_episodes:
             drawn, force, past = self._disturbance.get_state()
             pairs = (force, *past) if noise.varies_actuator else ()
             actuator = tuple(part for pair in pairs for part in pair)
-        return self._state, self._constants, self._taken, self.episode, self.seed, drawn, actuator
+        past = () if self._past is None else tuple(self._past[len(self.task.observation_scale) :].tolist())
+        return self._state, self._constants, self._taken, self.episode, self.seed, drawn, actuator, past
 
-    def remember(self, x: Any, c: Any, taken: int, episode: int, seed: int, drawn: Any, actuator: Any) -> None:
+    def remember(
+        self, x: Any, c: Any, taken: int, episode: int, seed: int, drawn: Any, actuator: Any, past: Any
+    ) -> None:
         """Goes on from a `memory`."""
         self._use_code(start=episode > 0)
         self._set_constants(tuple(c))
@@ -218,6 +224,13 @@ class _Single(BallbotEnv):
             else:
                 self._disturbance.set_state(DisturbanceState(tuple(drawn), pairs[0], pairs[1:]))
         self._restore_simulator()
+        if self._past is not None:
+            self._past[len(self.task.observation_scale) :] = past
+            self._past[: len(self.task.observation_scale)] = self._observed()
+
+    def observed(self) -> Any:
+        """The present observation, with those of the past behind it."""
+        return self._observed() if self._past is None else self._past.copy()
 
     def begin_next(self) -> None:
         """Begins the next episode."""

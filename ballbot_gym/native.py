@@ -48,7 +48,7 @@ class _Code(NamedTuple):
     observe: Callable[..., None]
 
 
-@fixed("task", "params", "randomization", "num_envs", "dtype")
+@fixed("task", "params", "randomization", "history", "num_envs", "dtype")
 class BallbotNative:
     """B ballbots that do one task, with `state`, `initial_state`, `step` and `robot` as of `BallbotBatch`.
 
@@ -79,7 +79,7 @@ class BallbotNative:
             ValueError: num_envs out of range.
         """
         self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
-        self.randomization, self.threads = Randomization(), threads
+        self.randomization, self.history, self.threads = Randomization(), 0, threads
         self._state: State = None
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
@@ -224,7 +224,7 @@ class BallbotNative:
         size = self.num_envs
         x, c, none = (np.zeros((rows, size), self.dtype) for rows in (8, len(self.task.constant_names), 0))
         seeds = np.array(seeds_of(self._entropy, size))
-        fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none)
+        fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none, none)
         return BatchState(*fields)
 
     def _start(self, which: np.ndarray, state: State, given: bool = False) -> None:

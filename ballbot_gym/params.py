@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from ballbot_gym import files
 from ballbot_gym.ops import is_number, is_positive
@@ -205,6 +206,43 @@ class BallbotParams:
 def default_params() -> BallbotParams:
     """The paper's robot, read once from the packaged URDF."""
     return BallbotParams.from_urdf()
+
+
+class ModelNumbers(NamedTuple):
+    """The parameters that `dynamics` reads, as plain values, tensors or symbols.
+
+    torch.compile cannot trace the cached properties of `BallbotParams`, because they take a lock.
+    """
+
+    total_mass: Any
+    moving_mass: Any
+    first_moment: Any
+    pivot_inertia: Any
+    axial_inertia: Any
+    gravity: Any
+    weight: Any
+    rolls: bool
+    ball_radius: Any
+    friction: Any
+    grips: bool
+
+    @classmethod
+    def of(cls, params: BallbotParams) -> "ModelNumbers":
+        total_mass = params.ball_mass + params.body_mass
+        rolling = params.ball_inertia / params.ball_radius**2 if params.rolls else None
+        return cls(
+            total_mass=total_mass,
+            moving_mass=total_mass if rolling is None else total_mass + rolling,
+            first_moment=BallbotParams.first_moment.func(params),
+            pivot_inertia=BallbotParams.pivot_inertia.func(params),
+            axial_inertia=params.axial_inertia,
+            gravity=params.gravity,
+            weight=total_mass * params.gravity,
+            rolls=params.rolls,
+            ball_radius=params.ball_radius,
+            friction=params.friction,
+            grips=params.grips,
+        )
 
 
 class _Tree(ElementTree.TreeBuilder):

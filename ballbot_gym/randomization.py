@@ -42,6 +42,10 @@ class Randomization:
     """Factor on the height of the body's centre of mass above the ball's centre, drawn per episode."""
     inertia: Range = (1.0, 1.0)
     """Factor on both of the body's inertias about its centre of mass, drawn per episode."""
+    force: Range = (1.0, 1.0)
+    """Factor on the force that the actuator applies when it is asked for one, drawn per episode."""
+    friction: Range = (1.0, 1.0)
+    """Factor on the coefficient of friction, where it is limited, drawn per episode."""
     actuator_lag: Range = (0.0, 0.0)
     """Time constant of the force's first-order response, s, drawn per episode."""
     actuator_delay: Range = (0.0, 0.0)
@@ -54,13 +58,23 @@ class Randomization:
     """Standard deviation of observed ẋ and ẏ, m/s."""
     lean_rate_noise: float = 0.0
     """Standard deviation of observed γ̇ and θ̇, rad/s."""
+    lean_bias: float = 0.0
+    """Standard deviation of a constant error of observed γ and θ, rad, drawn per episode."""
+    lean_rate_bias: float = 0.0
+    """Standard deviation of a constant error of observed γ̇ and θ̇, rad/s, drawn per episode."""
+    odometry_drift: float = 0.0
+    """Standard deviation of a constant error of observed ẋ and ẏ, m/s, drawn per episode; x and y drift away with it."""
     push_impulse: Range = (0.0, 0.0)
     """Horizontal impulse on the ball, N·s, in a random direction, spread over one control step."""
     push_interval: float = 1.0
     """Mean time between pushes, s. In each control step there is one with probability control_dt / push_interval."""
 
-    EPISODE_DRAWS = 6
-    """Uniform numbers that `draw` takes."""
+    DRAWN = (
+        "body_mass", "ball_mass", "com_height", "inertia", "gain", "delay", "force", "friction",
+        "drift_x", "drift_y", "bias_γ", "bias_θ", "bias_γ̇", "bias_θ̇",
+    )  # fmt: skip
+    """Names of what `draw` draws, of which the first 6 stand alone where nothing draws the others: factors, the gain and
+    delay of `actuate`, and errors of the sensors in SI units."""
     PUSH_DRAWS = 3
     """Uniform numbers that `push` takes."""
     NOISE_DRAWS = 8
@@ -93,17 +107,46 @@ class Randomization:
     @property
     def varies_robot(self) -> bool:
         """Whether robots differ from the nominal one."""
-        return any(r != (1.0, 1.0) for r in (self.body_mass, self.ball_mass, self.com_height, self.inertia))
+        return any(r != (1.0, 1.0) for r in self._factors)
 
     @property
     def varies_actuator(self) -> bool:
-        """Whether the force lags or is delayed."""
-        return self.actuator_lag[1] > 0 or self.actuator_delay[1] > 0
+        """Whether the force lags, is delayed, or is another than was asked for."""
+        return self.actuator_lag[1] > 0 or self.actuator_delay[1] > 0 or self.force != (1.0, 1.0)
 
     @property
     def is_noisy(self) -> bool:
-        """Whether observations carry noise."""
-        return any(self.noise)
+        """Whether observations have errors."""
+        return any(self.noise) or self.is_biased
+
+    @property
+    def is_biased(self) -> bool:
+        """Whether sensors have errors that stay for an episode."""
+        return any(self._biases)
+
+    @property
+    def varies_episodes(self) -> bool:
+        """Whether `draw` draws anything."""
+        return self.varies_robot or self.varies_actuator or self.is_biased
+
+    @property
+    def moves_optima(self) -> bool:
+        """Whether an episode's optimum is another than that of the nominal robot with an ideal actuator."""
+        return self.varies_robot or self.varies_actuator
+
+    @property
+    def episode_draws(self) -> int:
+        """Uniform numbers that `draw` takes."""
+        every = self.is_biased or self.force != (1.0, 1.0) or self.friction != (1.0, 1.0)
+        return len(self.DRAWN) if every else 6
+
+    @property
+    def _factors(self) -> tuple[Range, ...]:
+        return self.body_mass, self.ball_mass, self.com_height, self.inertia, self.force, self.friction
+
+    @property
+    def _biases(self) -> tuple[float, ...]:
+        return self.odometry_drift, self.lean_bias, self.lean_rate_bias
 
     @property
     def pushes(self) -> bool:
@@ -143,24 +186,24 @@ class Randomization:
         return low, high
 
     def draw(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
-        """An episode's robot and actuator from 6 uniform numbers.
-
-        Returns:
-            Factors on body mass, ball mass, centre-of-mass height and inertia; then the gain and the delay of `actuate`.
-        """
-        ranges = (self.body_mass, self.ball_mass, self.com_height, self.inertia)
-        factors = tuple(between(z[i], *ranges[i]) for i in range(4))
+        """An episode's robot, actuator and sensors, as `DRAWN` names them, from `episode_draws` uniform numbers."""
+        factors = tuple(between(z[i], *self._factors[i]) for i in range(4))
         # The tiny constant makes no lag an exact gain of 1.
         gain = 1.0 - ops.exp(-control_dt / (between(z[4], *self.actuator_lag) + 1e-9))
         low, high = self.delay_steps(control_dt)
         delay = 0.0 * z[5] + low
         for k in range(low, high):
             delay = ops.where(z[5] * (high - low + 1) >= k - low + 1, 0.0 * z[5] + (k + 1), delay)
-        return (*factors, gain, delay)
+        if self.episode_draws == 6:
+            return (*factors, gain, delay)
+        deviations = (std for std in self._biases for _ in range(2))
+        errors = (std * normal for std, normal in zip(deviations, normals(z[8:]), strict=True))
+        return (*factors, gain, delay, between(z[6], *self.force), between(z[7], *self.friction), *errors)
 
-    def robot(self, params: BallbotParams, factors: tuple[Any, ...]) -> BallbotParams:
-        """The robot with factors (4) on body mass, ball mass, centre-of-mass height and inertia."""
-        body_mass, ball_mass, com_height, inertia = factors
+    def robot(self, params: BallbotParams, drawn: tuple[Any, ...]) -> BallbotParams:
+        """The robot of an episode for which `draw` drew this."""
+        body_mass, ball_mass, com_height, inertia = drawn[:4]
+        force, friction = drawn[6:8] or (1.0, 1.0)
         return replace(
             params,
             body_mass=params.body_mass * body_mass,
@@ -169,6 +212,8 @@ class Randomization:
             inertia=params.inertia * inertia,
             axial_inertia=params.axial_inertia * inertia,
             ball_inertia=params.ball_inertia * ball_mass if params.rolls else params.ball_inertia,
+            force_limit=params.force_limit * force,
+            friction=params.friction * friction if params.grips else params.friction,
         )
 
     def push(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, Any]:
@@ -178,21 +223,43 @@ class Randomization:
         bearing = 2 * math.pi * z[2]
         return force * ops.cos(bearing), force * ops.sin(bearing)
 
-    def sensed(self, x: tuple[Any, ...], z: tuple[Any, ...]) -> tuple[Any, ...]:
-        """State (8) as the sensors report it, with noise from 8 uniform numbers."""
-        return tuple(
+    def sensed(self, x: tuple[Any, ...], z: tuple[Any, ...], drawn: tuple[Any, ...], time: Any) -> tuple[Any, ...]:
+        """State (8) as the sensors report it.
+
+        Args:
+            x: (8) the true one.
+            z: 8 uniform numbers.
+            drawn: what `draw` drew for the episode.
+            time: since the episode began, s.
+        """
+        seen = tuple(
             value + std * normal if std else value for value, std, normal in zip(x, self.noise, normals(z), strict=True)
         )
+        if not self.is_biased:
+            return seen
+        drift, lean, rate = drawn[8:10], drawn[10:12], drawn[12:14]
+        errors = (*(time * part for part in drift), *lean, *drift, *rate)
+        return tuple(value + error for value, error in zip(seen, errors, strict=True))
+
+
+def track_of(randomization: Randomization) -> str:
+    """Its name in `TRACKS`, or ""."""
+    return next((name for name, track in TRACKS.items() if track == randomization), "")
 
 
 def checked_randomization(randomization: Any) -> Randomization:
-    """The randomization that was given, also as the dict of all its fields, or none for None.
+    """The randomization that was given, also by its name in `TRACKS` or as the dict of all its fields, or none for None.
 
     Raises:
-        TypeError: it is something else, such as a dict of fields.
+        ValueError: no track of that name.
+        TypeError: it is something else, such as a dict of some fields.
     """
     if randomization is None:
         return Randomization()
+    if isinstance(randomization, str):
+        if randomization not in TRACKS:
+            raise ValueError(f"unknown randomization {randomization!r}; known: {', '.join(map(repr, TRACKS))}")
+        return TRACKS[randomization]
     randomization = from_fields(Randomization, randomization)
     if not isinstance(randomization, Randomization):
         raise TypeError(
@@ -205,7 +272,7 @@ class DisturbanceState(NamedTuple):
     """What a `Disturbance` remembers."""
 
     drawn: tuple[float, ...]
-    """(6,) what `Randomization.draw` drew for the episode."""
+    """What `Randomization.draw` drew for the episode."""
     force: tuple[float, float]
     """N, applied last."""
     past: tuple[tuple[float, float], ...]
@@ -223,7 +290,7 @@ class Disturbance:
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draws the episode's robot and actuator."""
-        z = tuple(rng.random(Randomization.EPISODE_DRAWS).tolist())
+        z = tuple(rng.random(self._randomization.episode_draws).tolist())
         self.begin(self._randomization.draw(z, self._dt))
 
     def begin(self, drawn: tuple[float, ...]) -> None:
@@ -237,12 +304,13 @@ class Disturbance:
     def set_state(self, state: DisturbanceState) -> None:
         """Goes on from what another one remembered."""
         self._drawn, self._force, self._past = state
-        *factors, self._gain, self._delay = self._drawn
+        self._gain, self._delay, self._strength = (*self._drawn, 1.0)[4:7]
         if self._randomization.varies_robot:
-            self.params = self._randomization.robot(self._nominal, tuple(factors))
+            self.params = self._randomization.robot(self._nominal, self._drawn)
 
     def actuate(self, command: tuple[float, float]) -> tuple[float, float]:
         """The force, N, that the actuator applies in the control step that begins with this command, N."""
+        command = (self._strength * command[0], self._strength * command[1])
         self._force = actuate(command, self._past, self._force, self._gain, self._delay)
         self._past = (command, *self._past)[: self._past_steps]
         return self._force
@@ -254,11 +322,12 @@ class Disturbance:
         push = self._randomization.push(tuple(rng.random(Randomization.PUSH_DRAWS).tolist()), self._dt)
         return force[0] + push[0], force[1] + push[1]
 
-    def sensed(self, x: tuple[float, ...], rng: np.random.Generator) -> tuple[float, ...]:
-        """State (8) as the sensors report it."""
+    def sensed(self, x: tuple[float, ...], rng: np.random.Generator, time: float) -> tuple[float, ...]:
+        """State (8) as the sensors report it at the episode's time, s."""
         if not self._randomization.is_noisy:
             return x
-        return self._randomization.sensed(x, tuple(rng.random(Randomization.NOISE_DRAWS).tolist()))
+        z = tuple(rng.random(Randomization.NOISE_DRAWS).tolist())
+        return self._randomization.sensed(x, z, self._drawn, time)
 
 
 def actuate(
@@ -296,3 +365,25 @@ def _pair(name: str, value: Any) -> Range:
         return float(low), float(high)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"Randomization: {name} must be a finite range (low, high), not {value!r}") from None
+
+
+TRACKS: dict[str, Randomization] = {
+    "unknown": Randomization(body_mass=(0.7, 1.4), com_height=(0.85, 1.15), force=(0.85, 1.1), friction=(0.6875, 1.25)),
+    "late": Randomization(actuator_delay=(0.0, 0.06)),
+    "noisy": Randomization(
+        position_noise=0.01,
+        lean_noise=0.01,
+        velocity_noise=0.05,
+        lean_rate_noise=0.03,
+        lean_bias=0.002,
+        lean_rate_bias=0.005,
+        odometry_drift=0.003,
+    ),
+}
+"""Randomizations by name. What "unknown" and "late" draw is not observed. The friction of "unknown" is 0.55 to 1.0 where a
+rolling robot's is 0.8. No track has an actuator that lags: its optimum would be that of another problem."""
+TRACKS["real"] = replace(
+    TRACKS["noisy"],
+    **{name: getattr(TRACKS["unknown"], name) for name in ("body_mass", "com_height", "force", "friction")},
+    actuator_delay=TRACKS["late"].actuator_delay,
+)

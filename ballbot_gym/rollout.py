@@ -69,26 +69,33 @@ class ActionController:
     This is the one place where an observation is turned into a force.
     """
 
-    def __init__(self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray]):
+    def __init__(
+        self, task: Task, params: BallbotParams, action: Callable[[np.ndarray, bool], np.ndarray], history: int = 0
+    ):
         """Wraps a function.
 
         Args:
             task: what is observed.
             params: the robot, whose force limit is the unit of actions.
             action: gets an observation (no,) float32 and whether an episode begins; returns an action (2,) in [−1, 1].
+            history: of the observations, as of `BallbotEnv`.
         """
-        self._task, self._params, self._action = task, params, action
+        self._task, self._params, self._action, self._history = task, params, action, history
         self._c: tuple[float, ...] = ()
         self._begins = True
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
+        self._past = np.zeros(self._history * (len(self._task.observation_scale) + 2), np.float32)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         seen = self._task.observe(tuple(np.asarray(x).tolist()), self._task.at(self._c, t))
-        observation = np.array(seen, np.float32)
+        own = np.array(seen, np.float32)
+        observation = np.concatenate([own, self._past]) if self._history else own
         action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
+        if self._history:
+            self._past = np.concatenate([own, action.clip(-1.0, 1.0).astype(np.float32), self._past])[: len(self._past)]
         return self._params.force_limit * action
 
 
@@ -140,7 +147,7 @@ def rollout(
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     _, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]
-    seen = _sensed(ballbot, x)
+    seen = _sensed(ballbot, x, 0.0)
     start = time.perf_counter()
     controller.reset(0.0, seen, c)
     reset_seconds = time.perf_counter() - start
@@ -152,7 +159,7 @@ def rollout(
         act_seconds.append(time.perf_counter() - start)
         _, _, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
         x, done = info["state"], terminated or truncated
-        seen = _sensed(ballbot, x)
+        seen = _sensed(ballbot, x, (len(forces) + 1) * dt)
         cost += info["cost"]
         states.append(x)
         forces.append(info["force"])
@@ -171,12 +178,13 @@ def rollout(
     )
 
 
-def _sensed(env: BallbotEnv, x: np.ndarray) -> np.ndarray:
-    """State x (8,) with the noise of the env's sensors. Each call draws new noise from the env's generator."""
-    if not env.randomization.is_noisy:
+def _sensed(env: BallbotEnv, x: np.ndarray, t: float) -> np.ndarray:
+    """State x (8,) as the env's sensors report it at time t, s. Each call draws new noise from the env's generator."""
+    state = env.get_state().disturbance if env.randomization.is_noisy else None
+    if state is None:
         return x
     z = tuple(env.np_random.random(Randomization.NOISE_DRAWS).tolist())
-    return np.array(env.randomization.sensed(tuple(x.tolist()), z))
+    return np.array(env.randomization.sensed(tuple(x.tolist()), z, state.drawn, t))
 
 
 def simulate(

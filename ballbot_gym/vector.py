@@ -88,7 +88,7 @@ class VectorState(NamedTuple):
     """(B,) bool: the episode has ended, and the next one has not begun."""
 
 
-@fixed("task", "params", "randomization", "num_envs", "render_mode", "autoreset_mode")
+@fixed("task", "params", "randomization", "history", "num_envs", "render_mode", "autoreset_mode")
 @fixed("action_space", "observation_space", "single_action_space", "single_observation_space")
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.
@@ -122,12 +122,13 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         dtype: torch.dtype | str = torch.float32,
         compile: bool | str = "auto",
         params: BallbotParams | None = None,
-        randomization: Randomization | None = None,
+        randomization: Randomization | str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         physics: str = "rk4",
         max_episode_steps: int | None = None,
         engine: str = "auto",
         robot: str | BallbotParams = PAPER,
+        history: int = 0,
         **task_fields: Any,
     ):
         """Makes the environments. Arguments that are not listed are those of `BallbotBatch`.
@@ -139,11 +140,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
-                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization`. "torch" computes
-                them in torch, and `compile` says whether that is compiled. "loop" computes one after the other in float64,
-                whatever dtype is returned. "auto" takes "native" where it can on a CPU, unless compile is True or
-                False; else "loop" for fewer than `LOOP_BELOW` envs on a CPU, unless compile is True; else "torch". All run
-                the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotLoop`.
+                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization` and no history.
+                "torch" computes them in torch, and `compile` says whether that is compiled. "loop" computes one after the
+                other in float64, whatever dtype is returned. "auto" takes "native" where it can on a CPU, unless compile is
+                True or False; else "loop" for fewer than `LOOP_BELOW` envs on a CPU, unless compile is True; else "torch".
+                All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotLoop`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -163,20 +164,21 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         real: torch.dtype = dtype_named(dtype)
         self._dtype = np.float32 if real == torch.float32 else np.float64
-        self.batch = _batch(task, num_envs, device, real, compile, params, randomization, engine)
+        self.batch = _batch(task, num_envs, device, real, compile, params, randomization, engine, history)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
+        self.history = self.batch.history
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
         fps = round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._ended = np.zeros(self.num_envs, np.bool_)  # whose episodes have ended and not begun anew
         self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.single_observation_space = observation_space(self.task, self.params)
+        self.single_observation_space = observation_space(self.task, self.params, self.history)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._most_steps = _most_steps(max_episode_steps, self.task)
         self._none, self._nothing = np.full(self.num_envs, -1), np.zeros(self.num_envs)
         self._everywhere = np.ones(self.num_envs, np.bool_)
-        self._ends = sparse_rows(self.num_envs, len(self.task.observation_scale))
+        self._ends = sparse_rows(self.num_envs, self.single_observation_space.shape[0])
         for array in (self._none, self._nothing, self._everywhere):
             array.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
@@ -234,7 +236,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         force, grip = np.zeros((2, size), self._dtype), np.zeros((4 * self.params.grips, size), self._dtype)
         success, failure, clipped = np.zeros((3, size), bool)
         parts = np.zeros((4, size))
-        now = StepInfo(x_now, parts[0], parts[1:], tilt, force, success, failure, self._none, clipped, c_now, grip)
+        flags = success, failure, self._none, clipped
+        now = StepInfo(x_now, parts[0], parts[1:], tilt, force, *flags, c_now, grip, self._drawn())
         infos = self._info(now, mask)
         return self._array(observation, np.float32), infos
 
@@ -377,7 +380,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             return self.batch.step_with_infos(actions, waiting, restart)
         check_finite(actions)
         actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
-        constants = self._x_and_c()[1]
+        constants, drawn = self._x_and_c()[1], self._drawn()
         if isinstance(self.batch, BallbotLoop):
             result: Any = self.batch.step(actions, waiting, restart)
         else:
@@ -388,7 +391,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         ended = (result.terminated | result.truncated).nonzero()[0]
         if isinstance(self.batch, BallbotBatch):
             result = result._replace(final_observation=result.final_observation[ended])
-        return result, *self._step_infos(result, constants, ended, waiting, restart), ended
+        return result, *self._step_infos(result, constants, drawn, ended, waiting, restart), ended
 
     def _cut(
         self, result: Any, now: StepInfo, end: StepInfo, ended: np.ndarray, restart: bool
@@ -410,12 +413,18 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         tilt[cut] = dynamics.tilt(tuple(x[:, cut]))
         now, ended = _begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
         result = result._replace(observation=observation, final_observation=final[ended])
-        return result, now._replace(x=x, c=c, tilt=tilt), end, ended
+        return result, now._replace(x=x, c=c, tilt=tilt, drawn=self._drawn()), end, ended
 
     def _step_infos(
-        self, result: Any, constants: np.ndarray, ended: np.ndarray, waiting: np.ndarray | None, restart: bool
+        self,
+        result: Any,
+        constants: np.ndarray,
+        drawn: np.ndarray,
+        ended: np.ndarray,
+        waiting: np.ndarray | None,
+        restart: bool,
     ) -> tuple[StepInfo, StepInfo]:
-        """What infos say of the envs now, and of a step, before which they had those constants (nc, B)."""
+        """What infos say of the envs now, and of a step, before which they had those constants (nc, B) and draws."""
         reward, cost, success, violated = result.reward, result.cost, result.success, result.violated
         parts = np.empty((3, self.num_envs))
         parts[0], parts[2] = self._survive, 0.0
@@ -429,10 +438,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * success[ended]
         x, c = self._x_and_c()
         flags = success, violated >= 0, violated, result.clipped
-        now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip)
+        now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip, self._drawn())
         if not (restart and ended.size):
             return now, now
-        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants)
+        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants, drawn=drawn)
         return _begun(now, ended), end
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
@@ -443,6 +452,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
         return self._array(state.x), self._array(state.c)
+
+    def _drawn(self) -> np.ndarray:
+        """What the randomization drew for the running episodes, as of `BatchState`."""
+        state = self.batch.state if self.randomization.varies_episodes else None
+        return np.zeros((0, 0)) if state is None else self._array(state.drawn)
 
     @staticmethod
     def _array(part: Any, dtype: Any = None) -> np.ndarray:
@@ -468,6 +482,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             infos[name], infos[mask_name] = value, mask
         if self.params.grips:
             infos["grip"], infos["_grip"] = told.grip.T, mask
+        if self.randomization.varies_episodes:
+            infos["drawn"], infos["_drawn"] = told.drawn.T.copy(), mask
         return infos
 
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
@@ -503,30 +519,31 @@ def _batch(
     dtype: torch.dtype,
     compile: bool | str,
     params: BallbotParams,
-    randomization: Randomization | None,
+    randomization: Randomization | str | None,
     engine: str,
+    history: int,
 ) -> "BallbotBatch | BallbotLoop | BallbotNative":
     """The envs of an engine; see `BallbotVectorEnv`."""
     numbers = np.float32 if dtype == torch.float32 else np.float64
     on_cpu = torch.device(device).type == "cpu"
     if engine == "native" or (engine == "auto" and on_cpu and compile == "auto"):
         # made in any case, because it checks the arguments; it allocates nothing
-        checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization)
+        checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization, history=history)
         native = _native(checked, numbers, must=engine == "native")
         if native is not None:
             return native
-    batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization)
+    batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, history=history)
     small = engine == "auto" and on_cpu and batch.num_envs < LOOP_BELOW and compile is not True
     if engine == "loop" or small:
-        return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization)
+        return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization, batch.history)
     return batch
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
     """The envs of a batch in machine code. Where that is not possible: None, or an error if it must be."""
-    if batch.randomization != Randomization():
+    if batch.randomization != Randomization() or batch.history:
         if must:
-            raise ValueError('engine="native" knows no Randomization; take engine="torch" or "loop"')
+            raise ValueError('engine="native" knows no Randomization and no history; take engine="torch" or "loop"')
         return None
     try:
         from ballbot_gym.native import BallbotNative, NativeUnavailableError

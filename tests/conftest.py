@@ -67,14 +67,10 @@ def interpreted(monkeypatch):
 
     For a problem that no other test solves, compiling takes longer than solving without machine code.
     """
-    compiled, search, shooting = (
-        pytest.importorskip(f"ballbot_baselines.{name}") for name in ("compiled", "search", "shooting")
-    )
+    compiled, shooting = (pytest.importorskip(f"ballbot_baselines.{name}") for name in ("compiled", "shooting"))
     monkeypatch.setattr(compiled, "loaded", lambda *_: None)
-    for name in ("shooting_ocp", "shooting_solver", "free_time_solver"):
-        own = functools.cache(getattr(shooting, name).__wrapped__)
-        for module in (search, shooting):
-            monkeypatch.setattr(module, name, own, raising=False)
+    for name in ("_ocp", "_solver", "_free_time_solver"):
+        monkeypatch.setattr(shooting, name, functools.cache(getattr(shooting, name).__wrapped__))
 
 
 @pytest.fixture

@@ -286,7 +286,7 @@ def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
     task = make_task("turn")
     full = certified.load(task, "paper")
     monkeypatch.setattr(certified, "EPISODES", 2)
-    monkeypatch.setattr(certified, "path_of", lambda task, robot: tmp_path / "package" / f"{task.id}.npz")
+    monkeypatch.setattr(certified, "path_of", lambda task, *_: tmp_path / "package" / f"{task.id}.npz")
     certify(("turn",), 2, out=tmp_path / "out", workers=1)
     assert not (tmp_path / "package").exists()
     certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
@@ -302,7 +302,7 @@ def test_certify_keeps_installed_optima_that_are_cheaper(tmp_path, monkeypatch, 
     first = replace(first, costs=first.costs * [1.0, 0.9, 1.1], trajectories=first.trajectories[:1])
     first.save(task, path, "paper")
     monkeypatch.setattr(certified, "EPISODES", 3)
-    monkeypatch.setattr(certified, "path_of", lambda task, robot: path)
+    monkeypatch.setattr(certified, "path_of", lambda *_: path)
     certify(("turn",), 3, install=True, out=tmp_path / "out", workers=1)
     assert "turn: 1 of 3 optima are cheaper than those installed" in capsys.readouterr().out
     now = certified.load(task, "paper").costs / first.costs

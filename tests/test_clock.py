@@ -9,6 +9,7 @@ from test_examples import load
 
 from ballbot_baselines import find_optimum, regret
 from ballbot_baselines.batched import solves
+from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import BallbotEnv
@@ -17,7 +18,9 @@ from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
 from ballbot_gym.step_code import Judge
+from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.transition import outcome
+from ballbot_train.report.playground import engine_script
 
 STEPS = 16
 CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}
@@ -108,6 +111,9 @@ def test_the_optimum_repeats_in_the_env_at_its_cost_and_controllers_come_near_it
     assert tracked.success
     assert tracked.cost == pytest.approx(optimum.cost, rel=0.01)
     assert rollout(env, NmpcController(task, params), options=start).cost == pytest.approx(optimum.cost, rel=0.01)
+    linear = rollout(env, LqrController(task, params), options=start)
+    assert linear.success
+    assert linear.cost < 1.3 * optimum.cost  # measured: at most 1.19 on 12 starts of each task
     env.reset(options=start)
     costs = [env.step(u / params.force_limit)[4]["cost"] for u in optimum.trajectory.u[:STEPS]]  # rounding grows later
     rates = [
@@ -119,6 +125,15 @@ def test_the_optimum_repeats_in_the_env_at_its_cost_and_controllers_come_near_it
     found = regret(optimum.trajectory, task, params, c)
     assert found.success
     assert abs(found.regret) < 1e-6
+
+
+def test_where_the_robot_is_linear_lqr_along_a_moving_reference_is_optimal_but_for_its_price_of_the_end(params):
+    task, x, c = load("figure_eight").FigureEight(), np.zeros(8), np.array([0.02])
+    x[0] = 0.02
+    env = BallbotEnv(task, physics="rk4", params=params)
+    tracked = rollout(env, LqrController(task, params), options={"state": x, "constants": c})
+    # measured: 1.0 %, and less than 1e-6 without that price
+    assert tracked.cost == pytest.approx(find_optimum(task, params, x, c).cost, rel=0.015)
 
 
 def test_an_optimum_may_start_later_in_the_episode(task, params):
@@ -133,3 +148,8 @@ def test_an_optimum_may_start_later_in_the_episode(task, params):
 
 def test_batches_of_optima_leave_a_task_with_a_clock_to_find_optimum(task, params):
     assert not solves(task, params)
+
+
+def test_the_page_beside_a_benchmark_leaves_a_task_with_a_clock_out(task):
+    assert type(task) in TASKS.values()
+    assert task.id not in engine_script()

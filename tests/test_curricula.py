@@ -223,21 +223,6 @@ def test_a_share_of_the_episodes_repeats_starts_that_went_wrong(constants):
     assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0)]
 
 
-def test_episodes_on_optima_that_went_wrong_are_repeated_as_such(constants):
-    constants(ON_OPTIMA=1.0, RETRIES=1.0)
-    made = backwards(num_envs=50)
-    torch.manual_seed(0)
-    run(made, 2 * made.task.steps)
-    assert made._again.all()
-    assert (made._kind == curricula._ON_OPTIMUM).all()
-    starts = made._starts
-    known = {(*x, int(k)) for x, k in zip(starts.x.float().T.tolist(), starts.steps, strict=True)}
-    assert {(*x, int(k)) for x, k in zip(made._begun[:8].T.tolist(), made._begun[-1], strict=True)} <= known
-    counts = made._on_optima.state()
-    run(made, made.task.steps)
-    assert counts == pytest.approx(made._on_optima.state(), nan_ok=True)
-
-
 def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     task = make_task("turn", duration=8.0)
     starts = curricula.optimal_starts(task, default_params(), 1, 100)
@@ -255,36 +240,6 @@ def test_optima_with_a_reserve_end_deeper_in_the_goal():
         return max(float(excess) for excess in task.goal(starts.x[:, -1], starts.c[:, -1]))
 
     assert last_excess(0.5) < last_excess(0.0)
-
-
-@pytest.mark.parametrize(
-    ("share", "seconds", "narrows"),
-    [(0.5, 1.0, False), (float("nan"), 1.0, False), (0.7, 0.1, True), (0.7, 0.08, False)],
-)
-def test_the_goal_narrows_only_where_enough_episodes_on_optima_succeed_too_and_begin_anywhere(
-    share, seconds, narrows, constants
-):
-    constants(EPISODES=1, SUCCESS=0.0, REACH=seconds)
-    made = backwards()
-    made._on_optima.share = share
-    made._count(torch.ones(6, dtype=torch.bool), torch.ones(6, dtype=torch.bool))
-    assert (made.difficulty["goal_factor"] < 5) == narrows
-
-
-def test_starts_on_optima_longer_than_an_episode_are_anywhere_where_an_episode_may_begin(constants):
-    constants(REACH=0.06)
-    made = backwards(duration=0.06)
-    made._on_optima.share = 1.0
-    assert float(made._starts.left.max()) * made.task.control_dt > made.task.duration
-    assert made._optima_succeed
-
-
-def test_what_is_drawn_widens_whatever_starts_on_optima_achieve(constants):
-    constants(RAMPS={"max_speed": (4.0, 1.0)}, GOAL_FACTOR=1.0, EPISODES=1, SUCCESS=0.0)
-    made = backwards()
-    made._on_optima.share = 0.5
-    made._count(torch.ones(6, dtype=torch.bool), torch.ones(6, dtype=torch.bool))
-    assert made.difficulty["max_speed"] == 5.0
 
 
 @pytest.mark.parametrize(

@@ -112,15 +112,15 @@ def processes(monkeypatch):
         seed, out = (words[words.index(name) + 1] for name in ("--seed", "--out"))
         options["stdout"].write(f"seed {seed} says\n")
         if seed in fails:
-            return SimpleNamespace(returncode=1)
+            return SimpleNamespace(wait=lambda: 1)
         settings = json.loads(json.dumps(asdict(LEARNERS["dagger"].settings("stabilize"))))
         training = {"learner": "dagger", "task": "stabilize", "seed": int(seed), "settings": settings}
         measured = {"success": 0.9 + 0.01 * int(seed), "falls": int(seed), "regret_mean": 0.1}
         described = {"spec": {"task": "x"}, "training": training, "training_seconds": 60.0, "measured": measured}
         files.write(f"{out}/policy.json", json.dumps(described))
-        return SimpleNamespace(returncode=0)
+        return SimpleNamespace(wait=lambda: 0)
 
-    monkeypatch.setattr(seeds.subprocess, "run", run)
+    monkeypatch.setattr(seeds.subprocess, "Popen", run)
     return calls, fails
 
 

@@ -121,8 +121,13 @@ def test_a_reward_threshold_is_of_the_papers_robot_alone():
         assert gymnasium.make("BallbotStabilize-v0", physics="rk4", **keywords).spec.reward_threshold == threshold
 
 
-@pytest.mark.parametrize(("limit", "steps"), [(7, 7), (1000, 20), (-1, 20), (None, 20)])
-@pytest.mark.parametrize("mode", [None, "sync", "async", "vector_entry_point"])
+@pytest.mark.parametrize(
+    ("mode", "limit", "steps"),
+    [
+        *((mode, 7, 7) for mode in (None, "sync", "async", "vector_entry_point")),
+        *((mode, limit, 20) for mode in (None, "vector_entry_point") for limit in (1000, -1, None)),
+    ],
+)
 def test_max_episode_steps_cuts_episodes_short_and_lengthens_none(mode, limit, steps):
     keywords = {"physics": "rk4", "duration": 0.4, "max_episode_steps": limit}
     if mode is None:
@@ -222,23 +227,6 @@ def test_same_seed_is_bit_identical_across_processes():
     assert theirs == {
         f"{task} {physics}": digest(task, physics) for task, physics in itertools.product(TASKS, installed_physics())
     }
-
-
-def test_reset_repeats_with_the_seed_in_the_middle_of_an_episode(task, physics, make_env):
-    env = make_env(task, physics=physics)
-    _, first = env.reset(seed=7)
-    after = env.step([0.3, -0.2])[0]
-    env.step([1.0, 1.0])
-    _, again = env.reset(seed=7)
-    np.testing.assert_array_equal(again["state"], first["state"])
-    np.testing.assert_array_equal(again["constants"], first["constants"])
-    np.testing.assert_array_equal(env.step([0.3, -0.2])[0], after)
-
-
-def test_different_seeds_and_following_episodes_differ(task, make_env):
-    env = make_env(task, physics="rk4")
-    starts = [env.reset(seed=seed)[0] for seed in (0, 1, None, None)]
-    assert all((a != b).any() for a, b in itertools.combinations(starts, 2))
 
 
 def test_every_physics_draws_the_same_episodes(task, physics, make_env):
@@ -388,22 +376,12 @@ def test_action_is_the_force_in_units_of_the_limit(make_env, action):
     np.testing.assert_array_equal(env.step(action)[-1]["force"], [87.5, -175.0])
 
 
-BAD_ACTIONS = {
-    "NaN": ([math.nan, 0.0], "finite"),
-    "infinite": ([0.0, math.inf], "finite"),
-    "too long": ([0.0, 0.0, 0.0], r"shape \(2,\), not \(3,\)"),
-    "too deep": ([[0.0, 0.0]], r"shape \(2,\), not \(1, 2\)"),
-    "scalar": (0.5, r"shape \(2,\), not \(\)"),
-    "None": (None, r"shape \(2,\)"),
-}
-
-
-@pytest.mark.parametrize(("action", "problem"), BAD_ACTIONS.values(), ids=BAD_ACTIONS.keys())
-def test_bad_action_is_refused_and_changes_nothing(make_env, physics, action, problem):
+def test_bad_action_is_refused_and_changes_nothing(make_env, physics):
     env = make_env(physics=physics)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=problem):
-        env.step(action)
+    for action in ([math.nan, 0.0], [0.0, math.inf], [0.0] * 3, [[0.0, 0.0]], 0.5, None):
+        with pytest.raises(ValueError, match=r"action must (be finite|have shape \(2,\), not \()"):
+            env.step(action)
     after = env.step([0.1, 0.1])[0]
     env.reset(seed=0)
     np.testing.assert_array_equal(env.step([0.1, 0.1])[0], after)
@@ -412,81 +390,9 @@ def test_bad_action_is_refused_and_changes_nothing(make_env, physics, action, pr
 # --- bad input ---
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "error", "problem"),
-    [
-        ({"physics": "dart"}, ValueError, "unknown physics 'dart'; known: 'bullet', 'mujoco', 'rk4'"),
-        ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'"),
-        ({"task": "juggle"}, ValueError, "unknown task 'juggle'; known: 'stabilize'"),
-        (
-            {"durration": 4.0},
-            TypeError,
-            "Stabilize-v0 got an unexpected keyword argument 'durration'; it has .*duration",
-        ),
-        ({"duration": -1.0}, ValueError, "Stabilize: duration must be positive"),
-        ({"task": Stabilize(), "duration": 4.0}, ValueError, r"fields \['duration'\] cannot be given together"),
-        ({"physics_dt": 0.003}, ValueError, "whole fraction"),
-    ],
-)
-def test_bad_argument_is_named(kwargs, error, problem):
-    with pytest.raises(error, match=problem):
-        BallbotEnv(**kwargs)
-
-
 def test_unknown_task_field_through_gymnasium_make_is_a_type_error(task):
     with pytest.raises(TypeError, match=f"{task.id} got an unexpected keyword argument 'colour'; it has"):
         gymnasium.make(task.id, colour="red")
-
-
-BAD_OPTIONS = {
-    "unknown": ({"stat": UPRIGHT}, r"unknown reset options \['stat'\]; known: 'state', 'constants'"),
-    "short state": ({"state": [0.0] * 7}, "state must be 8 finite numbers"),
-    "deep state": ({"state": [[0.0] * 8]}, "state must be 8 finite numbers"),
-    "NaN state": ({"state": [math.nan] * 8}, "state must be 8 finite numbers"),
-    "words for a state": ({"state": "upright"}, "state must be 8 finite numbers"),
-    "fallen state": ({"state": leaning(1.5)}, r"start state is out of range.*γ = 1.5.*tilt 85.9° of at most 80.0°"),
-    "long constants": ({"constants": [0.0] * 99}, "constants must be"),
-    "unknown constant": (
-        {"constants": {"colour": 1.0}},
-        r"no constants \['colour'\]; (it has \[|its episodes have none)",
-    ),
-}
-
-
-@pytest.mark.parametrize(("options", "problem"), BAD_OPTIONS.values(), ids=BAD_OPTIONS.keys())
-def test_bad_option_is_named(task, make_env, options, problem):
-    env = make_env(task, physics="rk4")
-    with pytest.raises(ValueError, match=problem):
-        env.reset(seed=0, options=options)
-
-
-@pytest.mark.parametrize(
-    ("task", "constants", "problem"),
-    [
-        ("turn", {"speed": 0.0}, "speed must be in"),
-        ("turn", {"speed": 13.0}, "speed must be in"),
-        ("orbit", {"radius": 0.5}, "radius must exceed"),
-        ("orbit", {"speed": 0.0}, "speed must not be 0"),
-        ("weave", {"obstacle1_radius": 0.0}, "obstacle1_radius must be positive"),
-        ("weave", {"obstacle0_x": 7.0, "obstacle0_y": 0.0, "goal_x": 7.0}, "the goal lies in obstacle 0"),
-        ("orbit", {"radius": math.nan}, "constants must be 2 finite numbers"),
-    ],
-)
-def test_senseless_constant_is_named(make_env, task, constants, problem):
-    with pytest.raises(ValueError, match=problem):
-        make_env(task, physics="rk4").reset(seed=0, options={"constants": constants})
-
-
-def test_obstacle_on_the_start_is_refused(make_env):
-    env = make_env("weave", physics="rk4")
-    on_start = {"obstacle0_x": 0.0, "obstacle0_y": 0.0, "obstacle0_radius": 0.5}
-    with pytest.raises(ValueError, match=r"obstacle|start"):
-        env.reset(seed=0, options={"constants": on_start})
-
-
-def test_step_before_reset_is_refused(physics, make_env):
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"step\(\) before reset"):
-        make_env(physics=physics).step([0.0, 0.0])
 
 
 def test_step_after_the_end_is_refused(physics, make_env):

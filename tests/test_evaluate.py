@@ -100,12 +100,6 @@ def test_episodes_are_read_back_as_they_were_written(name, tmp_path):
     assert about == ({} if name.endswith(".csv") else {"commit": "none"})
 
 
-def test_a_file_without_episodes_is_refused(tmp_path):
-    (tmp_path / "leaderboard.json").write_text('{"rows": []}')
-    with pytest.raises(ValueError, match="holds no episodes"):
-        read_results(tmp_path)
-
-
 @pytest.mark.parametrize(
     "name", ["=cmd|' /C calc'!A0.json", "+1+1", "@SUM(A1)", "-x", "'=x", "\tx", "plain", 'a,"b"', "'x"]
 )
@@ -175,11 +169,6 @@ def test_a_policy_file_and_an_expert_by_name_are_evaluated(tmp_path):
     assert evaluate.evaluate("lqr", "stabilize", 1, "rk4").success == 1
 
 
-def test_what_cannot_act_is_refused():
-    with pytest.raises(TypeError, match="is no policy"):
-        evaluate.evaluate(3, "stabilize", 1, "rk4")
-
-
 def test_noise_reaches_the_controller_and_only_it():
     seen = []
     idle = FunctionController(lambda t, x: seen.append(x) or np.zeros(2))
@@ -207,11 +196,6 @@ def test_without_names_every_expert_and_shipped_policy_is_benchmarked():
         assert names == [*CONTROLLERS, *shipped_policies(make_task(task))]
 
 
-def test_an_unknown_controller_is_an_error_that_names_the_known_ones():
-    with pytest.raises(ValueError, match=r"unknown controller pid; known: lqr, trajopt"):
-        benchmark.controllers_of(["stabilize"], ["pid"])
-
-
 def test_controllers_and_tasks_are_given_once_and_at_least_one_task(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="controller lqr is given more than once"):
         benchmark.controllers_of(["stabilize"], ["lqr", "nmpc", "lqr"])
@@ -225,39 +209,10 @@ def test_controllers_and_tasks_are_given_once_and_at_least_one_task(tmp_path, mo
         benchmark.controllers_of(["turn"], ["mine.json", "./mine.safetensors"])
 
 
-@pytest.mark.parametrize(
-    ("episodes", "message"),
-    [
-        (0, "must be 1 to 200, or a list of indices, not 0"),
-        (201, "must be 1 to 200"),
-        ([], "is empty"),
-        ([0, 0], "names an episode twice"),
-        ([0, 200], "must be 0 to 199, not 200"),
-        ([-1], "must be 0 to 199, not -1"),
-    ],
-)
-def test_episodes_that_do_not_exist_or_come_twice_are_refused(episodes, message):
-    with pytest.raises(ValueError, match=message):
-        evaluate.evaluate("lqr", "stabilize", episodes, "rk4")
-
-
-def test_episodes_that_are_no_numbers_are_refused():
-    for episodes in (1.5, ["0"]):
-        with pytest.raises(TypeError, match=r"whole numbers|number of episodes"):
-            evaluate.evaluate("lqr", "stabilize", episodes, "rk4")
-
-
 def test_chosen_episodes_are_those_that_are_run():
     rows = [evaluate.evaluate("lqr", "stabilize", chosen, "rk4") for chosen in ([3], np.array([3]), range(3, 4))]
     assert len({row.cost_mean for row in rows}) == 1
     assert rows[0].cost_mean != evaluate.evaluate("lqr", "stabilize", [4], "rk4").cost_mean
-
-
-@pytest.mark.parametrize("content", ["[" * 100_000, '{"about": {}, "episodes": [{"task": 3}]}', "\xff", '{"about": 3}'])
-def test_damaged_results_are_refused(content, tmp_path):
-    (tmp_path / "leaderboard.json").write_text(content, encoding="latin-1")
-    with pytest.raises(ValueError, match="holds no episodes"):
-        read_results(tmp_path)
 
 
 def test_results_that_are_cut_off_are_refused(tmp_path):
@@ -273,34 +228,22 @@ def test_results_that_are_cut_off_are_refused(tmp_path):
                 read_results(path)
 
 
-LIGHT = """
-import sys
-{code}
-print(sorted({{"torch", "casadi", "scipy", "stable_baselines3", "tyro", "matplotlib"}} & set(sys.modules)))
-"""
+IMPORTS = [
+    ("import ballbot_train.evaluation.benchmark, ballbot_train.evaluation.comparison", []),
+    ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
+    ("from ballbot_train import evaluate, shipped_policies", []),
+    ("evaluate(FunctionController(lambda t, x: (0.0, 0.0)), 'stabilize', 1, 'rk4')", []),
+    ("import ballbot_train.learning.demonstrations", ["casadi", "scipy"]),
+    ("from ballbot_train import load_policy", ["casadi", "scipy", "torch"]),
+]
 
 
-@pytest.mark.parametrize(
-    ("code", "loaded"),
-    [
-        ("from ballbot_train import evaluate, shipped_policies", []),
-        ("import ballbot_train.evaluation.benchmark, ballbot_train.evaluation.comparison", []),
-        ("import ballbot_train.evaluation.robustness, ballbot_train.evaluation.basins", []),
-        ("import ballbot_train.learning.demonstrations", ["casadi", "scipy"]),
-        (
-            "from ballbot_train import evaluate\n"
-            "class Idle:\n"
-            "    def reset(self, t, x, c): pass\n"
-            "    def act(self, t, x): return (0.0, 0.0)\n"
-            "evaluate(Idle(), 'stabilize', 1, 'rk4')",
-            [],
-        ),
-        ("from ballbot_train import load_policy", ["torch"]),
-    ],
-)
-def test_an_import_loads_only_what_it_needs(code, loaded):
-    run = subprocess.run([sys.executable, "-c", LIGHT.format(code=code)], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == str(loaded)
+def test_an_import_loads_only_what_it_needs():
+    code = "import sys; from ballbot_gym.rollout import FunctionController\n"
+    heavy = "torch", "casadi", "scipy", "stable_baselines3", "tyro", "matplotlib"
+    code += "".join(f"{line}\nprint(sorted(set({heavy}) & set(sys.modules)))\n" for line, _ in IMPORTS)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines() == [str(loaded) for _, loaded in IMPORTS]
 
 
 def test_the_short_paths_are_the_same_functions():

@@ -22,16 +22,11 @@ TYPED = "import sys\nsys.argv = ['ballbot', '{}']\nfrom ballbot_train.cli import
     ("code", "library", "extra"),
     [
         ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0')", "torch", "train"),
-        ("from ballbot_gym.batch import BallbotBatch", "torch", "train"),
-        ("from ballbot_baselines import find_optimum", "casadi", "baselines"),
         (
             "import ballbot_gym, ballbot_baselines as b; b.CONTROLLERS['lqr'](ballbot_gym.TASKS['turn'](), None)",
             "scipy",
             "baselines",
         ),
-        ("from ballbot_train import BallbotVecEnv", "stable_baselines3", "train"),
-        ("from ballbot_train import load_policy", "safetensors", "train"),
-        ("from ballbot_train.cli import main", "rich", "train"),
         ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
         (
             "from ballbot_train.executors import Workers, open_pool; open_pool(Workers(ray='local')).__enter__()",
@@ -45,8 +40,6 @@ TYPED = "import sys\nsys.argv = ['ballbot', '{}']\nfrom ballbot_train.cli import
             "train",
         ),
         ("import ballbot_train.learning.tuning", "optuna", "tune"),
-        (TYPED.format("paper"), "matplotlib", "train"),
-        (TYPED.format("demos"), "minari", "train"),
         (TYPED.format("compare"), "tyro", "train"),
         ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
     ],

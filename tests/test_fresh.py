@@ -170,50 +170,18 @@ def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path
     assert worst["replay"] in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", ["stabilize", "weave"])
-def test_bins_are_drawn_for_every_measure(name):
+def test_bins_are_drawn_for_every_measure():
     from ballbot_train.report import figures
 
-    result = evaluate_fresh("shac", name, 30)
+    result = evaluate_fresh("shac", "stabilize", 30)
     drawn = figures.fresh_figure(result, result.bins())
     assert len(drawn.axes) >= 3 * len(result.measures)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"policy": "lqr"}, "lqr is an expert"),
-        ({"policy": "pid"}, "unknown controller pid"),
-        ({"policy": "dagger"}, "unknown controller dagger"),  # Stabilize has none
-        ({"policy": "shac", "task": "dance"}, "unknown task dance"),
-        ({"policy": "shac", "fresh": -1}, "fresh must be at least 0, not -1"),
-        ({"policy": "shac", "seed": -1}, "seed must be at least 0"),
-        ({"policy": "shac", "bins": 0}, "bins must be at least 1"),
-        ({"policy": "shac", "fresh": 5, "optima": 6}, "optima must be at most the 5 fresh episodes"),
-        ({"policy": "shac", "fresh": 0}, "nothing to run"),
-        ({"policy": "lqr", "episodes": 500}, "episodes must be at most 200"),
-        ({"policy": "nowhere.json"}, "nowhere.json is not a policy"),
-    ],
-)
-def test_what_cannot_be_run_is_refused_before_anything_is_written(arguments, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    policy = arguments.pop("policy")
-    with pytest.raises(ValueError, match=message):
-        evaluate(policy, **arguments)
-    assert not any(tmp_path.iterdir())
 
 
 def test_a_policy_file_names_its_task(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     evaluate(str(shipped_policies(Turn())["dagger"]), fresh=10, out=tmp_path / "out")
     assert json.loads((tmp_path / "out" / "fresh.json").read_text())["about"]["task"] == "turn"
-
-
-def test_numbers_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="the number of fresh episodes must be 1 to 1,000,000, not 0"):
-        evaluate_fresh("shac", "stabilize", 0)
-    with pytest.raises(ValueError, match="seed must be 0 to"):
-        evaluate_fresh("shac", "stabilize", 1, seed=-1)
 
 
 def test_what_does_not_act_is_refused():

@@ -160,23 +160,6 @@ def test_an_action_that_is_not_finite_changes_nothing(count):
 
 
 @needs_compiler
-def test_infos_that_a_user_keeps_stay_as_they_are():
-    """Arrays of last observations are used again, but not while somebody has them."""
-    env = BallbotVectorEnv(50, "stabilize", engine="native")
-    env.reset(seed=0)
-    kept = [infos for action in actions_of(50, 60, scale=3) if "final_obs" in (infos := env.step(action)[4])]
-    told = [(infos["final_obs"].copy(), infos["final_info"]["violated"].copy()) for infos in kept]
-    assert len(told) > 10
-    for action in actions_of(50, 30, scale=3):
-        env.step(action)
-    for (seen, violated), infos in zip(told, kept, strict=True):
-        np.testing.assert_array_equal(infos["final_obs"], seen)
-        np.testing.assert_array_equal(infos["final_info"]["violated"], violated)
-        np.testing.assert_array_equal(np.isnan(seen).all(1), ~infos["_final_obs"])
-        assert not np.isnan(seen[infos["_final_obs"]]).any()
-
-
-@needs_compiler
 def test_copies_and_pickles_go_on_alike_and_apart():
     env, actions = BallbotVectorEnv(5, "weave", engine="native", duration=0.16), actions_of(5)
     play(env, actions[:10], 0)

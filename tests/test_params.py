@@ -138,8 +138,3 @@ def test_unequal_force_limits_are_refused(tmp_path):
     path.write_text(text)
     with pytest.raises(UrdfError, match=r"\[300.0, 350.0\] N"):
         BallbotParams.from_urdf(path)
-
-
-def test_absent_urdf_is_named(tmp_path):
-    with pytest.raises(UrdfError, match=r"nowhere\.urdf: no such file; give the path of a URDF"):
-        BallbotParams.from_urdf(tmp_path / "nowhere.urdf")

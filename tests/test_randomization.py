@@ -10,7 +10,7 @@ import torch
 
 from ballbot_gym import Randomization
 from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.randomization import actuate, normals
+from ballbot_gym.randomization import TRACKS, actuate, normals
 from ballbot_gym.vector import BallbotVectorEnv
 
 ROBOTS = Randomization(body_mass=(0.8, 1.3), ball_mass=(0.5, 2.0), com_height=(0.9, 1.1), inertia=(0.7, 1.4))
@@ -56,30 +56,6 @@ def test_everything_is_off_by_default(physics, make_env, rng):
         play(make_env(physics=physics, randomization=Randomization()), actions),
         play(make_env(physics=physics), actions),
     )
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("body_mass", (1.2, 0.8), "body_mass must be a finite range"),
-        ("body_mass", (0.0, 1.0), "body_mass must be positive"),
-        ("com_height", (1.0, math.inf), "com_height must be a finite range"),
-        ("inertia", 1.0, "inertia must be a finite range"),
-        ("actuator_lag", (-0.1, 0.1), "actuator_lag must be at least 0"),
-        ("lean_noise", -0.1, "lean_noise must be finite and at least 0"),
-        ("push_impulse", (math.nan, 1.0), "push_impulse must be"),
-        ("push_interval", 0.0, "push_interval must be positive"),
-    ],
-)
-def test_bad_range_is_refused_by_name(field, value, message):
-    with pytest.raises(ValueError, match=message):
-        Randomization(**{field: value})
-
-
-def test_delay_must_be_whole_control_steps(make_env):
-    assert Randomization(actuator_delay=(0.02, 0.06)).delay_steps(0.02) == (1, 3)
-    with pytest.raises(ValueError, match="whole control steps"):
-        make_env(randomization=Randomization(actuator_delay=(0.0, 0.03)))
 
 
 def test_draws_fill_their_ranges(rng):
@@ -298,3 +274,98 @@ def test_vector_env_tells_the_robots_of_its_running_episodes(params):
     vec.reset(seed=0)
     assert len(set(vec.get_attr("episode_params"))) == 3
     vec.close()
+
+
+# --- tracks ---
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_track_is_the_same_for_all_kinds_of_envs(track, make_env):
+    """The same name, what it draws in info under one key, and the same motion for the same draw."""
+    env = make_env(physics="rk4", randomization=track)
+    many = BallbotVectorEnv(3, engine="torch", compile=False, dtype="float64", randomization=track)
+    one_by_one = BallbotVectorEnv(3, engine="loop", randomization=track)
+    assert env.randomization == many.randomization == one_by_one.randomization == TRACKS[track]
+    (_, infos), (_, looped) = many.reset(seed=5), one_by_one.reset(seed=5)
+    assert len(infos["drawn"][0]) == TRACKS[track].episode_draws
+    np.testing.assert_allclose(looped["drawn"], infos["drawn"], rtol=1e-6)
+    assert len(np.unique(infos["drawn"], axis=0)) == (3 if track != "late" else len(np.unique(infos["drawn"][:, 5])))
+    options = {"state": infos["state"][1], "drawn": infos["drawn"][1]}
+    np.testing.assert_array_equal(env.reset(options=options)[1]["drawn"], infos["drawn"][1])
+    for action in np.random.default_rng(0).uniform(-0.2, 0.2, (8, 2)):
+        infos, info = many.step(np.tile(action, (3, 1)).astype(np.float32))[4], env.step(action.astype(np.float32))[4]
+        np.testing.assert_allclose(infos["state"][1], info["state"], atol=1e-6)
+        np.testing.assert_allclose(infos["force"][1], info["force"], rtol=1e-6)
+        assert (info["drawn"] == options["drawn"]).all()
+
+
+def test_weak_actuator_gives_its_share_of_the_force_and_friction_is_a_share_too(make_env):
+    robots = Randomization(force=(0.5, 0.5), friction=(0.5, 0.5))
+    env = make_env(physics="rk4", robot="rolling", randomization=robots)
+    env.reset(seed=0)
+    assert env.step([0.2, -0.1])[4]["force"] == pytest.approx(0.5 * env.params.force_limit * np.array([0.2, -0.1]))
+    assert env.episode_params.friction == env.params.friction / 2
+    assert env.episode_params.force_limit == env.params.force_limit / 2
+    plain = make_env(physics="rk4", randomization=robots)
+    plain.reset(seed=0)
+    assert plain.episode_params.friction == math.inf
+
+
+def test_biased_sensors_are_wrong_by_the_same_all_the_time_and_odometry_drifts(make_env):
+    env = make_env(physics="rk4", randomization=Randomization(lean_bias=0.1, lean_rate_bias=0.2, odometry_drift=0.3))
+    seen, info = env.reset(seed=3)
+    errors = []
+    for _ in range(4):
+        seen, *_, info = env.step(np.zeros(2))
+        errors.append(seen * env.task.observation_scale - info["state"])
+    drift, lean, rate = info["drawn"][8:10], info["drawn"][10:12], info["drawn"][12:]
+    for k, error in enumerate(errors, start=1):
+        expected = [*(k * env.task.control_dt * drift), *lean, *drift, *rate]
+        np.testing.assert_allclose(error, expected, atol=1e-5)
+
+
+def test_unknown_track_is_refused_with_the_names_of_all(make_env):
+    with pytest.raises(ValueError, match="unknown randomization 'windy'; known: 'unknown', 'late', 'noisy', 'real'"):
+        make_env(randomization="windy")
+
+
+# --- observations for memory ---
+
+
+@pytest.mark.parametrize("task", ["stabilize", "orbit"])
+def test_history_shows_the_last_observations_with_their_actions_in_every_kind_of_env(task, make_env):
+    plain, env = make_env(task, physics="rk4"), make_env(task, physics="rk4", history=2)
+    own = plain.observation_space.shape[0]
+    assert env.observation_space.shape == (own + 2 * (own + 2),)
+    many = BallbotVectorEnv(2, task, engine="torch", compile=False, dtype="float64", history=2)
+    looped = BallbotVectorEnv(2, task, engine="loop", history=2)
+    (_, infos), _ = many.reset(seed=0), looped.reset(seed=0)
+    options = {"state": infos["state"][0], "constants": infos["constants"][0]}
+    observed, actions = [plain.reset(options=options)[0]], []
+    assert (env.reset(options=options)[0] == [*observed[0], *np.zeros(2 * (own + 2))]).all()
+    for action in np.random.default_rng(0).uniform(-0.1, 0.1, (5, 2)).astype(np.float32):
+        observed.append(plain.step(action)[0])
+        actions.append(action)
+        before = [*zip(observed[:-1], actions, strict=True)][::-1][:2]
+        wanted = np.concatenate([observed[-1], *(part for pair in before for part in pair)])
+        wanted = np.pad(wanted, (0, own + 2 * (own + 2) - len(wanted)))
+        kept = env.get_state()
+        np.testing.assert_array_equal(env.step(action)[0], wanted)
+        env.set_state(kept)
+        np.testing.assert_array_equal(env.step(action)[0], wanted)
+        for vector in (many, looped):
+            np.testing.assert_allclose(vector.step(np.tile(action, (2, 1)))[0][0], wanted, atol=1e-5)
+
+
+def test_history_of_an_ended_episode_is_forgotten(make_env):
+    env = make_env(physics="rk4", history=1)
+    own = len(env.task.observation_scale)
+    many = BallbotVectorEnv(2, engine="torch", compile=False, history=1, duration=0.04)
+    env.reset(seed=0)
+    env.step(np.ones(2))
+    assert not env.reset()[0][own:].any()
+    many.reset(seed=0)
+    many.step(np.ones((2, 2), np.float32))
+    seen, *_, infos = many.step(np.ones((2, 2), np.float32))
+    assert not seen[:, own:].any()
+    assert infos["final_obs"][0][own:].all()

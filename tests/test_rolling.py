@@ -100,24 +100,6 @@ def test_accelerations_and_contact_are_those_of_newton_and_euler(robot, rng):
         np.testing.assert_allclose(dynamics.contact(robot, x, u), floor, rtol=0, atol=1e-9 * np.abs(floor).max())
 
 
-def test_accelerations_are_lagranges_from_the_energy(robot, rng):
-    """d/dt ∂T/∂q̇ − ∂(T − V)/∂q = Q, with T + V from `energy`, differentiated symbolically."""
-    q, v, u = casadi.SX.sym("q", 4), casadi.SX.sym("v", 4), casadi.SX.sym("u", 2)
-    total = dynamics.energy(robot, casadi.vertcat(q, v))
-    potential = casadi.substitute(total, v, casadi.SX.zeros(4))
-    lagrangian = total - 2 * potential  # T − V
-    momentum = casadi.gradient(lagrangian, v)
-    r = robot.ball_radius
-    force = casadi.vertcat(u[0], u[1], -r * u[0], -r * u[1] * casadi.cos(q[2]))
-    rest = force + casadi.gradient(lagrangian, q) - casadi.jtimes(momentum, q, v)
-    expected = casadi.Function("a", [q, v, u], [casadi.solve(casadi.jacobian(momentum, v), rest)])
-    for x, f in random_states(rng):
-        found = np.array(expected(x[:4], x[4:], f)).ravel()
-        np.testing.assert_allclose(
-            dynamics.accelerations(robot, x, f), found, rtol=1e-9, atol=1e-9 * np.abs(found).max()
-        )
-
-
 def test_the_papers_robot_is_a_rolling_one_of_no_radius_and_inertia(rng):
     paper = default_params()
     almost = dataclasses.replace(paper, rolls=True, ball_radius=1e-9, ball_inertia=1e-40)
@@ -132,16 +114,6 @@ def test_the_linearization_of_the_rolling_robot_moves_as_derived(rolling):
     a, b = linearize(rolling, np.zeros(8), np.zeros(2))
     # -a, b, c, -d of the paper's (5) and (6), which are 35.07, 60.40, 0.295 and 0.397
     assert (a[4, 2], a[6, 2], b[4, 0], b[6, 0]) == pytest.approx((-33.12, 57.77, 0.316, -0.441), abs=0.005)
-
-
-def test_the_power_of_the_drive_is_the_change_of_energy(robot):
-    """Both bodies together take up T·(ω_ball − ω_body), and the floor does no work."""
-    x, u, h = np.array(START), np.array([20.0, -15.0]), 1e-5
-    before, after = (dynamics.energy(robot, dynamics.step(robot, x, u, s * h)) for s in (-1, 1))
-    gamma, vx, vy, gamma_dot, theta_dot = x[2], *x[4:]
-    r = robot.ball_radius
-    power = u[0] * (vx - r * gamma_dot) + u[1] * (vy - r * math.cos(gamma) * theta_dot)
-    assert (after - before) / (2 * h) == pytest.approx(power, rel=1e-6)
 
 
 def test_a_steady_orbit_stays_one(rolling):

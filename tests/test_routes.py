@@ -133,35 +133,22 @@ def test_a_spec_with_routes_needs_a_frame_with_a_route():
         spec_for(make_task("stabilize"), "routes", (8,))
 
 
-@pytest.mark.parametrize("name", ["shac", "dagger"])
-def test_a_learner_teaches_its_routes_first_and_keeps_them(name, monkeypatch):
+def test_a_learner_teaches_its_routes_first_and_keeps_them(monkeypatch):
     monkeypatch.setattr(routing, "EPISODES", 60)
     monkeypatch.setattr(routing, "_STEPS", 5)
     monkeypatch.setattr(routing, "_DISTANCES", 1)
-    tiny = {
-        "shac": {"num_envs": 4, "horizon": 3, "iterations": 2, "one_way": True},
-        "dagger": {
-            "episodes_per_iteration": 1,
-            "candidate_episodes": 0,
-            "rollouts_per_plan": 0,
-            "tracked_rollouts_per_plan": 1,
-            "gradient_steps": 2,
-            "max_guesses": 1,
-            "iterations": 2,
-        },
-    }[name]
-    settings = replace(LEARNERS[name].settings("weave"), symmetry="routes", hidden=(8,), **tiny)
-    learner = LEARNERS[name].make(TASK, PARAMS, settings, 0, None)
+    tiny = {"num_envs": 4, "horizon": 3, "iterations": 2, "one_way": True, "hidden": (8,)}
+    settings = replace(LEARNERS["shac"].settings("weave"), symmetry="routes", **tiny)
+    learner = LEARNERS["shac"].make(TASK, PARAMS, settings, 0, None)
     before = [part.clone() for part in learner.network.routes.parameters()]
     learner.iterate()
     taught = [part.clone() for part in learner.network.routes.parameters()]
     assert not any(torch.equal(a, b) for a, b in zip(before, taught, strict=True))
-    resumed = LEARNERS[name].make(TASK, PARAMS, settings, 0, None)
+    resumed = LEARNERS["shac"].make(TASK, PARAMS, settings, 0, None)
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     learner.iterate()
     resumed.iterate()
     for kept, again in zip(taught, resumed.network.routes.parameters(), strict=True):
         assert torch.equal(kept, again)
-    if name == "shac":
-        for ours, theirs in zip(learner.network.parameters(), resumed.network.parameters(), strict=True):
-            assert torch.equal(ours, theirs)
+    for ours, theirs in zip(learner.network.parameters(), resumed.network.parameters(), strict=True):
+        assert torch.equal(ours, theirs)

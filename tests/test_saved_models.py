@@ -12,13 +12,10 @@ import pytest
 import torch
 from gymnasium.wrappers import (
     DiscretizeAction,
-    DtypeObservation,
     FlattenObservation,
     FrameStackObservation,
     NormalizeObservation,
     RescaleAction,
-    RescaleObservation,
-    TimeAwareObservation,
 )
 from rsl_rl.models import MLPModel
 from stable_baselines3 import PPO, SAC, TD3
@@ -151,17 +148,10 @@ WRAPPERS = {
         lambda env: RescaleAction(env, np.float32(-350), np.float32(350)),
         "trained on actions (2,) float32 from -350 to 350",
     ),
-    "RescaleObservation": (
-        lambda env: RescaleObservation(env, np.float32(-1), np.float32(1)),
-        "trained on observations (8,) float32 from -1 to 1, and those of BallbotStabilize-v0 are (8,) float32 from -34",
-    ),
     "NormalizeObservation": (NormalizeObservation, "trained on observations (8,) float32 from -inf to inf"),
-    "float64": (lambda env: DtypeObservation(env, np.float64), "trained on observations (8,) float64"),
     "stacked": (stacked, "24"),
-    "time": (TimeAwareObservation, "9"),
     "discrete": (lambda env: DiscretizeAction(env, 5), "2"),
     "another robot": (lambda env: make("rolling", 8.0), "from -5441.96 to 5441.96"),
-    "another duration": (lambda env: make("paper", 4.0), "from -1839.96 to 1839.96"),
 }
 
 

@@ -68,10 +68,7 @@ def test_an_episode_without_a_plan_has_failed_at_the_full_price(submitted, tmp_p
     honest = recordings.read(submitted()[1])
     first = honest.lengths[0]
     gave_up = replace(
-        honest,
-        lengths=changed(honest.lengths, 0, 0),
-        states=honest.states[first + 1 :],
-        actions=honest.actions[first:],
+        honest, lengths=changed(honest.lengths, 0, 0), states=honest.states[first + 1 :], actions=honest.actions[first:]
     )
     entry = verify(recordings.write(tmp_path / "gave-up.npz", honest.about, gave_up), EPISODES)
     assert (entry.falls, entry.ends, entry.costs[0]) == (1, ["no plan", "success"], 800.0)
@@ -115,11 +112,7 @@ def test_another_action_and_one_beyond_its_limit_are_refused(forge, submitted):
 
 def test_an_end_that_is_none_is_refused(forge, submitted):
     honest = recordings.read(submitted()[1])
-    shorter = {
-        "lengths": honest.lengths - [0, 3],
-        "states": honest.states[:-3],
-        "actions": honest.actions[:-3],
-    }
+    shorter = {"lengths": honest.lengths - [0, 3], "states": honest.states[:-3], "actions": honest.actions[:-3]}
     with pytest.raises(
         SubmissionError, match=r"episode 1, step \d+: the recording stops here, and the episode has not"
     ):
@@ -199,11 +192,7 @@ def test_a_folder_of_several_controllers_must_be_told_which(submitted, tmp_path)
 def test_motions_survive_the_way_through_text_and_file(rng, tmp_path):
     lengths = [3, 0, 5]
     motions = [
-        (
-            rng.integers(-(2**36), 2**36, (n + 1 if n else 0, 8)),
-            rng.integers(-(2**28), 2**28, (n, 2)),
-        )
-        for n in lengths
+        (rng.integers(-(2**36), 2**36, (n + 1 if n else 0, 8)), rng.integers(-(2**28), 2**28, (n, 2))) for n in lengths
     ]
     for motion in motions:
         for sent, arrived in zip(motion, recordings.from_text(recordings.to_text(motion)), strict=True):

@@ -60,12 +60,7 @@ def turned(x, angle):
         return np.array([np.sin(gamma) * np.cos(theta), np.sin(theta)])
 
     gamma, theta = x[2:4]
-    rate = np.array(
-        [
-            np.cos(gamma) * np.cos(theta) * x[6] - np.sin(gamma) * np.sin(theta) * x[7],
-            np.cos(theta) * x[7],
-        ]
-    )
+    rate = np.array([np.cos(gamma) * np.cos(theta) * x[6] - np.sin(gamma) * np.sin(theta) * x[7], np.cos(theta) * x[7]])
     nx, ny = rotation @ axis(gamma, theta)
     rx, ry = rotation @ rate
     height = np.cos(gamma) * np.cos(theta)
@@ -256,8 +251,7 @@ def steady_motion(task, c, params, rng):
 
 
 @pytest.mark.parametrize(
-    ("name", "frame"),
-    [("orbit", "radial"), ("weave", "slalom"), ("weave", "fine_slalom"), ("stabilize", "fine_rest")],
+    ("name", "frame"), [("orbit", "radial"), ("weave", "slalom"), ("weave", "fine_slalom"), ("stabilize", "fine_rest")]
 )
 def test_a_frame_knows_the_steady_motion_of_the_episode(params, rng, name, frame):
     task = TASKS[name]()

@@ -128,43 +128,6 @@ def test_arrays_that_are_no_trajectory_are_refused(change, problem):
         Trajectory(**{**GOOD, **change})
 
 
-def damaged_files(folder):
-    """Files that are no trajectory, by what is wrong with them."""
-    good = example(n=50).save(folder / "good.npz").read_bytes()
-    middle = len(good) // 3
-    np.save(folder / "one array.npy", np.zeros(3))
-    np.savez(folder / "no states.npz", t=np.zeros(1))
-    np.savez(folder / "objects.npz", t=np.array([{}]), x=np.zeros((1, 8)), u=np.zeros((1, 2)))
-    np.savez(folder / "bad shapes.npz", t=np.zeros(3), x=np.zeros((1, 8)), u=np.zeros((1, 2)))
-    (folder / "cut short.npz").write_bytes(good[: len(good) // 2])
-    (folder / "flipped bits.npz").write_bytes(
-        good[:middle] + bytes(b ^ 255 for b in good[middle:][:99]) + good[middle + 99 :]
-    )
-    (folder / "text.npz").write_text("not a trajectory")
-    (folder / "empty.npz").write_bytes(b"")
-    (folder / "folder.npz").mkdir()
-    return ("one array.npy", "no states.npz", "objects.npz", "bad shapes.npz", "cut short.npz", "flipped bits.npz") + (
-        "text.npz",
-        "empty.npz",
-        "folder.npz",
-        "absent.npz",
-    )
-
-
-def test_file_that_is_no_trajectory_is_named(tmp_path):
-    unnamed = []
-    for name in damaged_files(tmp_path):
-        try:
-            Trajectory.load(tmp_path / name)
-            unnamed.append(f"{name}: no error")
-        except TrajectoryError as error:
-            if name not in str(error):
-                unnamed.append(f"{name}: {error}")
-        except Exception as error:
-            unnamed.append(f"{name}: {type(error).__name__} {error}")
-    assert unnamed == []
-
-
 def test_write_makes_folders_and_returns_the_path(tmp_path):
     path = files.write(tmp_path / "a" / "b" / "text.txt", "γ")
     assert path.read_text(encoding="utf-8") == "γ"

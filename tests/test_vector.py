@@ -101,8 +101,7 @@ def test_episodes_are_not_recorded_and_carry_no_gradient_unless_asked():
 # --- the same environment as BallbotEnv(physics="rk4") ---
 
 
-@pytest.mark.parametrize("scale", [0.05, 1.2], ids=["gentle", "violent"])
-def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task, scale, make_vec, make_env, rng):
+def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task, make_vec, make_env, rng):
     """Actuated in the same way, in float64 they differ by the last digits of sine and cosine, which an unstable robot
     multiplies by up to e^(7.8 · 0.5) here.
     """
@@ -116,7 +115,7 @@ def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task,
         np.testing.assert_allclose(observations[i], observation, rtol=1e-6, atol=1e-12)
         assert_same_info(column(infos, i), info, 1e-12)
     for _ in range(60):
-        actions = rng.uniform(-scale, scale, (4, 2))
+        actions = rng.uniform(-1, 1, (4, 2)) * [[0.05], [0.05], [1.2], [1.2]]
         observations, rewards, terminations, truncations, infos = vec.step(actions)
         for i, env in enumerate(singles):
             observation, reward, terminated, truncated, info = env.step(actions[i])
@@ -249,44 +248,6 @@ def test_the_spec_of_vector_envs_makes_the_same_ones_again_also_from_json(keywor
     vec.close()
 
 
-def test_infos_have_the_form_of_gymnasiums_own_vector_env(task, make_vec):
-    def form(infos):
-        if isinstance(infos, dict):
-            return {key: form(value) for key, value in infos.items()}
-        return infos.shape, infos.dtype
-
-    sync = gymnasium.make_vec(
-        task.id,
-        num_envs=3,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-        physics="rk4",
-        duration=0.2,
-    )
-    vec = gymnasium.make_vec(task.id, num_envs=3, dtype=torch.float64, duration=0.2)
-    _, expected = sync.reset(seed=0)
-    _, infos = vec.reset(seed=0)
-    assert form(infos) == form(expected)
-    options = {"state": expected["state"][0], "constants": expected["constants"][0]}
-    _, expected = sync.reset(options=dict(options))
-    _, infos = vec.reset(options=options)
-    np.testing.assert_array_equal(infos["state"], expected["state"])
-    for k in range(10):
-        *ours, infos = vec.step(np.zeros((3, 2)))
-        *theirs, expected = sync.step(np.zeros((3, 2)))
-        ends = [each.pop("final_obs", None) for each in (infos, expected)]
-        assert form(infos) == form(expected)
-        for a, b in zip(ours[k == 9 :], theirs[k == 9 :], strict=True):  # the next episodes are drawn apart
-            assert a.dtype == b.dtype
-            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
-    # ours are one array, because Gymnasium's arrays of objects are nothing for torch
-    np.testing.assert_allclose(ends[0], np.stack(ends[1]), rtol=1e-6, atol=1e-6)
-    for key in INFO:
-        np.testing.assert_array_equal(infos["final_info"][f"_{key}"], [True] * 3)
-    sync.close()
-    vec.close()
-
-
 def test_only_ended_envs_have_final_observations(make_vec):
     vec = make_vec(2)
     _, infos = vec.reset(seed=0, options={"state": np.array([np.zeros(8), [0, 0, 1.39, 0, 0, 0, 2, 0]])})
@@ -314,64 +275,19 @@ def test_only_masked_envs_are_reset(make_vec):
     np.testing.assert_array_equal(again[1], vec.reset(seed=0)[0][1])
 
 
-@pytest.mark.parametrize(
-    ("mask", "error", "message"),
-    [
-        ([True, False], TypeError, "NumPy array of bool"),
-        (np.array([1, 0]), TypeError, "NumPy array of bool"),
-        (np.array([True]), ValueError, "shape"),
-        (np.array([False, False]), ValueError, "True somewhere"),
-        (np.ma.masked_array([True, False], [True, False]), TypeError, "NumPy array of bool"),
-    ],
-)
-def test_bad_reset_mask_is_refused(mask, error, message, make_vec):
-    with pytest.raises(error, match=message):
-        make_vec(2).reset(options={"reset_mask": mask})
-
-
-@pytest.mark.parametrize(
-    ("task", "options", "message"),
-    [
-        ("stabilize", {"stat": 1}, "unknown reset options"),
-        ("stabilize", {"state": np.zeros(7)}, "state must be finite"),
-        ("stabilize", {"state": np.full((2, 8), np.nan)}, "state must be finite"),
-        ("stabilize", {"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a limit"),
-        ("orbit", {"constants": {"tempo": 1.0}}, "no constants"),
-        ("orbit", {"constants": [[0.5, 1.0], [2.0, 1.0]]}, "radius must exceed"),
-    ],
-)
-def test_bad_start_is_refused_and_changes_nothing(task, options, message, make_vec):
-    vec = make_vec(2, task)
+def test_bad_start_is_refused_and_changes_nothing(make_vec):
+    vec = make_vec(2, "orbit")
     vec.reset(seed=0)
     before = vec.batch.state
-    with pytest.raises(ValueError, match=message):
-        vec.reset(seed=5, options=options)
+    for options, message in (
+        ({"state": np.array([np.zeros(8), [0, 0, 1.5, 0, 0, 0, 0, 0]])}, r"envs \[1\] violate a limit"),
+        ({"constants": {"tempo": 1.0}}, "no constants"),
+        ({"constants": [[0.5, 1.0], [2.0, 1.0]]}, "radius must exceed"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vec.reset(seed=5, options=options)
     for now, then in zip(vec.batch.state, before, strict=True):
         np.testing.assert_array_equal(now, then)
-
-
-def test_bad_arguments_are_refused():
-    for kwargs, error, message in (
-        ({"num_envs": 0}, ValueError, "num_envs"),
-        ({"num_envs": 10**9}, ValueError, "num_envs must be at most 1048576, not 1000000000"),
-        ({"num_envs": 10**9, "engine": "loop"}, ValueError, "num_envs must be at most 1048576"),
-        ({"num_envs": 2, "dtype": torch.float16}, ValueError, "dtype"),
-        ({"num_envs": 2, "compile": "yes"}, ValueError, "compile"),
-        ({"num_envs": 2, "render_mode": "human"}, ValueError, "render_mode"),
-        ({"num_envs": 2, "task": "juggle"}, ValueError, "unknown task"),
-        ({"num_envs": 2, "physics": "bullet"}, ValueError, 'num_envs=2, vectorization_mode="sync", physics="bullet"'),
-        ({"num_envs": 2, "physics": "dart"}, ValueError, "unknown physics 'dart'"),
-        ({"num_envs": 2, "autoreset_mode": "never"}, ValueError, "unknown autoreset_mode 'never'; known: 'NextStep'"),
-        (
-            {"num_envs": 2, "engine": "numpy"},
-            ValueError,
-            "unknown engine 'numpy'; known: 'auto', 'native', 'torch', 'loop'",
-        ),
-        ({"num_envs": 2, "max_episode_steps": 0}, ValueError, "max_episode_steps must be a positive whole number"),
-        ({"num_envs": 2, "frameskip": 4}, TypeError, "got an unexpected keyword argument 'frameskip'"),
-    ):
-        with pytest.raises(error, match=message):
-            BallbotVectorEnv(**kwargs)
 
 
 def test_steps_before_reset_and_after_close_and_bad_actions_are_refused(make_vec):
@@ -483,10 +399,10 @@ def play(batch, actions, first=0):
 def test_results_depend_neither_on_batch_size_nor_on_position(task):
     name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
     generator = torch.Generator().manual_seed(0)
-    actions = torch.rand(40, 37, 2, generator=generator) * 2 - 1
-    whole = play(BallbotBatch(name, 37, compile=False, duration=0.5), actions)
+    actions = torch.rand(12, 37, 2, generator=generator) * 2 - 1
+    whole = play(BallbotBatch(name, 37, compile=False, duration=0.16), actions)
     for first, count in ((0, 1), (3, 16), (19, 18), (36, 1)):
-        part = play(BallbotBatch(name, count, compile=False, duration=0.5), actions[:, first : first + count], first)
+        part = play(BallbotBatch(name, count, compile=False, duration=0.16), actions[:, first : first + count], first)
         for a, b in zip(part, whole, strict=True):
             assert torch.equal(a, b[:, first : first + count])
 
@@ -555,7 +471,7 @@ def casadi_gradient(task, params, x0, gain, forces):
     return np.array(gradient(forces.numpy().T)).T
 
 
-@pytest.mark.parametrize(("steps", "feedback"), [(400, True), (25, False)], ids=["8 s under LQR", "0.5 s open loop"])
+@pytest.mark.parametrize(("steps", "feedback"), [(150, True), (25, False)], ids=["3 s under LQR", "0.5 s open loop"])
 def test_gradient_of_the_cost_agrees_with_finite_differences_and_casadi(steps, feedback, params):
     lqr = pytest.importorskip("ballbot_baselines.lqr")
     batch = BallbotBatch("stabilize", 1, dtype=torch.float64, compile=False)
@@ -606,32 +522,37 @@ def test_detach_cuts_the_gradient():
 # --- compiled ---
 
 
-@pytest.mark.skipif(not batch_module._has_compiler(torch.device("cpu")), reason="no C++ compiler")
-def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wherever_an_env_stands():
-    """37 envs fill vector registers and leave a remainder, 5 fill none, and turning the order round moves each elsewhere.
+ONE_STEP = {"duration": 0.1, "control_dt": 0.01}  # one RK4 step: two in a row compile twice as long
+needs_compiler = pytest.mark.skipif(not batch_module._has_compiler(torch.device("cpu")), reason="no C++ compiler")
 
-    At a control step of one RK4 step: two in a row compile twice as long.
-    """
-    one = {"duration": 0.1, "control_dt": 0.01}
+
+@needs_compiler
+def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wherever_an_env_stands():
+    """37 envs fill vector registers and leave a remainder, and turning the order round moves each elsewhere."""
     actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    compiled, uncompiled = (BallbotBatch("stabilize", 37, compile=compile, **ONE_STEP) for compile in (True, False))
     with torch.no_grad():
-        compiled = BallbotBatch("stabilize", 37, compile=True, **one)
-        results = play(compiled, actions, range(37))
+        results, eager = (play(batch, actions, range(37)) for batch in (compiled, uncompiled))
         assert compiled.compiled
         turned = play(compiled, actions.flip(1), range(36, -1, -1))
-        few = play(BallbotBatch("stabilize", 5, compile=True, **one), actions[:, 7:12], range(7, 12))
-        uncompiled = BallbotBatch("stabilize", 37, compile=False, **one)
-        eager = play(uncompiled, actions)
         last, last_eager = compiled.step(actions[0]), uncompiled.step(actions[0])
-    for a, b, c in zip(turned, results, few, strict=True):
-        assert torch.equal(a.flip(1), b)
-        assert torch.equal(c, b[:, 7:12])
-    for a, b in zip(results, eager, strict=True):
+    for a, b, c in zip(results, eager, turned, strict=True):
+        assert torch.equal(c.flip(1), a)
         # 10 steps to an end, over which rounding grows by e^(7.8 · 0.1)
         torch.testing.assert_close(a, b, rtol=5e-5, atol=5e-5)
     for name in last._fields:
         a, b = getattr(last, name), getattr(last_eager, name)
         assert (a.dtype, a.shape) == (b.dtype, b.shape), name
+
+
+@pytest.mark.slow  # it compiles twice
+@needs_compiler
+def test_compiled_batch_of_5_envs_which_fill_no_register_has_the_bits_of_a_larger_one():
+    actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    with torch.no_grad():
+        many = play(BallbotBatch("stabilize", 37, compile=True, **ONE_STEP), actions, range(37))
+        few = play(BallbotBatch("stabilize", 5, compile=True, **ONE_STEP), actions[:, 7:12], range(7, 12))
+    assert all(torch.equal(a, b[:, 7:12]) for a, b in zip(few, many, strict=True))
 
 
 def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monkeypatch, caplog):

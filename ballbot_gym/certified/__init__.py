@@ -19,7 +19,8 @@ from ballbot_gym import dynamics, files
 from ballbot_gym.certified import cache
 from ballbot_gym.checks import shown
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.params import BallbotParams, ModelNumbers
+from ballbot_gym.randomization import Randomization, track_of
 from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER, checked_robot, file_name, named_robot, robot_name, short_name
 from ballbot_gym.tasks import Task
@@ -27,6 +28,7 @@ from ballbot_gym.trajectory import Trajectory
 
 EPISODES = 200
 TRAJECTORIES = 20
+_OF_A_TRACK = 5  # trajectories in the file of a track, of which there are many
 
 _CHEAPER = 1e-7  # relative: optima that differ by less are the same
 _ENDS = (slice(None, -1), slice(1, None))  # of control steps
@@ -50,8 +52,11 @@ class EvaluationSet:
     | violations | (n,) | largest constraint violation of the optimum, SI units |
     | statuses | (n,) | how the solver ended, e.g. "fatrop: Solve_Succeeded" |
     | trajectories | ≤ n | the first optimal trajectories, forces held over control steps |
+    | drawn | (n, 14), (n, 6) or (n, 0) | what a randomization drew for the episodes; names in `Randomization.DRAWN` |
+    | ideal | (n,) | optimal costs if forces came without delay |
 
-    Episodes whose optima were not asked for, of a set in the user's cache, are NaN.
+    Where a randomization moves the optima, each is that of the episode's own robot, and its first forces are 0 for as long as
+    the episode's forces are delayed. Episodes whose optima were not asked for, of a set in the user's cache, are NaN.
     """
 
     states: np.ndarray
@@ -61,13 +66,16 @@ class EvaluationSet:
     violations: np.ndarray
     statuses: np.ndarray
     trajectories: tuple[Trajectory, ...]
+    drawn: np.ndarray
+    ideal: np.ndarray
 
     def __len__(self) -> int:
         return len(self.costs)
 
     def options(self, i: int) -> dict[str, np.ndarray]:
         """What to give `env.reset(options=...)` to start episode i."""
-        return {"state": self.states[i], "constants": self.constants[i]}
+        drawn = {"drawn": self.drawn[i]} if self.drawn.shape[1] else {}
+        return {"state": self.states[i], "constants": self.constants[i], **drawn}
 
     def first(self, episodes: int) -> "EvaluationSet":
         """A set of the first episodes alone."""
@@ -77,7 +85,8 @@ class EvaluationSet:
     def improved_by(self, other: "EvaluationSet") -> "EvaluationSet":
         """A set with the cheaper optimum of each episode of two sets; the other's where the episodes differ."""
         better = other.costs < self.costs * (1 - _CHEAPER)
-        better |= (other.states != self.states).any(1) | (other.constants != self.constants).any(1)
+        for name in ("states", "constants", "drawn"):
+            better |= (getattr(other, name) != getattr(self, name)).any(1)
         chosen = {}
         for name in _PER_EPISODE:
             old, new = getattr(self, name), getattr(other, name)
@@ -85,26 +94,31 @@ class EvaluationSet:
         pairs = zip(better.tolist(), self.trajectories, other.trajectories, strict=False)
         return EvaluationSet(**chosen, trajectories=tuple(new if take else old for take, old, new in pairs))
 
-    def save(self, task: Task, path: Path, robot: str | BallbotParams) -> Path:
+    def save(
+        self, task: Task, path: Path, robot: str | BallbotParams, randomization: Randomization = Randomization()
+    ) -> Path:
         """Writes the set, with what defines its optima, so that it is never read for another problem or robot."""
-        params = checked_robot(robot)
+        params, varied = checked_robot(robot), randomization.moves_optima
+        names = _PER_EPISODE if varied else _PER_EPISODE[:-2]
+        trajectories = self.trajectories[:_OF_A_TRACK] if varied else self.trajectories
         arrays = {
             "task": np.array(task.problem()),
             **({} if params == named_robot(PAPER) else {"robot": np.array(repr(params))}),
-            **{name: getattr(self, name) for name in _PER_EPISODE},
-            "lengths": np.array([len(trajectory.u) for trajectory in self.trajectories]),
-            "x": np.concatenate([trajectory.x for trajectory in self.trajectories]),
-            "u": np.concatenate([trajectory.u for trajectory in self.trajectories]),
+            **({"randomization": np.array(repr(randomization))} if varied else {}),
+            **{name: getattr(self, name) for name in names},
+            "lengths": np.array([len(trajectory.u) for trajectory in trajectories]),
+            "x": np.concatenate([trajectory.x for trajectory in trajectories]),
+            "u": np.concatenate([trajectory.u for trajectory in trajectories]),
         }
         return files.write_npz(path, arrays)
 
 
-_PER_EPISODE = ("states", "constants", "costs", "durations", "violations", "statuses")
+_PER_EPISODE = ("states", "constants", "costs", "durations", "violations", "statuses", "drawn", "ideal")
 
 
-def path_of(task: Task, robot: str = PAPER) -> Path:
-    """Where the package keeps the evaluation set of a task and a robot by name."""
-    return Path(__file__).parent / f"{file_name(task.id, robot)}.npz"
+def path_of(task: Task, robot: str = PAPER, track: str = "") -> Path:
+    """Where the package keeps the evaluation set of a task, a robot by name and a track."""
+    return Path(__file__).parent / f"{file_name(task.id, robot)}{track and f'-{track}'}.npz"
 
 
 def load(
@@ -112,6 +126,7 @@ def load(
     robot: str | BallbotParams,
     path: str | Path | None = None,
     episodes: Iterable[int] | None = None,
+    randomization: Randomization = Randomization(),
 ) -> EvaluationSet:
     """The evaluation set of a task and a robot.
 
@@ -120,64 +135,86 @@ def load(
         robot: whose optima: the params of the robot that runs, or a name in `ROBOTS`. Another friction is another robot.
         path: a set made by `ballbot certify --out`, instead of the packaged one.
         episodes: indices whose optima are needed; default, the first 200.
+        randomization: what the robots and actuators of the episodes are drawn from.
 
     Raises:
-        CertificateError: there is none, it belongs to another robot, task or other fields of the task, or it is damaged.
+        CertificateError: there is none, or can be none; it belongs to another robot, task or other fields of the task, or it
+            is damaged.
         ValueError: no task or robot of that name.
     """
     params, name = checked_robot(robot), short_name(robot) if isinstance(robot, str) else robot_name(robot)
     task = make_task(task, name)
     needed = range(EPISODES) if episodes is None else list(episodes)
+    if not randomization.moves_optima:
+        randomization = Randomization()
+    elif randomization.actuator_lag[1] > 0:
+        raise CertificateError("no optimum is known where the actuator lags; leave actuator_lag out")
     try:
         if path is None and name_of(task) is None:  # a subclass may have its parent's id and name
             raise CertificateError(f"no evaluation set of {type(task).__name__}, which is none of TASKS")
-        given = path_of(task, name) if path is None else Path(path)
+        track = track_of(randomization)
+        if path is None and randomization.moves_optima and not track:
+            raise CertificateError(f"no evaluation set of {randomization}, which is none of TRACKS")
+        given = path_of(task, name, track) if path is None else Path(path)
         if not given.exists():
             raise CertificateError(f"{given}: no evaluation set of {task.id}")
         status = given.stat()
-        found = _read(given, (status.st_mtime_ns, status.st_size), type(task), task, params)
+        found = _read(given, (status.st_mtime_ns, status.st_size), type(task), task, params, randomization)
         if path is None and not all(0 <= index < len(found) for index in needed):
             raise CertificateError(f"{given} has {len(found)} episodes, and not all of {shown(needed)}")
         return found
     except CertificateError as error:
-        cached = None if path is not None else from_cache(task, params, needed)
+        cached = None if path is not None else from_cache(task, params, needed, randomization)
         if cached is not None:
             return cached
-        again = _command(task, params, name, path is not None)
+        again = _command(task, params, name, path is not None, track_of(randomization))
         raise CertificateError(f"{error}; {again}") from error.__cause__
 
 
-def from_cache(task: Task, params: BallbotParams, episodes: Iterable[int]) -> EvaluationSet | None:
+def from_cache(
+    task: Task, params: BallbotParams, episodes: Iterable[int], randomization: Randomization = Randomization()
+) -> EvaluationSet | None:
     """What the user's cache has of some episodes; None where one is missing, or does not move or cost as it did.
 
     `statuses` say how each optimum was found.
     """
     needed = tuple(episodes)
-    return _from_cache(needed, cache.versions(task, params, needed), type(task), task, params)
+    versions = cache.versions(task, params, needed, randomization)
+    return _from_cache(needed, versions, type(task), task, params, randomization)
 
 
 @lru_cache(maxsize=16)
 def _from_cache(
-    needed: tuple[int, ...], versions: tuple[Any, ...], kind: type[Task], task: Task, params: BallbotParams
+    needed: tuple[int, ...],
+    versions: tuple[Any, ...],
+    kind: type[Task],
+    task: Task,
+    params: BallbotParams,
+    randomization: Randomization,
 ) -> EvaluationSet | None:
     """`from_cache` of files in their present versions. Steps them once, however often they are asked for."""
-    found = cache.read(task, params, needed)
+    found = cache.read(task, params, needed, randomization)
     if len(found) < len(set(needed)) or not found:
         return None
     rows = max(EPISODES, max(found) + 1)
-    arrays: dict[str, Any] = {name: np.full(rows, np.nan) for name in ("costs", "durations", "violations")}
+    arrays: dict[str, Any] = {name: np.full(rows, np.nan) for name in ("costs", "durations", "violations", "ideal")}
     arrays |= {"states": np.full((rows, 8), np.nan), "constants": np.full((rows, len(task.constant_names)), np.nan)}
+    arrays["drawn"] = np.full((rows, len(cache.drawn(task, randomization, 0))), np.nan)
     statuses = [""] * rows
     moves = {}
     for index, optimum in found.items():
         t = task.control_dt * np.arange(len(optimum["x"]))
         moves[index] = Trajectory(t, optimum["x"], optimum["u"])
-        values = (optimum["cost"], t[-1], optimum["violation"], optimum["state"], optimum["constants"])
+        values = (
+            *(optimum["cost"], t[-1], optimum["violation"], optimum["ideal"], optimum["state"], optimum["constants"]),
+            cache.drawn(task, randomization, index, optimum["draw"]),
+        )
         for name, value in zip(arrays, values, strict=True):
             arrays[name][index] = value
         statuses[index] = f"{optimum['status']}; {json.dumps(optimum['found'])}"
     chosen = list(moves)
-    if not _holds(tuple(moves.values()), arrays["constants"][chosen], arrays["costs"][chosen], task, params):
+    of_moves = {name: arrays[name][chosen] for name in ("constants", "costs", "drawn")}
+    if not _holds(tuple(moves.values()), of_moves, task, params, randomization):
         return None
     first = range(next(i for i in range(rows + 1) if i not in moves))
     trajectories = tuple(moves[i] for i in first[:TRAJECTORIES])
@@ -188,15 +225,25 @@ def _from_cache(
 
 
 @lru_cache(maxsize=16)
-def _read(path: Path, version: tuple[int, int], kind: type[Task], task: Task, params: BallbotParams) -> EvaluationSet:
+def _read(
+    path: Path,
+    version: tuple[int, int],
+    kind: type[Task],
+    task: Task,
+    params: BallbotParams,
+    randomization: Randomization,
+) -> EvaluationSet:
     """The set of a file in its present version, whose trajectories hold. Steps them once, however often it is asked for."""
     try:
         arrays = files.read_npz(path)
+        if "drawn" not in arrays and "costs" in arrays:
+            arrays |= {"drawn": np.zeros((arrays["costs"].size, 0)), "ideal": arrays["costs"]}
         missing = [name for name in ("task", "lengths", "x", "u", *_PER_EPISODE) if name not in arrays]
         if missing:
             raise ValueError(f"it has no array {', '.join(missing)}")
-        made_for = str(arrays["task"]), str(arrays.get("robot", repr(named_robot(PAPER))))
-        for made, wanted in zip(made_for, (task.problem(), repr(params)), strict=True):
+        made_for = [str(arrays["task"]), str(arrays.get("robot", repr(named_robot(PAPER))))]
+        made_for.append(str(arrays.get("randomization", repr(Randomization()))))
+        for made, wanted in zip(made_for, (task.problem(), repr(params), repr(randomization)), strict=True):
             if made != wanted:
                 raise CertificateError(f"{path} was computed for {made}, not for {wanted}")
         arrays |= _checked(task, arrays)
@@ -211,7 +258,7 @@ def _read(path: Path, version: tuple[int, int], kind: type[Task], task: Task, pa
         raise CertificateError(f"{path} is no evaluation set: {error}") from error
     for array in arrays.values():
         array.setflags(write=False)  # everybody who loads the set gets it
-    if not _holds(trajectories, arrays["constants"][: len(trajectories)], arrays["costs"], task, params):
+    if not _holds(trajectories, arrays, task, params, randomization):
         raise CertificateError(
             f"{path}: its optimal trajectories do not move or cost in {task.problem()} as they did when they were computed, "
             "because cost, limits or equations have changed since"
@@ -219,7 +266,7 @@ def _read(path: Path, version: tuple[int, int], kind: type[Task], task: Task, pa
     return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
 
 
-def _command(task: Task, params: BallbotParams, robot: str, file: bool) -> str:
+def _command(task: Task, params: BallbotParams, robot: str, file: bool, track: str) -> str:
     """How the set of a task and a robot is computed, in words."""
     name = name_of(task)
     first = [] if name else [f"ballbot_gym.register_task({type(task).__name__}) gives the task a name"]
@@ -228,6 +275,7 @@ def _command(task: Task, params: BallbotParams, robot: str, file: bool) -> str:
         first.append("ballbot_gym.register_robot gives this robot, with the fields of its tasks, a name")
         robot = "NAME"
     given = f" --tasks {name or 'NAME'}" + ("" if robot == PAPER else f" --robot {robot}")
+    given += f" --randomization {track}" if track else ""
     return "; ".join(
         [
             *([] if file else ["ballbot_train.evaluate and `ballbot benchmark` compute what they need of it"]),
@@ -238,17 +286,24 @@ def _command(task: Task, params: BallbotParams, robot: str, file: bool) -> str:
 
 
 def _holds(
-    trajectories: Sequence[Trajectory], constants: np.ndarray, costs: np.ndarray, task: Task, params: BallbotParams
+    trajectories: Sequence[Trajectory],
+    of_episodes: Mapping[str, np.ndarray],
+    task: Task,
+    params: BallbotParams,
+    randomization: Randomization,
 ) -> bool:
-    """Whether trajectories of episodes with these constants move, cost and keep the limits as when they were found."""
+    """Whether trajectories of the first of some episodes move, cost and keep the limits as when they were found."""
     dt = task.control_dt
+    constants, known, drawn = (of_episodes[name][: len(trajectories)] for name in ("constants", "costs", "drawn"))
     number = np.repeat(np.arange(len(trajectories)), [len(trajectory.u) for trajectory in trajectories])
     before, after = (np.concatenate([trajectory.x[part] for trajectory in trajectories]) for part in _ENDS)
     u, c = np.concatenate([trajectory.u for trajectory in trajectories]), constants[number]
     began, ended = (task.at(c, np.concatenate([trajectory.t[part] for trajectory in trajectories])) for part in _ENDS)
-    known = costs[: len(trajectories)]
+    robot: Any = params
+    if randomization.moves_optima:
+        robot = ModelNumbers.of(randomization.robot(params, tuple(drawn[number].T)))
     with np.errstate(all="ignore"):  # of damaged files
-        moved = np.abs(dynamics.step(params, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
+        moved = np.abs(dynamics.step(robot, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
         found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, began), len(u)), len(known))
         kept = all(np.min(margin) >= -_SAME for margin in task.margins(after, ended))
         return bool(moved.all() and (np.abs(found - known) <= _SAME * known).all() and kept)
@@ -258,6 +313,7 @@ def _checked(task: Task, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarr
     """The arrays of numbers; raises a ValueError that names the one whose shape or values make no sense."""
     n = arrays["costs"].size
     shapes = dict.fromkeys(_PER_EPISODE, (n,)) | {"states": (n, 8), "constants": (n, len(task.constant_names))}
+    shapes["drawn"] = (n, arrays["drawn"].shape[-1])
     for name, shape in shapes.items():
         if n == 0 or arrays[name].shape != shape:
             raise ValueError(f"{name} has the shape {arrays[name].shape}, and not {shape} of at least one episode")

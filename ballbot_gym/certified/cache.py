@@ -21,9 +21,10 @@ import numpy as np
 
 from ballbot_gym import files, machine_code, traced
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
 
-_NUMBERS = ("state", "constants", "cost", "violation", "x", "u")
+_NUMBERS = ("state", "constants", "cost", "ideal", "violation", "x", "u")
 
 
 def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +36,18 @@ def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tup
     return task.sample(np.random.default_rng(seed), params)
 
 
-def folder(task: Task, params: BallbotParams) -> Path:
+def drawn(task: Task, randomization: Randomization, index: int, draw: int = 0) -> tuple[float, ...]:
+    """What a randomization draws for episode `index` of a task's evaluation set, the same on every machine.
+
+    A later draw takes the place of one with which nobody can do the episode.
+    """
+    if not randomization.varies_episodes:
+        return ()
+    rng = np.random.default_rng([zlib.crc32(task.id.encode()), index, draw, 1])
+    return randomization.draw(tuple(rng.random(len(Randomization.DRAWN)).tolist()), task.control_dt)
+
+
+def folder(task: Task, params: BallbotParams, randomization: Randomization = Randomization()) -> Path:
     """Where the optima of a problem are kept: in $BALLBOT_OPTIMA, or the folder `optima` of the user's cache.
 
     Raises:
@@ -46,38 +58,49 @@ def folder(task: Task, params: BallbotParams) -> Path:
         raise ValueError(
             f"BALLBOT_OPTIMA must be an absolute path, not {str(base)!r}; unset it for the user's cache folder"
         )
-    return base / f"{type(task).__name__}-{_digest(task, params)}"
+    return base / f"{type(task).__name__}-{_digest(task, params, randomization)}"
 
 
-def write(task: Task, params: BallbotParams, index: int, optimum: Mapping[str, Any]) -> None:
+def write(
+    task: Task,
+    params: BallbotParams,
+    index: int,
+    optimum: Mapping[str, Any],
+    randomization: Randomization = Randomization(),
+) -> None:
     """Keeps the optimum of an episode, unless a cheaper one is there.
 
     Args:
         task: and params: the problem.
         index: of the episode.
         optimum: "cost", "violation", "status", "x" (n+1, 8), "u" (n, 2), and "found", which says in JSON how it was found;
-            "draw", if it is not the first.
+            "draw", if it is not the first; "ideal", its cost without delay, if that is another.
+        randomization: what the episode's robot and actuator are drawn from.
     """
-    path = _path(task, params, index)
-    known = read(task, params, [index]).get(index)
+    path = _path(task, params, index, randomization)
+    known = read(task, params, [index], randomization).get(index)
     if known is not None and float(known["cost"]) <= optimum["cost"]:
         optimum = {**known, "found": {**known["found"], "guesses": optimum["found"]["guesses"]}}
     draw = int(optimum.get("draw", 0))
     state, constants = episode(task, params, index, draw)
     arrays = {"state": state, "constants": constants, "draw": np.array(draw)}
     arrays |= {name: np.asarray(optimum[name]) for name in ("cost", "violation", "status", "x", "u")}
+    arrays |= {"ideal": np.asarray(optimum.get("ideal", optimum["cost"]))}
     files.write_npz(path, arrays | {"found": np.array(json.dumps(optimum["found"]))})
 
 
-def read(task: Task, params: BallbotParams, indices: Iterable[int]) -> dict[int, dict[str, Any]]:
+def read(
+    task: Task, params: BallbotParams, indices: Iterable[int], randomization: Randomization = Randomization()
+) -> dict[int, dict[str, Any]]:
     """Optima of those episodes that are there, as `write` took them, with "state" and "constants". A damaged one is none."""
     found = {}
     for index in indices:
-        path = _path(task, params, index)
+        path = _path(task, params, index, randomization)
         if not path.exists():
             continue
         try:
             arrays: dict[str, Any] = dict(files.read_npz(path))
+            arrays.setdefault("ideal", arrays["cost"])
             arrays |= {name: files.numbers(arrays[name], name) for name in _NUMBERS}
             arrays |= {
                 "found": json.loads(str(arrays["found"])),
@@ -96,26 +119,30 @@ def read(task: Task, params: BallbotParams, indices: Iterable[int]) -> dict[int,
     return found
 
 
-def versions(task: Task, params: BallbotParams, indices: Iterable[int]) -> tuple[tuple[int, int] | None, ...]:
+def versions(
+    task: Task, params: BallbotParams, indices: Iterable[int], randomization: Randomization = Randomization()
+) -> tuple[tuple[int, int] | None, ...]:
     """When the optimum of each of some episodes was written, ns, and its size; None where there is none."""
-    paths = [_path(task, params, index) for index in indices]
+    paths = [_path(task, params, index, randomization) for index in indices]
     stats = [path.stat() if path.exists() else None for path in paths]
     return tuple(None if one is None else (one.st_mtime_ns, one.st_size) for one in stats)
 
 
-def forget(task: Task, params: BallbotParams, index: int) -> None:
+def forget(task: Task, params: BallbotParams, index: int, randomization: Randomization = Randomization()) -> None:
     """Deletes the optimum of an episode, if there is one."""
-    _path(task, params, index).unlink(missing_ok=True)
+    _path(task, params, index, randomization).unlink(missing_ok=True)
 
 
-def _path(task: Task, params: BallbotParams, index: int) -> Path:
-    return folder(task, params) / f"{index:06d}.npz"
+def _path(task: Task, params: BallbotParams, index: int, randomization: Randomization) -> Path:
+    return folder(task, params, randomization) / f"{index:06d}.npz"
 
 
 @lru_cache(maxsize=64)
-def _digest(task: Task, params: BallbotParams) -> str:
+def _digest(task: Task, params: BallbotParams, randomization: Randomization) -> str:
     """Of all that an optimum depends on, as 24 hexadecimal digits."""
+    varied = [repr(randomization)] if randomization.moves_optima else []
     parts = [task.id, task.problem(), repr(params), *map(_version, ("ballbot-gym", "casadi")), _formulas(task, params)]
+    parts += varied
     for index in range(2):
         x, c = episode(task, params, index)
         paths = [np.round(path, 9).tolist() for path in task.guess_paths(x, c, params)]

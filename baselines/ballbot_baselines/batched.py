@@ -23,7 +23,7 @@ import numpy as np
 
 from ballbot_baselines import guess, righting, search
 from ballbot_baselines.ilqr import MARGIN, Options, Solutions, ilqr
-from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, shooting_parameters
+from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
 from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -187,8 +187,11 @@ class _Batch:
         """Parameters of `ilqr`, (J, np), of constants (J, nc). With `then_rest`, LQR's cost-to-go counts."""
         share = [] if free_time or self._solver.rest is None else [float(then_rest)]
         backoff = replace(Backoff(), margin=MARGIN, goal=MARGIN)
-        rest = shooting_parameters(self._task, self._params, c[0], backoff)[1 + c.shape[1] :]
-        return np.column_stack([c, np.tile([*rest, *share], (len(c), 1))])
+        _, *given = shooting_parameters(self._task, self._params, c[0], backoff)
+        rows = np.tile([*given, *share], (len(c), 1))
+        first = len(robot_numbers(self._params))
+        rows[:, first : first + c.shape[1]] = c
+        return rows
 
     def _solve(
         self,

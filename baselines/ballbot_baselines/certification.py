@@ -1,20 +1,23 @@
 """Computes the certified evaluation sets that `ballbot_gym.certified` loads.
 
 `entries` solves episodes one after the other and yields what JSON holds, so that the work can be divided and continued.
-`evaluation_set` makes the set of all entries.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import ALL_GUESSES, find_optimum
-from ballbot_gym.certified import TRAJECTORIES, EvaluationSet
+from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
+from ballbot_baselines.search import COARSE
+from ballbot_gym import dynamics
+from ballbot_gym.certified import cache
 from ballbot_gym.certified.cache import episode
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
@@ -30,87 +33,115 @@ _MOST_DRAWS = 20
 
 
 def entries(
-    task: str | Task, indices: Iterable[int], robot: str | BallbotParams = PAPER, guesses: int = ALL_GUESSES
+    task: str | Task,
+    indices: Iterable[int],
+    robot: str | BallbotParams = PAPER,
+    guesses: int = ALL_GUESSES,
+    randomization: Randomization = Randomization(),
 ) -> Iterator[Entry]:
     """Solves episodes of a task for a robot, and yields one entry for each, in order.
 
-    If the robot's friction is limited, an episode without an optimum is drawn again: some starts make the robot slip whatever
-    it does, and only the search tells which.
+    If the robot's friction is limited or the robot varies, an episode without an optimum is drawn again: some starts make the
+    robot slip whatever it does, and only the search tells which.
 
     Args:
         task: the problem, or its name in `TASKS`.
         indices: of the episodes.
         robot: whose optima, or its name in `ROBOTS`.
         guesses: see `find_optimum`.
+        randomization: what the robot and the actuator of each episode are drawn from.
 
     Raises:
         ValueError: no task or robot of that name.
     """
     task, params = make_task(task, robot), checked_robot(robot)
     for index in indices:
-        for draw in range(_MOST_DRAWS if params.grips else 1):
-            entry = _solved(task, params, index, draw, guesses)
+        for draw in range(_MOST_DRAWS if params.grips or randomization.moves_optima else 1):
+            entry = _solved(task, params, index, draw, guesses, randomization)
             if "error" not in entry:
                 break
         yield entry
 
 
-def _solved(task: Task, params: BallbotParams, index: int, draw: int, guesses: int) -> Entry:
+def _solved(
+    task: Task, params: BallbotParams, index: int, draw: int, guesses: int, randomization: Randomization
+) -> Entry:
+    x0, c = episode(task, params, index, draw)
+    drawn = cache.drawn(task, randomization, index, draw)
+    if randomization.moves_optima:
+        params = randomization.robot(params, drawn)
+    delay = round(drawn[5]) if randomization.moves_optima else 0
     try:
-        optimum = find_optimum(task, params, *episode(task, params, index, draw), guesses=guesses)
+        optimum = delayed_optimum(task, params, x0, c, delay, guesses)
+        ideal = find_optimum(task, params, x0, c, guesses=guesses) if delay else optimum
     except PlanError as error:
         return {"episode": index, "error": str(error)}
-    if not optimum.is_optimal:
-        reason = f"only a feasible episode of cost {optimum.cost:.6g} was found ({optimum.solver_status})"
-        return {"episode": index, "error": reason}
+    for found in (optimum, ideal):
+        if not found.is_optimal:
+            reason = f"only a feasible episode of cost {found.cost:.6g} was found ({found.solver_status})"
+            return {"episode": index, "error": reason}
     trajectory = optimum.trajectory
-    return {
-        "episode": index,
-        "cost": optimum.cost,
-        "violation": optimum.violation,
-        "solver": optimum.solver,
-        "status": optimum.solver_status,
-        "found": {
-            "guesses": guesses,
-            "tried": optimum.tried,
-            "next_basin": None if math.isnan(optimum.next_basin) else optimum.next_basin,
-        },
-        "t": trajectory.t.tolist(),
-        "x": trajectory.x.tolist(),
-        "u": trajectory.u.tolist(),
-    } | ({"draw": draw} if draw else {})
+    return (
+        {
+            "episode": index,
+            "cost": optimum.cost,
+            "violation": optimum.violation,
+            "solver": optimum.solver,
+            "status": optimum.solver_status,
+            "found": {
+                "guesses": guesses,
+                "tried": optimum.tried,
+                "next_basin": None if math.isnan(optimum.next_basin) else optimum.next_basin,
+            },
+            "t": trajectory.t.tolist(),
+            "x": trajectory.x.tolist(),
+            "u": trajectory.u.tolist(),
+        }
+        | ({"draw": draw} if draw else {})
+        | ({"ideal": ideal.cost} if delay else {})
+    )
+
+
+def delayed_optimum(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, delay: int, guesses: int = ALL_GUESSES
+) -> Optimum:
+    """The cheapest episode in which no force comes in the first control steps.
+
+    Args:
+        task: and params: the problem.
+        x0: (8,) initial state.
+        c: (nc,) constants.
+        delay: how many control steps.
+        guesses: as of `find_optimum`.
+
+    Raises:
+        PlanError: the robot violates a limit before it can be moved, or no try came to a feasible episode.
+    """
+    if not delay:
+        return find_optimum(task, params, x0, c, guesses=guesses)
+    dt, none, states, cost = task.control_dt, np.zeros(2), [np.asarray(x0, np.float64)], 0.0
+    for k in range(delay):
+        began = task.at(c, k * dt)
+        cost += dt * float(task.cost(states[-1], none, began))
+        states.append(np.array(dynamics.step(params, states[-1], none, dt, dynamics.substeps_for(dt))))
+        violated = task.violated(states[-1], task.at(c, (k + 1) * dt))
+        if violated or min(dynamics.limits(params, states[-2], none, hold=dt), default=1.0) < 0:
+            raise PlanError(f"{task.id}: the limit of {violated or 'grip'} is violated before a force can come")
+    rest, start = replace(task, duration=dt * (task.steps - delay)), delay * dt
+    paths = None
+    if rest.steps % COARSE and task.passed_obstacles(c) is not None:
+        # only over an even number of steps are choices of sides compared
+        longer = replace(task, duration=rest.duration + dt)
+        paths = [find_optimum(longer, params, states[-1], c, guesses=guesses, start=start).trajectory.x[:-1, :2]]
+    found = find_optimum(rest, params, states[-1], c, guesses=guesses, paths=paths, start=start)
+    x = np.concatenate([states[:-1], found.trajectory.x])
+    u = np.concatenate([np.zeros((delay, 2)), found.trajectory.u])
+    return replace(found, cost=cost + found.cost, trajectory=Trajectory(dt * np.arange(len(x)), x, u))
 
 
 def _start(task: Task, params: BallbotParams, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
     """Initial state and constants of the episode of an entry."""
     return episode(task, params, entry["episode"], entry.get("draw", 0))
-
-
-def evaluation_set(task: Task, params: BallbotParams, entries: Sequence[Entry]) -> EvaluationSet:
-    """The set of the first episodes, from their entries in order, from episode 0 on.
-
-    Raises:
-        PlanError: an entry has no optimum; the message names the episodes.
-        ValueError: an episode is missing or out of order.
-    """
-    failed = [f"episode {entry['episode']}: {entry['error']}" for entry in entries if "error" in entry]
-    if failed:
-        raise PlanError(f"no optimum of {task.id} for\n" + "\n".join(failed))
-    for index, entry in enumerate(entries):
-        if entry["episode"] != index:
-            raise ValueError(
-                f"entry {index} of {task.id} is of episode {entry['episode']}; give episodes 0, 1, 2, … in order"
-            )
-    episodes = [_start(task, params, entry) for entry in entries]
-    return EvaluationSet(
-        states=np.array([x for x, _ in episodes]),
-        constants=np.array([c for _, c in episodes]),
-        costs=np.array([entry["cost"] for entry in entries]),
-        durations=np.array([entry["t"][-1] - entry["t"][0] for entry in entries]),
-        violations=np.array([entry["violation"] for entry in entries]),
-        statuses=np.array([f"{entry['solver']}: {entry['status']}" for entry in entries]),
-        trajectories=tuple(Trajectory(entry["t"], entry["x"], entry["u"]) for entry in entries[:TRAJECTORIES]),
-    )
 
 
 def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[str, np.ndarray]:

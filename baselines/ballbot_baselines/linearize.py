@@ -56,6 +56,14 @@ def quadratic_cost(
     return _semidefinite(0.5 * _blocks(q, n)), 0.5 * _blocks(r, n)
 
 
+def cost_slopes(
+    task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The gradient of the task's cost rate with respect to x (n, 8) and to u (n, 2); arguments as of `quadratic_cost`."""
+    along_x, along_u = _cost_gradient(task)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, len(x)))
+    return np.array(along_x).T, np.array(along_u).T
+
+
 def goal_weight(task: Task, x: np.ndarray, c: np.ndarray, t: float = 0.0) -> np.ndarray:
     """(8, 8) half the Hessian of the sum of the task's goal functions at x: about 1 per squared tolerance."""
     return _semidefinite(0.5 * np.array(_goal_hessian(task)(x, _constants(task, c, t, 1)))[None])[0]
@@ -83,6 +91,15 @@ def _cost_hessians(task: Task) -> casadi.Function:
     cost = task.cost(x, u, c)
     outputs = [casadi.densify(casadi.hessian(cost, x)[0]), casadi.densify(casadi.hessian(cost, u)[0])]
     return casadi.Function("hessians", [x, u, c], outputs)
+
+
+@cache
+def _cost_gradient(task: Task) -> casadi.Function:
+    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
+    c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
+    cost = task.cost(x, u, c)
+    outputs = [casadi.densify(casadi.gradient(cost, x)), casadi.densify(casadi.gradient(cost, u))]
+    return casadi.Function("gradient", [x, u, c], outputs)
 
 
 @cache

@@ -4,12 +4,12 @@ All use the env's own discretization: force held for control_dt, cost summed ove
 cost of an endless episode is xᵀPx.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
-from ballbot_baselines.linearize import discretize, goal_weight, quadratic_cost
+from ballbot_baselines.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Reference, Task
@@ -106,6 +106,37 @@ def tracking_gains(
     return riccati(a, b, q * task.control_dt, r * task.control_dt, p_final)
 
 
+def feedforward(
+    task: Task,
+    params: BallbotParams,
+    reference: Reference,
+    c: np.ndarray,
+    gains: Gains,
+    p_final: np.ndarray,
+    start: float = 0.0,
+) -> np.ndarray:
+    """(n, 2) forces, N, to add along an open reference that is no motion of the robot, or not the cheapest near it.
+
+    They are those of the cheapest motion in the linear model about the reference, of which LQR's gains are the feedback: the
+    steps by which the reference misses the equations of motion count, and the slopes of the cost.
+    """
+    x, u, dt = reference.x, reference.u, task.control_dt
+    t = start + dt * np.arange(len(x))
+    a, b = discretize(params, x, u, dt)
+    _, r = quadratic_cost(task, x, u, c, t)
+    of_x, of_u = cost_slopes(task, x, u, c, t)
+    missed = np.zeros_like(x)
+    missed[:-1] = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))[:-1] - x[1:]
+    after = [*gains.p[1:], p_final]
+    forces, slope = np.zeros_like(u), np.zeros(8)  # half the slope of the cost-to-go, which is xᵀPx + 2 slopeᵀx
+    for i in reversed(range(len(x))):
+        slope = slope + after[i] @ missed[i]
+        along = dt * of_u[i] / 2 + b[i].T @ slope
+        forces[i] = -np.linalg.solve(dt * r[i] + b[i].T @ after[i] @ b[i], along)
+        slope = dt * of_x[i] / 2 + a[i].T @ slope - gains.k[i].T @ along
+    return forces
+
+
 def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
     """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
     gains = Gains(np.zeros((0, 2, 8)), np.eye(8)[None])
@@ -120,7 +151,8 @@ class LqrController:
     """LQR about the task's reference motion, with weights from the task's own cost.
 
     About an equilibrium the gain is constant. Along an open reference the gain is time-varying. Around a closed reference the
-    gain is periodic, and the nearest point of the reference says which gain to use. A task with a clock gives an open one.
+    gain is periodic, and the nearest point of the reference says which gain to use. A task with a clock gives an open one,
+    with forces that look ahead, because it may be no motion of the robot (`feedforward`).
 
     After `reset`, `reference` is that motion, and `gains` has a gain for each of its points.
     """
@@ -137,6 +169,9 @@ class LqrController:
         else:
             p_final = final_weight(task, params, reference.x[-1], c, t + task.control_dt * len(reference.x))
             self.gains = tracking_gains(task, params, reference.x, reference.u, c, p_final, t)
+            if task.clock:
+                ahead = feedforward(task, params, reference, c, self.gains, p_final, t)
+                self.reference = replace(reference, u=reference.u + ahead)
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         reference = self.reference

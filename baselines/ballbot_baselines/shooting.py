@@ -9,7 +9,8 @@ Solvers see actions, which are forces divided by their limit.
 
 import math
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import Any
 
 import casadi
 import numpy as np
@@ -19,7 +20,7 @@ from ballbot_baselines.formulas import check_formulas
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.ops import is_number
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.tasks import Task
 
 BARRIER = 0.1
@@ -31,6 +32,7 @@ FREE_TIME_INTERVALS = 60
 """Of a first-exit task whose time is free."""
 
 _MOST_ITERATIONS = 200
+_checked: set[tuple[Task, bool, bool]] = set()
 
 
 @dataclass(frozen=True)
@@ -66,41 +68,57 @@ class Backoff:
         return Backoff(**{name: min(value, max(share * value, least[name])) for name, value in asdict(self).items()})
 
 
-@lru_cache(maxsize=64)
 def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
     """A task on its env's discretization, or with forces held longer than its control steps.
 
-    Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, so that
-    problems on fine and coarse grids share all compiled functions, and all tasks of a robot share those of the dynamics.
+    Inputs are actions, force / limit; `shooting_parameters` gives p. How long forces are held comes first in it, then the
+    numbers of the robot. So problems on fine and coarse grids and of all robots of a kind share all compiled functions, and
+    all tasks share those of the dynamics.
 
     Raises:
         ValueError: no optimizer can use the task's formulas; see `check_formulas`.
     """
-    check_formulas(task, params)
-    nc, limit = len(task.constant_names), params.force_limit
+    return _ocp(*_kind(task, params))
+
+
+def _kind(task: Task, params: BallbotParams) -> tuple[Task, bool, bool]:
+    """What solvers are made for: a task whose formulas they can use, and whether the ball rolls and the robot has to grip."""
+    kind = task, params.rolls, params.grips
+    if kind not in _checked:
+        check_formulas(task, params)
+        _checked.add(kind)
+    return kind
+
+
+@lru_cache(maxsize=64)
+def _ocp(task: Task, rolls: bool, grips: bool) -> Ocp:
+    nr = len(_robot_names(rolls, grips))
+    nc = len(task.constant_names)
+    robot = partial(_symbolic_robot, rolls, grips)
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(*task.margins(x, _constants(task, p, p[0]))) - p[1 + nc]
+        return casadi.vertcat(*task.margins(x, _constants(task, nr, p, p[0]))) - p[1 + nr + nc]
 
     def path(x: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(margins(x, p), *dynamics.limits(params, x, limit * a, p[3 + nc], p[0]))
+        numbers, limit = robot(p)
+        return casadi.vertcat(margins(x, p), *dynamics.limits(numbers, x, limit * a, p[3 + nr + nc], p[0]))
 
     def final(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not task.first_exit:
             return margins(x, p)
         # Goal functions are normalized, q/tolerance² − 1: keeping a fraction b of the tolerance asks (1−b)² − 1 − g ≥ 0.
-        room = (1 - p[2 + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, _constants(task, p, p[0])))
+        room = (1 - p[2 + nr + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, _constants(task, nr, p, p[0])))
         return casadi.vertcat(margins(x, p), room)
 
     return Ocp(
         name=task.id,
         states=8,
         inputs=2,
-        params=nc + 3 + params.grips + task.clock,
+        params=1 + nr + nc + 2 + grips + task.clock,
         counts_stages=task.clock,
-        next=lambda x, a, p: dynamics.step(params, x, limit * a, p[0], dynamics.substeps_for(task.control_dt)),
-        cost=lambda x, a, p: task.cost(x, limit * a, _constants(task, p, p[0])) * p[0],
-        inequalities=path if params.grips else lambda x, a, p: margins(x, p),
+        next=lambda x, a, p: _after(robot(p), x, a, p[0], dynamics.substeps_for(task.control_dt)),
+        cost=lambda x, a, p: task.cost(x, robot(p)[1] * a, _constants(task, nr, p, p[0])) * p[0],
+        inequalities=path if grips else lambda x, a, p: margins(x, p),
         final_inequalities=final,
     )
 
@@ -108,20 +126,44 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
 def shooting_parameters(
     task: Task, params: BallbotParams, c: np.ndarray, backoff: Backoff, coarseness: int = 1, start: float = 0.0
 ) -> list[float]:
-    """p of `shooting_ocp`: s that forces are held, c, back-offs from margins and goal, of grip if friction is limited, and
-    the episode's time at the start, s, if the task has a clock.
+    """p of `shooting_ocp`: s that forces are held, `robot_numbers`, c, back-offs from margins and goal, of grip if friction
+    is limited, and the episode's time at the start, s, if the task has a clock.
     """
     reserve = [backoff.grip] if params.grips else []
-    return [task.control_dt * coarseness, *c, backoff.margin, backoff.goal, *reserve, *([start] if task.clock else [])]
+    numbers, clock = robot_numbers(params), [start] if task.clock else []
+    return [task.control_dt * coarseness, *numbers, *c, backoff.margin, backoff.goal, *reserve, *clock]
 
 
-def _constants(task: Task, p: casadi.SX, h: casadi.SX) -> casadi.SX:
-    """c of a stage of length h, with its time if the task has a clock."""
-    c = p[1 : 1 + len(task.constant_names)]
+def robot_numbers(params: BallbotParams) -> list[float]:
+    """What problems need to know of a robot, besides whether its ball rolls and whether it has to grip."""
+    return [getattr(params, name) for name in _robot_names(params.rolls, params.grips)]
+
+
+def _robot_names(rolls: bool, grips: bool) -> list[str]:
+    names = ["total_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "force_limit"]
+    return names + ["moving_mass", "ball_radius"] * rolls + ["friction"] * grips
+
+
+def _symbolic_robot(rolls: bool, grips: bool, p: casadi.SX) -> tuple[Any, casadi.SX]:
+    """The robot of p of `shooting_ocp`, and its force limit."""
+    found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(_robot_names(rolls, grips))}
+    limit = found.pop("force_limit")
+    weight = found["total_mass"] * found["gravity"]
+    numbers = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight} | found
+    return ModelNumbers(**numbers, rolls=rolls, grips=grips), limit
+
+
+def _after(robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX, substeps: int) -> casadi.SX:
+    numbers, limit = robot
+    return dynamics.step(numbers, x, limit * a, length, substeps)
+
+
+def _constants(task: Task, nr: int, p: casadi.SX, h: casadi.SX) -> casadi.SX:
+    """c of a stage of length h, with its time if the task has a clock; it stands in p after nr numbers of the robot."""
+    c = p[1 + nr : 1 + nr + len(task.constant_names)]
     return task.at(c, p[-2] + p[-1] * h) if task.clock else c
 
 
-@lru_cache(maxsize=256)
 def shooting_solver(
     task: Task,
     params: BallbotParams,
@@ -131,7 +173,7 @@ def shooting_solver(
     barrier: float = BARRIER,
     tolerance: float | None = None,
 ) -> OcpSolver:
-    """A solver of `shooting_ocp`, made once.
+    """A solver of `shooting_ocp`, made once for all robots of a kind.
 
     Args:
         steps: intervals.
@@ -140,14 +182,27 @@ def shooting_solver(
         barrier: of the first iterate.
         tolerance: of the solver; default, the finest that it reaches.
     """
-    ocp = shooting_ocp(task, params)
-    return OcpSolver(ocp, steps, solver, tolerance or _tolerance(params), iterations, barrier)
+    options = solver, tolerance or _tolerance(params.grips), iterations, barrier
+    return _solver(*_kind(task, params), steps, *options)
+
+
+@lru_cache(maxsize=256)
+def _solver(task: Task, rolls: bool, grips: bool, steps: int, *options: Any) -> OcpSolver:
+    return OcpSolver(_ocp(task, rolls, grips), steps, *options)
+
+
+def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolver:
+    """A solver of a first-exit task over intervals of one free length h, the ninth state. It tells roughly when to arrive.
+
+    Made once for all robots of a kind.
+    """
+    return _free_time_solver(*_kind(task, params), solver)
 
 
 @lru_cache(maxsize=8)
-def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolver:
-    """A solver of a first-exit task over intervals of one free length h, the ninth state. It tells roughly when to arrive."""
-    fixed, limit = shooting_ocp(task, params), params.force_limit
+def _free_time_solver(task: Task, rolls: bool, grips: bool, solver: str) -> OcpSolver:
+    fixed, nr = _ocp(task, rolls, grips), len(_robot_names(rolls, grips))
+    robot = partial(_symbolic_robot, rolls, grips)
 
     def with_length(s: casadi.SX, p: casadi.SX) -> casadi.SX:
         return casadi.vertcat(s[8], p[1:]) if task.clock else p  # the length is also what the stage's time is found by
@@ -156,17 +211,17 @@ def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolve
         fixed,
         name=f"{task.id}-free-time",
         states=9,
-        next=lambda s, a, p: casadi.vertcat(dynamics.step(params, s[:8], limit * a, s[8], 2), s[8]),
-        cost=lambda s, a, p: task.cost(s[:8], limit * a, _constants(task, p, s[8])) * s[8],
+        next=lambda s, a, p: casadi.vertcat(_after(robot(p), s[:8], a, s[8], 2), s[8]),
+        cost=lambda s, a, p: task.cost(s[:8], robot(p)[1] * a, _constants(task, nr, p, s[8])) * s[8],
         inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, with_length(s, p)),
         final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], with_length(s, p)),
     )
-    return OcpSolver(ocp, FREE_TIME_INTERVALS, solver, _tolerance(params))
+    return OcpSolver(ocp, FREE_TIME_INTERVALS, solver, _tolerance(grips))
 
 
-def _tolerance(params: BallbotParams) -> float:
+def _tolerance(grips: bool) -> float:
     """Of the solvers. On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits."""
-    return 1e-6 if params.grips else 1e-8
+    return 1e-6 if grips else 1e-8
 
 
 @dataclass(frozen=True, eq=False)

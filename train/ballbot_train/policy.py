@@ -65,6 +65,8 @@ class PolicyNetwork(torch.nn.Module):
     A centred policy takes from the sum what it is in the steady motion in which the episode shall end, and adds the action
     that keeps it: so it rests at its goal, or orbits on the circle, and not beside it. With routes, a network of its own
     decides on which sides obstacles are passed.
+
+    With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in.
     """
 
     def __init__(self, spec: PolicySpec, device: str = "cpu"):
@@ -72,9 +74,13 @@ class PolicyNetwork(torch.nn.Module):
         self.spec = spec
         own: dict[str, Any] = {"device": device, "dtype": torch.float32}  # whatever torch's defaults are
         self._frame = None if spec.frame is None else FRAMES[spec.frame]
-        self._mirrors = [tuple(torch.tensor(signs, **own) for signs in mirror) for mirror in spec.mirrors]
+        self._mirrors = [
+            (torch.tensor([*signs, *(spec.history * (*signs, *action))], **own), torch.tensor(action, **own))
+            for signs, action in spec.mirrors
+        ]
         self.routes = Routes(spec.frame, spec.routes, device) if spec.frame is not None and spec.routes else None
         inputs = spec.observations if self._frame is None else self._frame.size
+        inputs += spec.history * (inputs + 2)
         self._steady = self._frame.steady if self._frame is not None and spec.centred else None
         self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd, **own) if spec.linear else None
         widths = (inputs, *spec.hidden)
@@ -96,14 +102,14 @@ class PolicyNetwork(torch.nn.Module):
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             seen = tuple(observation.tolist())
-            features, back = self._frame.features(seen if self.routes is None else seen + self.routes.alone(seen))
+            features, back = self._features(seen if self.routes is None else seen + self.routes.alone(seen))
             output = self._in_frame(features, observation.new_tensor)
             forwards, sideways = output.tolist()
             return observation.new_tensor(back((forwards, sideways)))
         if self.routes is not None:
             observation = self.routes.behind(observation)
         if self._frame is not None:
-            features, back = self._frame.features(observation.unbind(-1))
+            features, back = self._features(observation.unbind(-1))
             action = self._in_frame(features, lambda values: torch.stack(values, -1))
             return torch.stack(back((action[..., 0], action[..., 1])), -1)
         total = self._sum(observation)
@@ -111,12 +117,35 @@ class PolicyNetwork(torch.nn.Module):
             total = total + action_signs * self._sum(signs * observation)
         return total / (1 + len(self._mirrors)) if self._mirrors else total
 
+    def _features(self, observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
+        """Features of the present observation, and behind them those of the past ones with their actions; the way back."""
+        assert self._frame is not None
+        count, own = self.spec.history, self.spec.observations
+        if not count:
+            return self._frame.features(observation)
+        features, back = self._frame.features(observation[:own])
+        for k in range(count):
+            first = own + k * (own + 2)
+            then, back_then = self._frame.features(observation[first : first + own])
+            x, y = observation[first + own : first + own + 2]
+            one = 0.0 * x + 1.0
+            axes = (back_then((one, 0.0 * x)), back_then((0.0 * x, one)))  # orthonormal
+            features = (*features, *then, *(a * x + b * y for a, b in axes))
+        return features, back
+
     def _in_frame(self, features: tuple[Any, ...], stack: Callable[[Any], torch.Tensor]) -> torch.Tensor:
         """Action in the frame (..., 2) before it is squashed; stack: makes tensors (..., n) of n values."""
         output = self._sum(stack(features))
         if self._steady is not None:
-            output = centred(output, features, self._sum, self._steady, self.spec.squash, stack)
+            output = centred(output, features, self._sum, self._kept, self.spec.squash, stack)
         return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
+
+    def _kept(self, features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+        """Features of the steady motion, as if it had gone on for all of the history, and the action that keeps it."""
+        assert self._steady is not None
+        assert self._frame is not None
+        kept, action = self._steady(features[: self._frame.size])
+        return (*kept, *(self.spec.history * (*kept, *action))), action
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
@@ -157,7 +186,8 @@ class PolicyController(ActionController):
 
     def __init__(self, task: Task, params: BallbotParams, network: torch.nn.Module):
         """Args: network: a `PolicyNetwork`, or another from observations (..., no) to actions (..., 2)."""
-        super().__init__(task, params, lambda observation, begins: self.predict(observation)[0])
+        history = network.spec.history if isinstance(network, PolicyNetwork) else 0
+        super().__init__(task, params, lambda observation, begins: self.predict(observation)[0], history)
         self._network = network.eval()
 
     def predict(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
+from ballbot_gym.env import check_history
 from ballbot_gym.robots import PAPER, ROBOTS, file_name
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
@@ -71,6 +72,8 @@ class PolicySpec:
     observation_version: int = OBSERVATION_VERSION
     robot: str = PAPER
     """Name in `ROBOTS` of the robot it was trained on."""
+    history: int = 0
+    """How many earlier observations and actions it sees; `history` of its env."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.task, str):
@@ -79,6 +82,9 @@ class PolicySpec:
             raise ValueError(f"robot must be one of {', '.join(ROBOTS)}, not {self.robot!r:.200}")
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
+        check_history(self.history)
+        if self.history and self.routes:
+            raise ValueError("routes know no history")
         for name in ("hidden", "routes"):
             layers = getattr(self, name)
             if not isinstance(layers, tuple) or len(layers) > _MOST_LAYERS:

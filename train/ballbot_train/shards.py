@@ -142,12 +142,7 @@ class Shards:
         content = files.npz(arrays, compressed=False)  # trajectories hardly shrink, and one process writes all shards
         self._write(_name(number), content)
         digest = hashlib.sha256(content).hexdigest()
-        self._shards[number] = {
-            "file": _name(number),
-            "episodes": episodes,
-            "bytes": len(content),
-            "sha256": digest,
-        }
+        self._shards[number] = {"file": _name(number), "episodes": episodes, "bytes": len(content), "sha256": digest}
         self._write_manifest()
 
     def _write_manifest(self) -> None:

@@ -11,7 +11,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, markdown, physics_or_default, print_table, progress_bars
-from ballbot_train.evaluation import basins
+from ballbot_train.evaluation import basins, robustness, tracks
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
 from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
@@ -34,6 +34,7 @@ def benchmark(
     out: Path = Path("runs/benchmark"),
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
+    randomization: tuple[str, ...] = (),
 ) -> None:
     """Compares controllers by their regret on the certified episodes, and writes a leaderboard with figures.
 
@@ -50,7 +51,12 @@ def benchmark(
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.
+        randomization: names of tracks, "unknown", "late", "noisy" or "real": robots, delays and sensors that nobody told the
+            controllers. Then the result is one table of controllers by tracks, with the parts of their regret.
     """
+    if randomization:
+        _benchmark_tracks(tasks, controllers, episodes, quick, physics, seed, out, workers, robot, randomization)
+        return
     chosen = controllers_of(tasks, controllers, robot)
     physics = physics_or_default(physics)
     episodes = checked_episodes(episodes, quick, few=8)
@@ -85,6 +91,32 @@ def benchmark(
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")
     console.print(f"report: {page}")
+
+
+def _benchmark_tracks(
+    tasks: Sequence[str],
+    controllers: Sequence[str],
+    episodes: int,
+    quick: bool,
+    physics: Physics | None,
+    seed: int,
+    out: Path,
+    workers: Workers,
+    robot: str,
+    names: Sequence[str],
+) -> None:
+    wanted, chosen = tracks.conditions(names), controllers_of(tasks, controllers, robot)
+    physics, episodes = physics_or_default(physics), checked_episodes(episodes, quick, few=8)
+    facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes, tracks=list(names))
+    tracks.find_optima(list(chosen), names, episodes, robot, workers)
+    with progress_bars(robustness.episodes_to_run(chosen, wanted, episodes)) as bars:
+        results = robustness.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
+    rows = tracks.rows_of(results, robot, seed)
+    tracks.write(rows, results, facts, out)
+    table = [tracks.cells(row) for row in rows]
+    files.write(out / "tracks.md", markdown(tracks.HEADER, table))
+    jobs.release(out)
+    print_table(f"{episodes} certified episodes per task and track, physics={physics}", tracks.HEADER, table)
 
 
 def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path, robot: str) -> Path:

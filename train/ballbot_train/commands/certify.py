@@ -7,6 +7,7 @@ from ballbot_baselines import certification
 from ballbot_baselines.optimum import ALL_GUESSES
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
+from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
@@ -30,6 +31,7 @@ def certify(
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
     guesses: int = ALL_GUESSES,
+    randomization: str | None = None,
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
 
@@ -46,6 +48,7 @@ def certify(
         workers: who does the work.
         robot: whose sets.
         guesses: most guessed paths per episode; default all. With fewer, those of a slalom that are predicted to be the best.
+        randomization: name of the track from which each episode's robot and delay are drawn; default, none.
     """
     check_some("task", tasks, TASKS)
     check_least(1, episodes=episodes, guesses=guesses)
@@ -55,6 +58,8 @@ def certify(
         raise ValueError(
             f"episodes must be at most {most}, not {episodes}" + (most < _MOST_IN_SHARDS) * "; or give --shards"
         )
+    if not checked_randomization(randomization).moves_optima and randomization:
+        raise ValueError(f"{randomization} moves no optimum: its episodes have the optima without --randomization")
     if install and episodes < certified.EPISODES:
         raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
     if shards is not None:
@@ -64,33 +69,34 @@ def certify(
         return
     jobs.make_folder(out)
     params, failures, sets = named_robot(robot), [], {}
+    varied = checked_randomization(randomization)
     for name in tasks:
         task = make_task(name, robot)
         try:
-            optima.compute(task, params, range(episodes), workers, guesses, enough=guesses)
+            optima.compute(task, params, range(episodes), workers, guesses, guesses, varied)
         except PlanError as error:
             failures.append(str(error))
             continue
-        found = certified.from_cache(task, params, range(episodes))
+        found = certified.from_cache(task, params, range(episodes), varied)
         assert found is not None
         sets[name] = found.first(episodes)
-        path = sets[name].save(task, out / certified.path_of(task, robot).name, robot)
+        path = sets[name].save(task, out / certified.path_of(task, robot, randomization or "").name, robot, varied)
         console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     if failures:
         raise PlanError("\n".join(failures))
     if install:
         for name, evaluation_set in sets.items():
             task = make_task(name, robot)
-            path = certified.path_of(task, robot)
+            path = certified.path_of(task, robot, randomization or "")
             try:
-                old = certified.load(task, robot, path)
+                old = certified.load(task, robot, path, randomization=varied)
             except certified.CertificateError:  # none, or of another problem
                 kept = evaluation_set
             else:
                 kept = old.improved_by(evaluation_set)
                 same = int((kept.costs == old.costs).sum())
                 console.print(f"{name}: {len(kept) - same} of {len(kept)} optima are cheaper than those installed")
-            console.print(f"installed: {kept.save(task, path, robot)}")
+            console.print(f"installed: {kept.save(task, path, robot, varied)}")
 
 
 def _certify_shards(

@@ -64,9 +64,9 @@ def robustness(
     check_some("stress", stresses, stressed.STRESSES)
     episodes = checked_episodes(episodes, quick, few=3)
     facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
-    load_before = load()
-    with progress_bars(stressed.episodes_to_run(chosen, stresses, episodes)) as bars:
-        results = stressed.run(chosen, stresses, episodes, physics, out, workers, bars.advance, seed, robot)
+    load_before, wanted = load(), stressed.conditions(stresses)
+    with progress_bars(stressed.episodes_to_run(chosen, wanted, episodes)) as bars:
+        results = stressed.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
     facts |= load_facts(load_before, workers)
     rows = stressed.rows_of(results, seed)
     stressed.write(rows, results, facts, out)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, cast, get_args, get_type_hints
 
 from ballbot_gym import certified
+from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption, meanings_of
@@ -57,6 +58,10 @@ class Run:
     """Dataset of `ballbot demos`, or the URL of shards."""
     start: Path | None = None
     """Policy file to train on from; ppo, sac, shac."""
+    randomization: str | None = None
+    """Track: unknown, late, noisy or real; ppo, shac."""
+    history: int = 0
+    """Earlier observations and actions that are seen."""
     seed: int = 0
     """Seed of all that is drawn."""
     seeds: str | None = None
@@ -108,6 +113,8 @@ def train(
     seeds: str | None = None,
     workers: int | Workers = 1,
     robot: RobotName = PAPER,
+    randomization: str | None = None,
+    history: int = 0,
 ) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
@@ -127,6 +134,8 @@ def train(
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
         workers: how many runs of `seeds` go on at once, or `Workers`.
         robot: name of a robot.
+        randomization: name of the track on which the policy is trained and measured, for ppo and shac.
+        history: how many earlier observations and actions the policy sees, for ppo and shac.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
@@ -136,6 +145,8 @@ def train(
         robot,
         _text(demos),
         start,
+        randomization,
+        history,
         seed,
         threads=threads,
         out=Path("runs") / "train" / f"{file_name(task, robot)}-{learner}" if out is None else out,
@@ -166,11 +177,14 @@ def _train_one(learner: str, run: Run, settings: Any, command: str, workers: Wor
     from ballbot_train.policy import load_network
 
     torch.set_num_threads(run.threads)
-    problem, out = make_task(run.task, run.robot), cast(Path, run.out)
+    problem, out, varied = make_task(run.task, run.robot), cast(Path, run.out), checked_randomization(run.randomization)
     config = _config(learner, run, settings, command)
-    optima.known(problem, run.robot, workers=workers)  # by which it is scored while it learns
+    # by which it is scored while it learns
+    optima.known(problem, run.robot, workers=workers, randomization=varied)
     start = None if run.start is None else load_network(run.start, problem, robot=None)
-    made = LEARNERS[learner].make(problem, named_robot(run.robot), settings, run.seed, run.demos, start)
+    world = None if run.randomization is None else varied
+    given = settings, run.seed, run.demos, start, world, run.history
+    made = LEARNERS[learner].make(problem, named_robot(run.robot), *given)
     physics = physics_or_default(None)
     row = training.train(made, problem, config, out, run.resume, run.test_episodes)
     console.print(
@@ -203,6 +217,8 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
         "command": " && ".join([*reversed(inputs), command]),
         **({"inputs": inputs} if inputs else {}),
         **robot_setting(run.robot),
+        **({} if run.randomization is None else {"randomization": run.randomization}),
+        **({"history": run.history} if run.history else {}),
         **({} if more == VALIDATION_EPISODES else {"validation_episodes": more}),
     }
 
@@ -337,6 +353,7 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
     words = ["ballbot", "train", learner]
     defaults = {  # settings of which older records know nothing
         "robot": PAPER,
+        "history": 0,
         "threads": 1,
         "test_episodes": certified.EPISODES,
         "validation_episodes": VALIDATION_EPISODES,

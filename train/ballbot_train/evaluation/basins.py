@@ -30,9 +30,7 @@ BOUNDARY = "boundary"
 LEAN_LIMIT = 75.0  # degrees, either side
 _BOUNDARY_POINTS = 31  # its search goes from value to value, in steps that it can follow
 _ARENA_RADIUS = 1000.0  # m: a map asks whether the robot comes back, not how far it goes meanwhile
-_DOUBT = (
-    2.0  # degrees beyond the boundary that are run too, because the boundary is only as exact as its regularization
-)
+_DOUBT = 2.0  # degrees beyond the boundary that are run too, because it is only as exact as its regularization
 
 
 @dataclass(frozen=True)
@@ -45,10 +43,7 @@ class Axis:
     label: str
 
 
-AXES: dict[str, Axis] = {
-    "speed": Axis(4, 15.0, "speed ẋ, m/s"),
-    "lean rate": Axis(6, 15.0, "lean rate γ̇, rad/s"),
-}
+AXES: dict[str, Axis] = {"speed": Axis(4, 15.0, "speed ẋ, m/s"), "lean rate": Axis(6, 15.0, "lean rate γ̇, rad/s")}
 
 
 @dataclass(frozen=True)
@@ -185,10 +180,7 @@ def _cells(
 
 
 def maps_of(
-    bounds: Mapping[str, np.ndarray],
-    entries: Iterable[jobs.Entry],
-    controllers: Sequence[str],
-    points: int,
+    bounds: Mapping[str, np.ndarray], entries: Iterable[jobs.Entry], controllers: Sequence[str], points: int
 ) -> list[BasinMap]:
     """The maps that finished states make up."""
     recovered = {name: {c: np.zeros((points, points), bool) for c in controllers} for name in bounds}

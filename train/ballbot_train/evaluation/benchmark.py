@@ -25,7 +25,8 @@ from ballbot_train.executors import Workers
 from ballbot_train.policy_files import paths_of
 from ballbot_train.provenance import provenance
 
-_CHUNK = 5  # episodes of a job
+CHUNK = 5
+"""Episodes of a job."""
 
 
 def controllers_of(tasks: Sequence[str], names: Sequence[str] = (), robot: str = PAPER) -> dict[str, list[str]]:
@@ -161,10 +162,10 @@ def benchmark(
         robot: by name.
     """
     work = [
-        episode_job(task, name, physics, range(start, min(start + _CHUNK, episodes)), seed, robot=robot, record=True)
+        episode_job(task, name, physics, range(start, min(start + CHUNK, episodes)), seed, robot=robot, record=True)
         for task, group in controllers.items()
         for name in group
-        for start in range(0, episodes, _CHUNK)
+        for start in range(0, episodes, CHUNK)
     ]
     entries = [entry for done in jobs.run(work, out, workers, on_progress) for entry in done]
     motions = [recordings.from_text(entry.pop("motion")) for entry in entries]
@@ -191,16 +192,20 @@ def episode_job(
     made_for: str | None = None,
     variant: BallbotParams | None = None,
     record: bool = False,
+    own_optima: bool = False,
 ) -> jobs.Job:
     """Some certified episodes of a robot under a controller by name, as a job whose entries are the fields of Results.
 
     The controller is made for the robot, or for another one by name. A variant of the robot may run in its place; regret is
-    over the robot's own optimum then too. The label tells jobs apart that differ in their randomization or robots; progress
-    counts for the group, or else the task. With record each entry also has the "motion" as `recordings.to_text` gives it.
+    over the robot's own optimum then too, or with own_optima over that of each episode's robot. The label tells jobs apart
+    that differ in their randomization or robots; progress counts for the group, or else the task. With record each entry also
+    has the "motion" as `recordings.to_text` gives it.
     """
     what, packed = f"{task}-{controller}-{physics}-{label}", registry.packed(controller)
     # the optima go along, because workers on other machines do not have this user's cache
-    known = replace(certified.load(task, robot, episodes=episodes), trajectories=(), statuses=np.zeros(0, str))
+    varied = (own_optima and randomization) or Randomization()
+    known = certified.load(task, robot, episodes=episodes, randomization=varied)
+    known = replace(known, trajectories=(), statuses=np.zeros(0, str))
     slug = "".join(sign if sign.isalnum() else "-" for sign in what)
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",

@@ -22,7 +22,7 @@ from ballbot_gym.rollout import ActionController, Controller, PlanError, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.controllers import make_controller, policy_digest
-from ballbot_train.evaluation.results import Result, Row, summarize, write_leaderboard
+from ballbot_train.evaluation.results import UNMEASURED, Result, Row, summarize, write_leaderboard
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.provenance import provenance
@@ -93,7 +93,7 @@ def evaluate(
     episodes: int | Iterable[int] = certified.EPISODES,
     physics: str | None = None,
     name: str | None = None,
-    randomization: Randomization | None = None,
+    randomization: Randomization | str | None = None,
     robot: str | BallbotParams = PAPER,
     workers: int | Workers | None = None,
     out: str | Path | None = None,
@@ -109,32 +109,31 @@ def evaluate(
         episodes: how many of the certified episodes, from the first, or their indices, each once.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         name: of the row; default, the policy's own.
-        randomization: what disturbs it; default, nothing. The regret is over the optimum of the undisturbed robot.
+        randomization: what the policy is not told, or a name in `TRACKS`; default, nothing. The regret is over the optimum
+            of each episode's own robot and delay, which a policy could only reach that knows them.
         robot: a name in `ROBOTS`, or any BallbotParams.
         workers: processes that compute optima; default, this one alone. Others import the main script, as `multiprocessing`
             does: what it does must be under `if __name__ == "__main__"`.
         out: folder for the results, as `ballbot benchmark` writes them; `ballbot compare` and `ballbot submit` read them.
 
     Raises:
-        TypeError, ValueError: no such policy, task, physics or episodes.
+        TypeError, ValueError: no such policy, task, physics or episodes; or a randomization with an actuator that lags, under
+            which no optimum is known.
         PlanError: an episode has no optimum that can be found.
     """
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
         indices = episode_indices(episodes, certified.EPISODES)
         controller = as_controller(policy, env.task, env.params)
-        known = optima.known(env.task, env.params, indices, workers)
+        known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), task_name(env.task)
         motions: list[recordings.Motion] = []
         keep = None if out is None else motions.append
         results = list(iterate_episodes(env, controller, *named, indices, 0, known, keep))
         row = summarize(results)
         if out is not None:
-            facts = provenance() | {
-                "physics": env.physics,
-                "randomization": repr(env.randomization),
-                "robot": repr(env.params),
-            }
+            ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
+            facts = provenance() | ran
             write_leaderboard([row], results, facts, Path(out))
             if indices == list(range(len(indices))) and not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
@@ -156,15 +155,13 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
         ValueError: none, more than there are, or one of them twice.
         TypeError: they are no whole numbers.
     """
-    if isinstance(episodes, bool | str):
+    if isinstance(episodes, bool | str) or not isinstance(episodes, numbers.Integral | Iterable):
         raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
     if isinstance(episodes, numbers.Integral):
         count = int(episodes)
         if not 1 <= count <= available:
             raise ValueError(f"episodes must be 1 to {available}, or a list of indices, not {count}")
         return list(range(count))
-    if not isinstance(episodes, Iterable):
-        raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
     indices = list(itertools.islice(episodes, available + 1))  # it may be endless
     if len(indices) > available:
         raise ValueError(f"episodes names more than the {available} episodes that there are; give each once")
@@ -181,11 +178,9 @@ def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
 
 
 def _name(policy: Any) -> str:
-    return (
-        Path(policy).name
-        if isinstance(policy, str | Path)
-        else getattr(policy, "__name__", type(policy).__name__.lower())
-    )
+    if isinstance(policy, str | Path):
+        return Path(policy).name
+    return getattr(policy, "__name__", type(policy).__name__.lower())
 
 
 def task_name(task: Task) -> str:
@@ -210,7 +205,7 @@ def run_episodes(
         PlanError: an episode has no optimum that can be found.
     """
     indices = list(episodes)
-    known = optima.known(env.task, env.params, indices)
+    known = optima.known(env.task, env.params, indices, randomization=env.randomization)
     return list(iterate_episodes(env, controller, name, task, indices, seed, known))
 
 
@@ -226,30 +221,17 @@ def iterate_episodes(
 ) -> Iterator[Result]:
     """As `run_episodes`, one by one, compared with the optima of any set; `keep` gets what was done in each."""
     for i in episodes:
-        optimum = float(episode_set.costs[i])
-        common: dict[str, Any] = {
-            "task": task,
-            "controller": name,
-            "episode": i,
-            "physics": env.physics,
-            "optimum": optimum,
-        }
         run = None
         try:
             run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=episode_set.options(i))
         except PlanError as error:
-            outcome: dict[str, Any] = {
-                "cost": env.task.survival_pay,
-                "success": False,
-                "failure": True,
-                "note": str(error),
-            }
-            measures: dict[str, Any] = dict.fromkeys(
-                ("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), math.nan
-            )
+            measures: dict[str, Any] = UNMEASURED | {"cost": env.task.survival_pay, "note": str(error)}
+            measures |= {"success": False, "failure": True}
         else:
-            outcome = {"cost": run.cost, "success": run.success, "failure": run.failure}
             measures = {
+                "cost": run.cost,
+                "success": run.success,
+                "failure": run.failure,
                 "peak_tilt": math.degrees(run.peak_tilt),
                 "settle_time": run.settle_time,
                 "duration": run.trajectory.duration,
@@ -259,4 +241,4 @@ def iterate_episodes(
             }
         if keep is not None:
             keep(recordings.rounded(None if run is None else run.trajectory, env.params))
-        yield Result(**common, **outcome, **measures)
+        yield Result(task, name, i, env.physics, optimum=float(episode_set.costs[i]), **measures)

@@ -6,6 +6,7 @@ Importing this module is light: CasADi is imported when an optimum is computed.
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER, checked_robot, file_name, robot_name
 from ballbot_gym.rollout import PlanError
@@ -28,11 +30,15 @@ except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
 
+_Solver = Callable[[Task, Sequence[int]], Iterator[jobs.Entry]]
+
+
 def known(
     task: str | Task,
     robot: str | BallbotParams = PAPER,
     episodes: Iterable[int] | None = None,
     workers: int | Workers | None = None,
+    randomization: Randomization = Randomization(),
 ) -> certified.EvaluationSet:
     """The evaluation set of a task and a robot, with the optima of some episodes at least. What is missing is computed.
 
@@ -41,10 +47,11 @@ def known(
         robot: a name in `ROBOTS`, or any BallbotParams.
         episodes: their indices; default, the first 200.
         workers: processes that compute, or `Workers`; default, this process alone.
+        randomization: what the robots and actuators of the episodes are drawn from.
 
     Raises:
         PlanError: an episode has no optimum that can be found.
-        ValueError: no task or robot of that name.
+        ValueError: no task or robot of that name, or no optimum is known under such a randomization.
     """
     task, params, needed = (
         make_task(task, robot),
@@ -52,10 +59,12 @@ def known(
         range(certified.EPISODES) if episodes is None else list(episodes),
     )
     try:
-        return certified.load(task, params, episodes=needed)
+        return certified.load(task, params, episodes=needed, randomization=randomization)
     except certified.CertificateError:
-        compute(task, params, needed, workers)
-        return certified.load(task, params, episodes=needed)
+        if randomization.actuator_lag[1] > 0:
+            raise
+        compute(task, params, needed, workers, randomization=randomization)
+        return certified.load(task, params, episodes=needed, randomization=randomization)
 
 
 def compute(
@@ -65,6 +74,7 @@ def compute(
     workers: int | Workers | None = None,
     guesses: int | None = None,
     enough: int = 1,
+    randomization: Randomization = Randomization(),
 ) -> None:
     """Computes the optima of episodes that the user's cache lacks. Each is kept as soon as it is found.
 
@@ -76,6 +86,7 @@ def compute(
         workers: processes that compute, or `Workers`; default, this process alone.
         guesses: most guessed paths per episode; default, all.
         enough: an optimum that is there is not computed again if it was the best of so many guesses.
+        randomization: as of `known`.
 
     Raises:
         PlanError: an episode has no optimum; all others are kept.
@@ -84,7 +95,7 @@ def compute(
     needed = list(dict.fromkeys(episodes))
     for index in needed:
         _check_start(task, params, index)
-    folder = cache.folder(task, params)
+    folder = cache.folder(task, params, randomization)
     jobs.make_folder(folder)
     lock = filelock.FileLock(folder / "computing.lock")
     try:
@@ -94,19 +105,21 @@ def compute(
         lock.acquire()
     failures = []
     try:
-        missing = _missing(task, params, needed, enough)
+        missing = _missing(task, params, needed, enough, randomization)
         if not missing:
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as bars:
-            found = _here if workers is None else partial(_elsewhere, workers=workers)
-            for entry in found(task, params, missing, guesses):
+            solve = _solver(params, guesses, randomization)
+            label = f"{guesses or 'all'}"
+            some = solve if workers is None else partial(_elsewhere, label, folder, workers, solve)
+            for entry in some(task, missing):
                 bars.advance(name, 1)
                 if "error" in entry:
                     failures.append(f"episode {entry['episode']}: {entry['error']}")
                     continue
                 entry["status"] = f"{entry['solver']}: {entry['status']}"
-                cache.write(task, params, entry["episode"], entry)
+                cache.write(task, params, entry["episode"], entry, randomization)
     finally:
         lock.release()
     if failures:
@@ -138,32 +151,29 @@ def _check_start(task: Task, params: BallbotParams, index: int) -> None:
             )
 
 
-def _missing(task: Task, params: BallbotParams, episodes: list[int], enough: int) -> list[int]:
-    found = cache.read(task, params, episodes)
+def _missing(
+    task: Task, params: BallbotParams, episodes: list[int], enough: int, randomization: Randomization
+) -> list[int]:
+    found = cache.read(task, params, episodes, randomization)
     for index in list(found):
-        if certified.from_cache(task, params, [index]) is None:  # it does not move or cost so any more
-            cache.forget(task, params, index)
+        if certified.from_cache(task, params, [index], randomization) is None:  # it does not move or cost so any more
+            cache.forget(task, params, index, randomization)
             del found[index]
     return [index for index in episodes if index not in found or found[index]["found"]["guesses"] < enough]
 
 
-def _here(task: Task, params: BallbotParams, missing: list[int], guesses: int | None) -> Iterator[jobs.Entry]:
-    return _solver(params, guesses)(task, missing)
-
-
 def _elsewhere(
-    task: Task, params: BallbotParams, missing: list[int], guesses: int | None, workers: int | Workers
+    label: str, folder: Path, workers: int | Workers, solve: _Solver, task: Task, missing: list[int]
 ) -> Iterator[jobs.Entry]:
     """In other processes, in the order in which they finish. A job an episode, because any may be missing."""
-    folder, solve = cache.folder(task, params), _solver(params, guesses)
-    work = [jobs.Job(f"{index:06d}-{guesses or 'all'}", solve, (task,), (index,)) for index in missing]
+    work = [jobs.Job(f"{index:06d}-{label}", solve, (task,), (index,)) for index in missing]
     for number, (entry,) in jobs.stream(work, folder, workers, lambda *_: None):
         yield entry
         jobs.forget(folder, work[number].name)
     jobs.release(folder)
 
 
-def _solver(params: BallbotParams, guesses: int | None) -> Callable[[Task, Sequence[int]], Iterator[jobs.Entry]]:
+def _solver(params: BallbotParams, guesses: int | None, randomization: Randomization) -> _Solver:
     from ballbot_baselines.certification import ALL_GUESSES, entries
 
-    return partial(entries, robot=params, guesses=guesses or ALL_GUESSES)
+    return partial(entries, robot=params, guesses=guesses or ALL_GUESSES, randomization=randomization)

@@ -122,13 +122,15 @@ def write(path: Path, about: Mapping[str, Any], recording: Recording) -> Path:
     return files.write_npz(path, arrays | {"states": _packed(states), "actions": _packed(actions)})
 
 
-def read(path: str | Path) -> Recording:
+def read(path: str | Path, content: bytes | None = None) -> Recording:
     """What `write` wrote. Sizes are checked before anything is unpacked, and nothing in the file is executed.
+
+    Args: content: of the file, if it is read already.
 
     Raises:
         FileError: it is missing, damaged, too large, or no recording.
     """
-    arrays = files.arrays_of(files.read(path, LARGEST_FILE), path, _LARGEST_UNPACKED)
+    arrays = files.arrays_of(content or files.read(path, LARGEST_FILE), path, _LARGEST_UNPACKED)
     if unknown := arrays.keys() - _ARRAYS:
         raise files.FileError(f"{path} holds {', '.join(sorted(unknown))}, which no recording has: costs are computed")
     if missing := _ARRAYS - arrays.keys():
@@ -145,10 +147,7 @@ def read(path: str | Path) -> Recording:
     if not isinstance(facts, dict):
         raise files.FileError(f"{path} is no recording: about holds no object")
     return Recording(
-        facts,
-        lengths.astype(np.int64),
-        GRID * _unpacked(arrays["states"]),
-        ACTION_GRID * _unpacked(arrays["actions"]),
+        facts, lengths.astype(np.int64), GRID * _unpacked(arrays["states"]), ACTION_GRID * _unpacked(arrays["actions"])
     )
 
 

@@ -44,6 +44,10 @@ class Result:
         return math.nan if self.failure else self.cost / self.optimum - 1
 
 
+UNMEASURED = dict.fromkeys(("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), math.nan)
+"""What a Result says of an episode that has no trajectory."""
+
+
 @dataclass(frozen=True, repr=False)
 class Row(Displayed):
     """A leaderboard row. Regret, peak tilt, settle time and effort are of the episodes that did not fail."""
@@ -269,15 +273,16 @@ BUSY_NOTE = "~ The machine was busy, so plan and per step are longer than they n
 """What stands below a table of `cells` of a busy machine."""
 
 
+def shown(value: float, form: str, unit: str = "") -> str:
+    """A figure of a table; a dash where there is none."""
+    return format(value, form) + unit if math.isfinite(value) else "–"
+
+
 def cells(row: Row, busy: bool = False) -> list[str]:
     """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash.
 
     Times of a busy machine have a ~ in front.
     """
-
-    def shown(value: float, form: str, unit: str = "") -> str:
-        return format(value, form) + unit if math.isfinite(value) else "–"
-
     ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
     return [
         row.task,

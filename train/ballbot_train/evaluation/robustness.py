@@ -1,7 +1,8 @@
-"""The leaderboard under disturbances: how success and regret change with their severity.
+"""The leaderboard under disturbances: how success and regret change with their severity, and with tracks.
 
-No controller knows of the disturbance: experts plan for the nominal robot with ideal actuators and sensors. Regret is
-measured against the undisturbed optimum, so no controller could avoid all of it. Every controller meets the same draws.
+No controller knows of the disturbance: experts plan for the nominal robot with ideal actuators and sensors. Under a stress,
+regret is measured against the undisturbed optimum, so no controller could avoid all of it. On a track (`tracks.py`) it is
+measured against the optimum of each episode's own robot. Every controller meets the same draws.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +14,7 @@ from ballbot_gym import files
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train import jobs
-from ballbot_train.evaluation.benchmark import episode_job
+from ballbot_train.evaluation.benchmark import CHUNK, episode_job
 from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
 from ballbot_train.executors import Workers
 
@@ -92,20 +93,37 @@ class StressRow(Row):
     level: float = 0.0
 
 
-def conditions(stresses: Sequence[str]) -> list[tuple[str, float]]:
-    """(stress, level) of everything to run; the undisturbed once."""
-    return [(NONE, 0.0), *((name, level) for name in stresses for level in STRESSES[name].levels)]
+@dataclass(frozen=True)
+class Condition:
+    """What controllers meet: a stress of some severity, or a track, whose level is 0."""
+
+    name: str
+    level: float
+    randomization: Randomization
+    own_optima: bool = False
+    """Whether regret is over the optimum of each episode's own robot, and not over the undisturbed one."""
 
 
-def episodes_to_run(controllers: Mapping[str, Sequence[str]], stresses: Sequence[str], episodes: int) -> dict[str, int]:
-    """How many episodes `run` runs under every stress, the undisturbed first."""
-    each = sum(map(len, controllers.values())) * episodes
-    return {NONE: each} | {name: each * len(STRESSES[name].levels) for name in stresses}
+def conditions(stresses: Sequence[str]) -> list[Condition]:
+    """Every level of some stresses in `STRESSES`, and the undisturbed once."""
+    levels = ((name, level) for name in stresses for level in STRESSES[name].levels)
+    return [
+        Condition(NONE, 0.0, Randomization()),
+        *(Condition(name, level, STRESSES[name].at(level)) for name, level in levels),
+    ]
+
+
+def episodes_to_run(
+    controllers: Mapping[str, Sequence[str]], wanted: Sequence[Condition], episodes: int
+) -> dict[str, int]:
+    """How many episodes `run` runs under every stress or track."""
+    names, each = [condition.name for condition in wanted], sum(map(len, controllers.values())) * episodes
+    return {name: each * names.count(name) for name in dict.fromkeys(names)}
 
 
 def run(
     controllers: Mapping[str, Sequence[str]],
-    stresses: Sequence[str],
+    wanted: Sequence[Condition],
     episodes: int,
     physics: str,
     out: Path,
@@ -118,45 +136,43 @@ def run(
 
     Args:
         controllers: names by task.
-        stresses: names in `STRESSES`.
+        wanted: the conditions.
         episodes: certified episodes of each task, from the first.
         physics: "bullet", "mujoco" or "rk4".
         out: folder of the results.
         workers: a number of processes, or `Workers`.
-        on_progress: called with a stress and a number of finished episodes.
+        on_progress: called with the name of a condition and a number of finished episodes.
         seed: of the draws: episode i draws the same with every controller.
         robot: by name.
     """
     work = [
         (
-            stress,
-            level,
+            condition,
             episode_job(
                 task,
                 name,
                 physics,
-                range(episodes),
+                range(start, min(start + chunk, episodes)),
                 seed,
-                _randomization(stress, level),
-                f"{stress}-{level:g}",
-                stress,
+                condition.randomization,
+                f"{condition.name}-{condition.level:g}",
+                condition.name,
                 robot,
+                own_optima=condition.own_optima,
             ),
         )
-        for stress, level in conditions(stresses)
+        for condition in wanted
+        for chunk in (CHUNK if condition.own_optima else episodes,)
         for task, group in controllers.items()
         for name in group
+        for start in range(0, episodes, chunk)
     ]
-    done = jobs.run([job for *_, job in work], out, workers, on_progress)
+    done = jobs.run([job for _, job in work], out, workers, on_progress)
     return [
-        StressResult(**entry, stress=stress, level=level)
-        for (stress, level, _), entries in zip(work, done, strict=True)
+        StressResult(**entry, stress=condition.name, level=condition.level)
+        for (condition, _), entries in zip(work, done, strict=True)
         for entry in entries
     ]
-
-
-def _randomization(stress: str, level: float) -> Randomization:
-    return Randomization() if stress == NONE else STRESSES[stress].at(level)
 
 
 def rows_of(results: Sequence[StressResult], seed: int = 0) -> list[StressRow]:

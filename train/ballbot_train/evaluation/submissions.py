@@ -25,7 +25,7 @@ from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import outcome
 from ballbot_train.evaluation import recordings
-from ballbot_train.evaluation.results import Result, read_results, summarize, to_json
+from ballbot_train.evaluation.results import UNMEASURED, Result, read_results, summarize, to_json
 
 TOLERANCE = 1e-6
 """Largest difference of a recorded state from the one that follows, m, rad and per second, where the state is all that
@@ -86,9 +86,6 @@ class Entry:
     def results(self) -> list[Result]:
         """Its episodes, beside the certified optima as they are now."""
         optima = certified.load(self.task, self.robot).costs
-        unknown = dict.fromkeys(
-            ("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), math.nan
-        )  # which the row does not hold
         return [
             Result(
                 task=self.task,
@@ -99,7 +96,7 @@ class Entry:
                 optimum=float(optima[i]),
                 success=end == _SUCCESS,
                 failure=end not in (_SUCCESS, _MISSED),
-                **unknown,
+                **UNMEASURED,
             )
             for i, (cost, end) in enumerate(zip(self.costs, self.ends, strict=True))
         ]
@@ -196,7 +193,8 @@ def verify(path: str | Path, episodes: int = certified.EPISODES) -> Entry:
         FileError: as `recordings.read`.
         ImportError: its physics is not installed.
     """
-    recording = recordings.read(path)
+    content = files.read(path, recordings.LARGEST_FILE)
+    recording = recordings.read(path, content)
     facts = _checked_facts(recording.about, path)
     robot = named_robot(facts["robot"])
     task = make_task(facts["task"], facts["robot"])
@@ -207,7 +205,7 @@ def verify(path: str | Path, episodes: int = certified.EPISODES) -> Entry:
     known = certified.load(task, robot, episodes=range(episodes))
     costs, ends = _judged(_Steps(recording, path), facts["physics"], task, robot, known)
     rounded = [float(f"{cost:.9g}") for cost in costs]  # more digits differ between machines
-    digest = hashlib.sha256(files.read(path)).hexdigest()
+    digest = hashlib.sha256(content).hexdigest()
     entry = Entry(**{key: facts[key] for key in _FACTS}, submission=digest, costs=rounded, ends=ends)
     return replace(entry, **summary(entry))
 
@@ -344,11 +342,6 @@ def _jump(missed: np.ndarray, tolerance: float, contact: bool) -> str:
     """What is wrong with a step whose end is missed by so much."""
     i = int(np.argmax(np.where(np.isfinite(missed), missed, np.inf)))
     quantity, unit = dynamics.STATE[i]
-    return (
-        f"the next state does not follow: {quantity} is off by {missed[i]:.2g} {unit}, and {tolerance:g} is allowed"
-        + (
-            ". Balls that slip cannot be verified; record with physics rk4, where slipping is a failure"
-            if contact
-            else ""
-        )
-    )
+    slips = ". Balls that slip cannot be verified; record with physics rk4, where slipping is a failure" * contact
+    missed_by = f"{quantity} is off by {missed[i]:.2g} {unit}, and {tolerance:g} is allowed"
+    return f"the next state does not follow: {missed_by}{slips}"

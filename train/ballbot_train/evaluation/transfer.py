@@ -17,7 +17,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import named_robot
 from ballbot_train import jobs
 from ballbot_train.evaluation import benchmark
-from ballbot_train.evaluation.results import Result, Row, summarize, to_json
+from ballbot_train.evaluation.results import Result, Row, shown, summarize, to_json
 from ballbot_train.executors import Workers
 
 _CHUNK = 5  # episodes of a job
@@ -161,10 +161,6 @@ _NAMED = {
 
 def cells(row: TransferRow) -> list[str]:
     """A row as text, under `HEADER`; what does not exist is a dash."""
-
-    def shown(value: float, form: str, unit: str = "") -> str:
-        return format(value, form) + unit if math.isfinite(value) else "–"
-
     return [
         row.task,
         row.made_for,

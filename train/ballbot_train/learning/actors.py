@@ -8,7 +8,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.policy import PolicySpec
+from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over
@@ -22,13 +22,16 @@ of these."""
 _ROUTES = (128, 128)  # units of the layers that decide on sides
 
 
-def spec_for(task: Task, symmetry: RoutedSymmetry, hidden: tuple[int, ...], linear: bool = False) -> PolicySpec:
+def spec_for(
+    task: Task, symmetry: RoutedSymmetry, hidden: tuple[int, ...], linear: bool = False, history: int = 0
+) -> PolicySpec:
     """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
 
     Raises:
         ValueError: the task does not have the symmetry that the settings ask for.
     """
     fields: dict[str, Any] = {"hidden": hidden, "linear": linear, "squash": "tanh" if linear else "clip"}
+    fields["history"] = history
     if symmetry == "odd":
         if not any(set(mirror.state) == {-1} for mirror in task.mirrors):
             raise ValueError(f'{task.id} is not odd; give "none", "mirrors" or "frame" as its symmetry')
@@ -61,7 +64,25 @@ def spec_for(task: Task, symmetry: RoutedSymmetry, hidden: tuple[int, ...], line
 
 def retargeted(start: PolicySpec, mine: PolicySpec) -> PolicySpec:
     """The shape of a policy to start from, perhaps of another robot and its episodes, for the task and robot of `mine`."""
-    return replace(start, task=mine.task, robot=mine.robot)
+    return replace(start, task=mine.task, robot=mine.robot, history=mine.history)
+
+
+def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
+    """A policy to start from, with the history of `mine`: it sees more of the past, and at first makes nothing of it.
+
+    Raises:
+        ValueError: it sees a longer past than `mine`.
+    """
+    spec = retargeted(network.spec, mine)
+    if network.spec.history > mine.history:
+        raise ValueError(f"the policy to start from sees {network.spec.history} earlier observations; give --history")
+    made = PolicyNetwork(spec)
+    weights, shapes = network.state_dict(), made.state_dict()
+    for name, weight in weights.items():
+        more = shapes[name].shape[-1] - weight.shape[-1] if weight.ndim == 2 else 0
+        weights[name] = torch.nn.functional.pad(weight, (0, more))  # what is seen more comes last
+    made.load_state_dict(weights)
+    return made
 
 
 def check_start(start: PolicySpec, mine: PolicySpec) -> None:

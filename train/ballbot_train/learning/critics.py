@@ -21,23 +21,35 @@ class CriticInputs:
     """An observation as a critic sees it: in the task's frame if one is named, and with the products of its entries."""
 
     def __init__(
-        self, observations: int, products: bool = True, frame: str | None = None, routes: Routes | None = None
+        self,
+        observations: int,
+        products: bool = True,
+        frame: str | None = None,
+        routes: Routes | None = None,
+        past: int = 0,
     ):
         """Args:
         observations: their number.
         products: of all pairs, squares included.
         frame: name in `FRAMES`, or None.
         routes: of the actor, for a frame with a route.
+        past: numbers of earlier observations and actions behind them, which are seen as they are.
         """
-        self._routes = routes
+        self._routes, self._own = routes, observations if past else None
         self._frame = None if frame is None else FRAMES[frame]
         entries = observations if self._frame is None else self._frame.size
         self._pairs = torch.triu_indices(entries, entries) if products else None
-        self.size = entries + (0 if self._pairs is None else self._pairs.shape[1])
+        self.size = entries + (0 if self._pairs is None else self._pairs.shape[1]) + past
         """Number of inputs."""
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
-        """(B, observations) to (B, size)."""
+        """(B, observations + past) to (B, size)."""
+        if self._own is not None:
+            own, past = observation[..., : self._own], observation[..., self._own :]
+            return torch.cat([self._of_present(own), past], -1)
+        return self._of_present(observation)
+
+    def _of_present(self, observation: torch.Tensor) -> torch.Tensor:
         if self._routes is not None:
             observation = self._routes.behind(observation)
         if self._frame is not None:

@@ -27,6 +27,7 @@ import torch
 from ballbot_gym.batch import BallbotBatch, BatchStep
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.console import console
@@ -43,21 +44,11 @@ _SETTLED_SUCCESS = 0.85  # of the task's own episodes, for the curriculum to be 
 _ON_OPTIMA = 0.5  # share of the episodes that begins on optima, while the goal is wider or the field another
 _OPTIMA = 200
 _OPTIMA_SUCCESS = 0.6  # share of those episodes that has to succeed too before the goal narrows
-_RESERVE = (
-    0.4  # share of the goal's tolerances that the optima leave unused: noise must be allowed where slow optima end
-)
-_REACH, _REACH_STEP = (
-    0.1,
-    0.15,
-)  # s: how long before the end of their optimum they begin at first, and how much earlier then
-_RETRIES, _RETRIES_PER_FAILURE = (
-    0.4,
-    10.0,
-)  # share that repeats starts; in the end so many times the share that goes wrong
+_RESERVE = 0.4  # share of the goal's tolerances that optima leave unused: noise must be allowed where slow ones end
+_REACH, _REACH_STEP = 0.1, 0.15  # s: how long before the end of their optimum they begin, and how much earlier then
+_RETRIES, _RETRIES_PER_FAILURE = 0.4, 10.0  # share that repeats starts; later so many times the share that goes wrong
 _SHAPING = 10.0  # 1/m
-_EARLY_FAILURE_PRICE = (
-    300.0  # while the curriculum lasts: a high one teaches not to fail, and beside a low one cost is learnt
-)
+_EARLY_FAILURE_PRICE = 300.0  # while the curriculum lasts: it teaches not to fail; beside a low one cost is learnt
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
 _OWN, _ON_OPTIMUM = 0, 1  # how an episode began
 
@@ -116,6 +107,8 @@ class CurriculumBatch(BallbotBatch):
         short_episodes: tuple[float, float] = (0.0, 0.6),
         backwards: bool = False,
         pay: bool = True,
+        randomization: Randomization | None = None,
+        history: int = 0,
     ):
         """Makes the batch.
 
@@ -128,6 +121,7 @@ class CurriculumBatch(BallbotBatch):
             short_episodes: share of the episodes that is cut, and how long these last, s.
             backwards: whether training goes from the goal backwards.
             pay: whether living pays; else, and backwards, the reward is minus the running cost, and a failure has a price.
+            randomization, history: as of `BallbotBatch`.
 
         Raises:
             ValueError: the task has not what this asks for.
@@ -139,7 +133,7 @@ class CurriculumBatch(BallbotBatch):
             raise ValueError(f"short_episodes must be a share of 0 to 1 and seconds above 0, not {short_episodes}")
         if short_episodes[0] and task.first_exit:
             raise ValueError(f"{task.id} pays at its goal for the time that is left, so short_episodes must be 0")
-        super().__init__(task, num_envs, compile=False, params=params)
+        super().__init__(task, num_envs, compile=False, params=params, randomization=randomization, history=history)
         self.gamma, self._own, self._full = gamma, task, task if full is None else full
         self._short, self.backwards, self._pay = short_episodes, backwards, pay and not backwards
         self._goal_factor = _GOAL_FACTOR if backwards else 1.0
@@ -402,19 +396,10 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int, re
             states = find_optimum(task, params, x, c, backoff).trajectory.x
         except PlanError:
             continue
-        found.append((states, c))
+        n = min(len(states) - 1, steps)
+        found.append((states[:n], np.tile(c, (n, 1)), np.arange(n), len(states) - 1 - np.arange(n)))
     if not found:
         raise ValueError(f"{task.id}: no optimum was found on which episodes could begin")
-    return _starts(found, steps)
-
-
-def _starts(found: list[tuple[np.ndarray, np.ndarray]], steps: int) -> Starts:
-    """Starts before control step `steps`, of pairs of states (n + 1, 8) at n control steps and in the end, and constants."""
-    counts = [min(len(states) - 1, steps) for states, _ in found]
-    x = np.concatenate([states[:n] for n, (states, _) in zip(counts, found, strict=True)])
-    c = np.concatenate([np.tile(c, (n, 1)) for n, (_, c) in zip(counts, found, strict=True)])
-    passed = np.concatenate([np.arange(n) for n in counts])
-    left = np.concatenate([len(states) - 1 - np.arange(n) for n, (states, _) in zip(counts, found, strict=True)])
-    return Starts(
-        torch.from_numpy(x.T.copy()), torch.from_numpy(c.T.copy()), torch.from_numpy(passed), torch.from_numpy(left)
-    )
+    joined = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    x, c, passed, left = (torch.from_numpy(part.T.copy()) for part in joined)
+    return Starts(x, c, passed, left)

@@ -102,7 +102,7 @@ def _of_shard(opened: shards.Shards, number: int, task: Task) -> Demos:
     try:
         return _demos(arrays, len(task.observation_scale))
     except _UNFIT as error:
-        raise _damaged_shard(opened, number, error) from error
+        raise ValueError(f"shard {number} of {opened.url} is damaged; make the set anew ({error!r:.300})") from error
 
 
 def load_demos(path: str | Path, task: Task) -> Demos:
@@ -124,7 +124,7 @@ def load_demos(path: str | Path, task: Task) -> Demos:
     try:
         return _demos(_dataset(path), len(task.observation_scale))
     except Exception as error:  # h5py has dozens of ways to refuse a damaged file
-        raise _damaged_dataset(path, error) from error
+        raise ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r:.300})') from error
 
 
 def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task) -> None:
@@ -184,14 +184,6 @@ def _demos(arrays: Mapping[str, np.ndarray], observations: int) -> Demos:
         truncations=arrays["truncations"],
         executed=found["actions"],
     )
-
-
-def _damaged_dataset(path: str | Path, error: Exception) -> ValueError:
-    return ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r:.300})')
-
-
-def _damaged_shard(opened: shards.Shards, number: int, error: Exception) -> ValueError:
-    return ValueError(f"shard {number} of {opened.url} is damaged; make the set anew ({error!r:.300})")
 
 
 def command_of(path: str | Path) -> str:

@@ -226,17 +226,7 @@ def record(
         actions.append(action)
         rewards.append(reward)
         ends.append((terminated, truncated))
-    terminations, truncations = np.array(ends).T
-    recording = Recording(
-        np.array(observations),
-        np.array(states),
-        np.array(labels),
-        np.array(actions),
-        np.array(rewards),
-        terminations,
-        truncations,
-    )
-    return recording, info
+    return Recording(*map(np.array, (observations, states, labels, actions, rewards)), *np.array(ends).T), info
 
 
 def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progress: Callable[[int], None]) -> Path:
@@ -266,9 +256,8 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progre
     Workers.of(workers)
     jobs.claim(unfinished, described | {"arrays": _ARRAYS})  # earlier versions kept them in files of their own
     try:
-        chunks = [
-            tuple(range(start, min(start + _CHUNK, config.episodes))) for start in range(0, config.episodes, _CHUNK)
-        ]
+        every = range(config.episodes)
+        chunks = [tuple(every[start : start + _CHUNK]) for start in every[::_CHUNK]]
         work = [jobs.Job(f"{chunk[0]:06d}", _record_episodes, (config,), chunk) for chunk in chunks]
         done = jobs.run(work, unfinished, workers, lambda group, count: on_progress(count))
         _assemble(config, [entry for entries in done for entry in entries], unfinished, out)
@@ -417,12 +406,5 @@ def _about(entry: jobs.Entry) -> dict[str, Any]:
 def _buffer(entry: jobs.Entry) -> EpisodeBuffer:
     content = base64.b64decode(entry[_ARRAYS])
     arrays: dict[str, Any] = files.arrays_of(content, "an episode")  # Minari's annotations say lists
-    return EpisodeBuffer(
-        seed=entry["seed"],
-        observations=arrays["observations"],
-        actions=arrays["actions"],
-        rewards=arrays["rewards"],
-        terminations=arrays["terminations"],
-        truncations=arrays["truncations"],
-        infos={"expert_action": arrays["labels"], "state": arrays["states"]},
-    )
+    infos = {"expert_action": arrays.pop("labels"), "state": arrays.pop("states")}
+    return EpisodeBuffer(seed=entry["seed"], infos=infos, **arrays)

@@ -120,9 +120,13 @@ def _run_here(
     command_of: Callable[[int], str], waiting: Sequence[int], out: Path, workers: int, on_seed: Callable[[int], None]
 ) -> list[tuple[int, int]]:
     """Runs seeds on this machine; gives those that failed with their exit status."""
+
+    def one(seed: int) -> int:
+        return _start(command_of(seed), _log_of(out, seed)).wait()
+
     failed = []
     with ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(_run_one, command_of(seed), _log_of(out, seed)): seed for seed in waiting}
+        running = {pool.submit(one, seed): seed for seed in waiting}
         try:
             for done in as_completed(running):
                 if status := done.result():
@@ -202,7 +206,7 @@ def _train_away(
         for path, content in given.items():
             files.write(folder / path, content)
         sent: dict[str, int] = {}
-        process = _start_in(folder, command, folder / log)
+        process = _start(command, folder / log, folder)
         try:
             ended = False
             while not ended:
@@ -235,27 +239,14 @@ def middle_and_worst(trained: Sequence[Trained]) -> tuple[dict[str, float], dict
 _ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
-def _words(command: str) -> list[str]:
-    """A command of `ballbot`, run by this Python."""
-    return [sys.executable, "-m", "ballbot_train.cli", *shlex.split(command)[1:]]
-
-
-def _run_one(command: str, log: Path) -> int:
-    """Runs a command on one core, and gives its exit status."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as file:
-        return subprocess.run(
-            _words(command), stdout=file, stderr=subprocess.STDOUT, env=os.environ | _ONE_CORE
-        ).returncode
-
-
-def _start_in(folder: Path, command: str, log: Path) -> "subprocess.Popen[bytes]":
-    """Starts a command on one core in another folder, with the packages of this process."""
-    log.parent.mkdir(parents=True, exist_ok=True)
+def _start(command: str, log: Path, folder: Path | None = None) -> "subprocess.Popen[bytes]":
+    """Starts a command of `ballbot` on one core, with this Python and the packages of this process, in another folder."""
+    words = [sys.executable, "-m", "ballbot_train.cli", *shlex.split(command)[1:]]
     packages = {"PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path if path)}
     environment = os.environ | _ONE_CORE | packages
+    log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
-        return subprocess.Popen(_words(command), stdout=file, stderr=subprocess.STDOUT, env=environment, cwd=folder)
+        return subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT, env=environment, cwd=folder)
 
 
 def _is_finished(folder: Path, expected: Mapping[str, Any]) -> bool:

@@ -47,14 +47,16 @@ from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
 from ballbot_gym.batch import BallbotBatch, BatchEpisodes, run_episodes
+from ballbot_gym.certified import cache
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate, fresh
 from ballbot_train.learning import VALIDATION_EPISODES
-from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
+from ballbot_train.policy import PolicyController, PolicyNetwork, PolicySpec, load_network, save_policy
 from ballbot_train.provenance import provenance
 from ballbot_train.weights import own_defaults, saved_by_torch
 
@@ -140,7 +142,7 @@ class Score:
 def score(policy: Policy, task: Task, robot: str = PAPER) -> Score:
     """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
     episodes = certified.load(task, robot)
-    (run,) = _runs(policy, task, robot, (episodes.states, episodes.constants))
+    (run,) = _runs(policy, task, robot, Randomization(), (episodes.states, episodes.constants, episodes.drawn))
     return _score(run, task, episodes.costs)
 
 
@@ -184,31 +186,46 @@ _COLUMNS = (
 
 def validate(policy: Policy, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES) -> Validation:
     """Measures a policy on the validation set, which shares no episode with the certified ones nor with `evaluate_fresh`."""
-    (run,) = _runs(policy, task, robot, _validation_set(task, robot, episodes))
+    (run,) = _runs(policy, task, robot, Randomization(), _validation_set(task, robot, episodes, Randomization()))
     return _validation(run, task)
 
 
 def score_and_validate(
-    policy: Policy, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES
+    policy: Policy,
+    task: Task,
+    robot: str = PAPER,
+    episodes: int = VALIDATION_EPISODES,
+    randomization: Randomization = Randomization(),
 ) -> tuple[Score, Validation]:
-    """`score` and `validate` in one batch, in half the time."""
-    known = certified.load(task, robot)
-    sets = (known.states, known.constants), _validation_set(task, robot, episodes)
-    scored, validated = _runs(policy, task, robot, *sets)
+    """`score` and `validate` in one batch, in half the time; with a randomization, against the optima of its episodes."""
+    known = certified.load(task, robot, randomization=randomization)
+    fresh_set = _validation_set(task, robot, episodes, randomization)
+    drawn = known.drawn if known.drawn.shape[1] else _drawn(task, range(len(known)), randomization, -1)
+    scored, validated = _runs(policy, task, robot, randomization, (known.states, known.constants, drawn), fresh_set)
     return _score(scored, task, known.costs), _validation(validated, task)
 
 
-def _validation_set(task: Task, robot: str, episodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Initial states (B, 8) and constants (B, nc) of the validation set."""
-    return fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot)
+def _validation_set(task: Task, robot: str, episodes: int, randomization: Randomization) -> tuple[np.ndarray, ...]:
+    """Initial states (B, 8), constants (B, nc) and what is drawn of the validation set."""
+    drawn = _drawn(task, range(episodes), randomization, _VALIDATION_SEED)
+    return *fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot), drawn
 
 
-def _runs(policy: Policy, task: Task, robot: str, *sets: tuple[np.ndarray, np.ndarray]) -> tuple[BatchEpisodes, ...]:
-    """Runs all episodes of some sets of states (B, 8) and constants (B, nc) in one batch."""
-    states, constants = map(np.concatenate, zip(*sets, strict=True))
-    batch = BallbotBatch(task, len(states), compile=False, robot=robot)
-    run = run_episodes(batch, policy, states, constants)
-    lengths = [len(x) for x, _ in sets]
+def _drawn(task: Task, episodes: range, randomization: Randomization, seed: int) -> np.ndarray:
+    """(B, n) what a randomization draws for episodes, others than those of the certified sets."""
+    return np.array([cache.drawn(task, randomization, index, 1000 + seed) for index in episodes])
+
+
+def _runs(
+    policy: Policy, task: Task, robot: str, randomization: Randomization, *sets: tuple[np.ndarray, ...]
+) -> tuple[BatchEpisodes, ...]:
+    """Runs all episodes of some sets of states (B, 8), constants (B, nc) and draws in one batch."""
+    states, constants, drawn = map(np.concatenate, zip(*sets, strict=True))
+    spec = getattr(policy, "spec", None)
+    history = spec.history if isinstance(spec, PolicySpec) else 0
+    batch = BallbotBatch(task, len(states), compile=False, robot=robot, randomization=randomization, history=history)
+    run = run_episodes(batch, policy, states, constants, drawn=drawn if drawn.shape[1] else None)
+    lengths = [len(x) for x, *_ in sets]
     columns = [part.split(lengths) for part in run if part is not None]  # all but the states
     return tuple(BatchEpisodes(*parts, states=None) for parts in zip(*columns, strict=True))
 
@@ -306,6 +323,7 @@ class _Run:
         self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
         self.best, self.rows = _WORST, []
         self.robot = self.config.get("robot", PAPER)
+        self.randomization = checked_randomization(self.config.get("randomization"))
         self.validation_episodes = self.config.get("validation_episodes", VALIDATION_EPISODES)
         if (out / _CONFIG).exists() and not resume:
             raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
@@ -346,7 +364,9 @@ class _Run:
             The figures by their name in TensorBoard.
         """
         network = self.learner.network
-        scored, validation = score_and_validate(network, self.task, self.robot, self.validation_episodes)
+        scored, validation = score_and_validate(
+            network, self.task, self.robot, self.validation_episodes, self.randomization
+        )
         certified_score = asdict(scored)
         named = {f"validation_{name}": value for name, value in asdict(validation).items()}
         self.rows.append(
@@ -404,7 +424,7 @@ class _Run:
     def measure(self, count: int) -> evaluate.Row:
         """Measures the best policy on the first certified episodes in PyBullet, and adds the result to its JSON file."""
         network = load_network(self.out / "policy", self.task, self.robot)
-        env = BallbotEnv(self.task, robot=self.robot)
+        env = BallbotEnv(self.task, robot=self.robot, randomization=self.randomization)
         controller = PolicyController(self.task, named_robot(self.robot), network)
         results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()

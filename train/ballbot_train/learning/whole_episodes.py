@@ -19,10 +19,11 @@ import torch
 
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import average_of, retargeted, spec_for
+from ballbot_train.learning.actors import average_of, spec_for, started
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.policy import PolicyNetwork
 
@@ -54,19 +55,31 @@ class _Step(NamedTuple):
     """(B,) bool: in the goal."""
     failed: torch.Tensor
     """(B,) bool."""
+    actuator: torch.Tensor
+    past: torch.Tensor
+    """As of `BatchState`."""
 
 
 class WholeEpisodes:
     """The learner; see `training.Learner`."""
 
-    def __init__(self, task: Task, params: BallbotParams, config: "ShacConfig", seed: int = 0):
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        config: "ShacConfig",
+        seed: int = 0,
+        randomization: Randomization | None = None,
+        history: int = 0,
+    ):
         torch.manual_seed(seed)  # for the network's first weights
         self.config, self.iteration = config, 0
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self.task = replace(task, duration=config.episode_seconds)
-        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
+        world: dict[str, Any] = {"randomization": randomization, "history": history}
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params, **world)
         self._batch.reset(seed=spawned(seed))
-        network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
+        network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
         start_as_lqr(network, task, params)
         self._make(network)
 
@@ -82,9 +95,7 @@ class WholeEpisodes:
 
     def start_from(self, network: PolicyNetwork) -> None:
         """Takes a policy of any shape, to be improved; it may have been trained on another robot and its episodes."""
-        started = PolicyNetwork(retargeted(network.spec, self._trained.spec))
-        started.load_state_dict(network.state_dict())
-        self._make(started)
+        self._make(started(network, self._trained.spec))
 
     @property
     def network(self) -> PolicyNetwork:
@@ -136,7 +147,7 @@ class WholeEpisodes:
         start = state.x
         total = torch.zeros(config.num_envs)
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
-        ends, patience = [], _PATIENCE
+        ends, patience, ahead = [], _PATIENCE, int(self._batch.randomization.is_noisy)  # noise changes with the steps
         for _ in range(task.steps):
             step = self._step(state)
             total = total + torch.where(alive, step.cost, 0.0)
@@ -148,7 +159,9 @@ class WholeEpisodes:
                 if not patience:
                     break
             # where an episode has failed, the model goes on from its start, which leads to no infinite numbers
-            state = state._replace(x=torch.where(alive, step.x, start))
+            state = state._replace(
+                x=torch.where(alive, step.x, start), actuator=step.actuator, past=step.past, steps=state.steps + ahead
+            )
         if not task.first_exit:
             return total + _FAILURE_PENALTY * ~alive, alive
         least = torch.stack(ends).amin(0)
@@ -157,7 +170,7 @@ class WholeEpisodes:
     def _one_step(self, state: BatchState) -> _Step:
         """One control step of every episode; compiled."""
         config, task = self.config, self.task
-        _, result = self._batch.transition(state, self._trained(self._batch.observe(state)))
+        new, result = self._batch.transition(state, self._trained(self._batch.observe(state)))
         before, force = state.x.unbind(0), result.force.unbind(0)
         x, c = result.final_x.unbind(0), state.c.unbind(0)
         cost = task.cost(before, force, c) * task.control_dt
@@ -169,4 +182,5 @@ class WholeEpisodes:
                 )
         goal = torch.stack(task.goal(x, c))
         lacking = (goal + _GOAL_CLEARANCE).clamp(min=0).sum(0)
-        return _Step(result.final_x, cost, lacking, (goal <= 0).all(0), result.failure)
+        inside = (goal <= 0).all(0)
+        return _Step(result.final_x, cost, lacking, inside, result.failure, new.actuator, new.past)

@@ -123,10 +123,10 @@ class Runner:
         """Changes what the controller does not know: the true robot, its actuator and its sensors."""
         dt = self._task.control_dt
         self._plant = randomization
-        self._drawn = randomization.draw((0.5,) * Randomization.EPISODE_DRAWS, dt)
+        self._drawn = randomization.draw((0.5,) * randomization.episode_draws, dt)
         self._disturbance = Disturbance(randomization, self._nominal, dt)
         self._disturbance.begin(self._drawn)
-        self.true = randomization.robot(self._nominal, self._drawn[:4])
+        self.true = randomization.robot(self._nominal, self._drawn)
         """The robot that is simulated."""
         self._simulator.set_params(self.true)
         self._simulator.reset(self.x)
@@ -138,7 +138,7 @@ class Runner:
             FloatingPointError: a force that is not finite.
         """
         assert self.controller is not None
-        seen = self._plant.sensed(self.x, noise) if self._plant.is_noisy else self.x
+        seen = self._plant.sensed(self.x, noise, self._drawn, 0.0) if self._plant.is_noisy else self.x
         began = time.perf_counter()
         u = np.asarray(self.controller.act(self.seconds_of_controller(step), np.array(seen)), np.float64)
         self._act_seconds = time.perf_counter() - began

@@ -3,6 +3,7 @@
 import io
 import math
 import tempfile
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -31,6 +32,7 @@ _INCHES = (
     9.0,
     12.8,
 )  # of a film's figure: the narrowest and the widest, between which text has the same size in pixels
+_NOTE = 10  # points, of what is said in a take's corner
 _STRIP_SIZE = (520, 390)  # pixels of a strip's picture
 _FALLEN = 45.0  # deg: at a smaller tilt a failure is the touch of an obstacle, or a lost grip
 _PAUSE = 1.5  # s, for which a film that loops shows its last picture
@@ -200,6 +202,7 @@ class _Film:
         columns = min(count, 4)
         rows = math.ceil(count / columns)
         width, height = (0.99 - 0.005) / columns, 0.62 / rows
+        letter = 0.6 * _NOTE * self._figure.dpi / 72  # its width in pixels: wide ones are wider, spaces narrower
         self._stages: list[_Stage] = []
         for i, take in enumerate(self._replay.takes):
             left, bottom = 0.005 + i % columns * width, 0.95 - (i // columns + 1) * height
@@ -215,8 +218,8 @@ class _Film:
             note = axis.text(
                 0.97,
                 0.03,
-                take.note.replace("; ", "\n"),
-                fontsize=10,
+                "\n".join(textwrap.fill(part, round(box.width / letter)) for part in take.note.split("; ")),
+                fontsize=_NOTE,
                 color="0.2",
                 ha="right",
                 transform=axis.transAxes,

@@ -23,7 +23,7 @@ from ballbot_baselines.lqr import LqrController
 from ballbot_gym import certified, drawing, dynamics, files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
-from ballbot_gym.tasks import TASKS, Task
+from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy_files import BEST, PolicySpec, paths_of, read_description, shipped_policies
@@ -136,7 +136,7 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         "best": {"label": "optimum", "color": labels.OPTIMUM},
         "tasks": {
             name: {"id": task.id, "observations": len(task.observation_scale)}
-            for name, task in ((name, make_task(name)) for name in TASKS)
+            for name, task in ((name, make_task(name)) for name in BEST)
         },
         "scenarios": [_scenario_data(episode, params) for scenario in SCENARIOS for episode in _episodes(scenario)],
     }
@@ -235,7 +235,7 @@ def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
 
 
 def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> str:
-    """The functions `step` and `push`, and `MODELS`: every task's functions by the task's name."""
+    """The functions `step` and `push`, and `MODELS`: the functions of every shipped task by the task's name."""
     dt = make_task("stabilize").control_dt
     substeps = dynamics.substeps_for(dt)
     parts = [
@@ -243,7 +243,7 @@ def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> st
         javascript_function("push", functools.partial(dynamics.pushed, params), {"x": 8, "impulse": 2}),
     ]
     models = []
-    for name in TASKS:
+    for name in BEST:
         source, entry = _task_script(name, make_task(name), frames.get(name))
         parts.append(source)
         models.append(entry)

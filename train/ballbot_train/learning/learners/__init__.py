@@ -20,6 +20,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
 if TYPE_CHECKING:
+    from ballbot_gym.randomization import Randomization
     from ballbot_train.learning.training import Learner
     from ballbot_train.policy import PolicyNetwork
 
@@ -75,6 +76,8 @@ class Algorithm:
         seed: int,
         demos: str | Path | None = None,
         start: "PolicyNetwork | None" = None,
+        randomization: "Randomization | None" = None,
+        history: int = 0,
     ) -> "Learner":
         """Makes the learner.
 
@@ -85,6 +88,8 @@ class Algorithm:
             seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
             start: a policy to train on from, or None; it may be of another robot.
+            randomization: what varies in training, for ppo and shac.
+            history: how many earlier observations and actions the policy sees, for ppo and shac.
 
         Returns:
             The learner before its first iteration.
@@ -97,7 +102,11 @@ class Algorithm:
             raise ValueError(
                 f"{self.name} does not know the time, on which cost and goal of {task.id} depend; train ppo or sac"
             )
-        given = {"demos": demos} | ({"start": start} if self.starts else {})
+        given: dict[str, Any] = {"demos": demos} | ({"start": start} if self.starts else {})
+        if randomization is not None or history:
+            if self.name not in ("ppo", "shac"):
+                raise ValueError(f"{self.name} knows no randomization and no history; train ppo or shac")
+            given |= {"randomization": randomization, "history": history}
         with load("ballbot_train.weights:own_defaults")():
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
 

@@ -165,9 +165,7 @@ TUNED: dict[str, DaggerConfig] = {
 """Exceptions by name of task; every other task takes the defaults."""
 
 _BETA = 0.8  # share of rollouts that start on the plan and not at its beginning; falls to 0.2 of it
-_HARD_SHARE = (
-    0.25  # of the beginnings of optima found at once: those that cost the learner most among many that are drawn
-)
+_HARD_SHARE = 0.25  # of the beginnings of optima found at once: those of many drawn that cost the learner most
 _BATCH_STATES = 32  # of each of these optima that become samples, each with `tube_samples` around it
 _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
@@ -357,12 +355,7 @@ class Dagger:
             sides = self.network.routes(torch.as_tensor(np.asarray(self._task.observe(x, c)), dtype=torch.float32))
         return [self._task.routed_path(x, c, tuple(map(int, sides.tolist())))]
 
-    def _track(
-        self,
-        plans: Sequence[_Plan],
-        gains: Sequence[np.ndarray],
-        rng: np.random.Generator,
-    ) -> None:
+    def _track(self, plans: Sequence[_Plan], gains: Sequence[np.ndarray], rng: np.random.Generator) -> None:
         """Rolls the learner out along plans; TVLQR at the nearest point of the plan labels each state."""
         config = self.config
         tracked = [episode for episode in plans for _ in range(config.tracked_rollouts_per_plan)]

@@ -15,6 +15,7 @@ from torch import nn
 
 from ballbot_gym.batch import BatchState
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import Frame
 from ballbot_gym.vector import BallbotVectorEnv
@@ -95,13 +96,15 @@ class ModelFree(ABC):
         frame: Frame | None = None,
         control_dt: float | None = None,
         backwards: bool = False,
+        randomization: Randomization | None = None,
+        history: int = 0,
     ):
         """Args:
         demos: to imitate.
         warm: whether training starts from them or from a policy.
         frame: in which the envs show observations and take actions; demos must be of it already.
         control_dt: how long each force is held in training, s; default, as in the task.
-        backwards: as of `CurriculumBatch`.
+        backwards, randomization, history: as of `CurriculumBatch`.
 
         Raises:
             ValueError: the task does not have what the settings ask for, or a discount factor is none.
@@ -128,6 +131,8 @@ class ModelFree(ABC):
             config.short_episodes,
             backwards,
             self._pay,
+            randomization,
+            history,
         )
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
@@ -319,6 +324,8 @@ class TrainingEnv(VecEnvWrapper):
         short_episodes: tuple[float, float] = (0.0, 0.6),
         backwards: bool = False,
         pay: bool = True,
+        randomization: Randomization | None = None,
+        history: int = 0,
     ):
         """Makes the envs.
 
@@ -330,14 +337,15 @@ class TrainingEnv(VecEnvWrapper):
             reward_scale: factor of every reward.
             gamma: the learner's discount factor, for shaping.
             frame: in which observations are shown and actions taken; default, the task's own.
-            short_episodes, backwards, pay: as of `CurriculumBatch`.
+            short_episodes, backwards, pay, randomization, history: as of `CurriculumBatch`.
 
         Raises:
             ValueError: the task has not what these ask for.
         """
         shorter = replace(task, duration=episode_seconds)
-        self._vector = BallbotVectorEnv(num_envs, shorter, params=params, compile=False, engine="torch")
-        self.batch = CurriculumBatch(shorter, num_envs, params, gamma, task, short_episodes, backwards, pay)
+        world: dict[str, Any] = {"randomization": randomization, "history": history}
+        self._vector = BallbotVectorEnv(num_envs, shorter, params=params, compile=False, engine="torch", **world)
+        self.batch = CurriculumBatch(shorter, num_envs, params, gamma, task, short_episodes, backwards, pay, **world)
         self._vector.batch = self.batch
         self._scale = np.float32(reward_scale)
         self._frame, self._axes = frame, np.zeros(0)

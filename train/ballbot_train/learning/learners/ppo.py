@@ -18,9 +18,10 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import retargeted, spec_for
+from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
@@ -136,11 +137,7 @@ class RelativeRollouts(RolloutBuffer):
     """A rollout buffer of advantages relative to the cost to go."""
 
     def __init__(
-        self,
-        *args: Any,
-        living: Callable[[float], float],
-        potential: Callable[[], np.ndarray],
-        **kwargs: Any,
+        self, *args: Any, living: Callable[[float], float], potential: Callable[[], np.ndarray], **kwargs: Any
     ):
         """Makes an empty one.
 
@@ -214,7 +211,8 @@ class BranchedPolicy(ActorCriticPolicy):
 
     def _build_mlp_extractor(self) -> None:
         network = PolicyNetwork(self._spec)
-        inputs = CriticInputs(self.features_dim, frame=self._spec.frame, routes=network.routes)
+        own = self._spec.observations
+        inputs = CriticInputs(own, frame=self._spec.frame, routes=network.routes, past=self.features_dim - own)
         self.branches = Branches(MeanAction(network), QuadraticCritic(inputs, self._spec.hidden, torch.nn.Tanh))
         self.mlp_extractor = cast(MlpExtractor, self.branches)
 
@@ -256,6 +254,8 @@ class Ppo(ModelFree):
         seed: int = 0,
         demos: Demos | None = None,
         start: PolicyNetwork | None = None,
+        randomization: Randomization | None = None,
+        history: int = 0,
     ):
         """Takes demonstrations to imitate, or a policy to start from, which then says the shape of the actor.
 
@@ -265,10 +265,12 @@ class Ppo(ModelFree):
         warm = demos is not None or start is not None
         if warm and config.backwards:
             raise ValueError("backwards goes from scratch alone; give --no-backwards with --demos or --start")
-        spec = spec_for(task, config.symmetry, config.hidden)
+        spec = spec_for(task, config.symmetry, config.hidden, history=history)
         if start is not None:
-            spec = retargeted(start.spec, spec)
-        super().__init__(task, params, config, demos, warm, backwards=config.backwards)
+            start = started(start, spec)
+            spec = start.spec
+        world: dict[str, Any] = {"randomization": randomization, "history": history}
+        super().__init__(task, params, config, demos, warm, backwards=config.backwards, **world)
         self.config = config
         model = PPO(
             BranchedPolicy,
@@ -335,10 +337,14 @@ def make(
     seed: int,
     demos: str | Path | None = None,
     start: PolicyNetwork | None = None,
+    randomization: Randomization | None = None,
+    history: int = 0,
 ) -> Ppo:
     """Makes the learner.
 
     Raises:
         ValueError: the demonstrations are of another task, or the task does not have what the settings ask for.
     """
-    return Ppo(task, params, config, seed, None if demos is None else load_demos(demos, task), start)
+    return Ppo(
+        task, params, config, seed, None if demos is None else load_demos(demos, task), start, randomization, history
+    )

@@ -122,9 +122,7 @@ WARM: dict[str, SacConfig] = {
 }
 """The same with demonstrations, or from a policy; "" is any other task. Demonstrations are single steps of the task."""
 
-_CONTROL_DT = (
-    0.05  # s, how long each force is held from scratch: an action changes more, and critics tell actions apart
-)
+_CONTROL_DT = 0.05  # s, how long each force is held from scratch: an action changes more, so critics tell actions apart
 TAU = 0.005  # share by which the target critics move to the critics at each gradient step
 ENT_COEF = 0.01  # entropy coefficient at the start, in scaled rewards per nat
 _IMITATION_WEIGHT = 300.0
@@ -200,12 +198,7 @@ class Critics(ContinuousCritic):
     ):
         """Args: network: makes one critic's network; the others are SB3's."""
         super().__init__(
-            observation_space,
-            action_space,
-            net_arch,
-            features_dim=features_dim,
-            activation_fn=activation_fn,
-            **kwargs,
+            observation_space, action_space, net_arch, features_dim=features_dim, activation_fn=activation_fn, **kwargs
         )
         inputs = features_dim + get_action_dim(action_space)
         self.q_networks = [network(inputs, net_arch, activation_fn) for _ in range(self.n_critics)]

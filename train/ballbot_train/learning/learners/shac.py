@@ -21,10 +21,11 @@ from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry, check_start, spec_for
+from ballbot_train.learning.actors import RoutedSymmetry, check_start, spec_for, started
 from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
@@ -129,9 +130,11 @@ class Critic(torch.nn.Module):
         hidden: tuple[int, ...],
         frame: str | None = None,
         routes: Routes | None = None,
+        past: int = 0,
     ):
         super().__init__()
-        self._inputs = CriticInputs(len(task.observation_scale), products=False, frame=frame, routes=routes)
+        own = len(task.observation_scale)
+        self._inputs = CriticInputs(own, products=False, frame=frame, routes=routes, past=past)
         layers: list[torch.nn.Module] = []
         size = self._inputs.size
         for width in hidden:
@@ -156,26 +159,36 @@ class Critic(torch.nn.Module):
 class Shac:
     """The learner; see `training.Learner`."""
 
-    def __init__(self, task: Task, params: BallbotParams, config: ShacConfig, seed: int = 0):
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        config: ShacConfig,
+        seed: int = 0,
+        randomization: Randomization | None = None,
+        history: int = 0,
+    ):
         torch.manual_seed(seed)  # for the networks' first weights
+        world: dict[str, Any] = {"params": params, "randomization": randomization, "history": history}
         self._random = torch.Generator().manual_seed(seed)
         self.config, self.iteration, self._finetuning, self._seed = config, 0, False, seed
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._own = task
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
-        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, linear=True))
+        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
         start_as_lqr(self._network, task, params)
-        frame = self._network.spec.frame
-        self.critic = Critic(task, params, config.hidden, frame, self._network.routes)
-        self.target = Critic(task, params, config.hidden, frame, self._network.routes)
+        past = history * (len(task.observation_scale) + 2)
+        seen = self._network.spec.frame, self._network.routes, past
+        self.critic = Critic(task, params, config.hidden, *seen)
+        self.target = Critic(task, params, config.hidden, *seen)
         self.target.load_state_dict(self.critic.state_dict())
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         rate = config.critic_learning_rate
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), rate, betas=(0.7, 0.95))
-        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params)
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, **world)
         self._start = self._batch.reset(seed=spawned(seed))  # (B, no) first observations of the running episodes
         hard = round(config.hard_fraction * config.reset_fraction * config.num_envs)  # new episodes of an iteration
-        self._drawn = BallbotBatch(self.task, _HARD_AMONG * hard, compile=False, params=params) if hard else None
+        self._drawn = BallbotBatch(self.task, _HARD_AMONG * hard, compile=False, **world) if hard else None
         if self._drawn is not None:
             self._drawn.reset(seed=spawned(seed) + config.num_envs)
         self._step = self._one_step
@@ -193,7 +206,7 @@ class Shac:
             ValueError: its network differs in shape from this one.
         """
         check_start(network.spec, self._network.spec)
-        self._network.load_state_dict(network.state_dict())
+        self._network.load_state_dict(started(network, self._network.spec).state_dict())
         self._finetuning = True
 
     def iterate(self) -> dict[str, float]:
@@ -286,12 +299,7 @@ class Shac:
         return schedules.cosine(rate, _FINAL_LEARNING_RATE_FRACTION, progress)
 
     def _one_step(
-        self,
-        state: BatchState,
-        start: torch.Tensor,
-        alive: torch.Tensor,
-        discount: torch.Tensor,
-        loss: torch.Tensor,
+        self, state: BatchState, start: torch.Tensor, alive: torch.Tensor, discount: torch.Tensor, loss: torch.Tensor
     ) -> tuple[Any, ...]:
         """One control step of every env; compiled."""
         config, task = self.config, self.task
@@ -364,12 +372,15 @@ def make(
     seed: int,
     demos: None = None,
     start: PolicyNetwork | None = None,
+    randomization: Randomization | None = None,
+    history: int = 0,
 ) -> Shac | WholeEpisodes:
     """Makes the learner, without demonstrations; raises a ValueError where the task, a setting or a policy does not fit."""
     for name in ("margin_clearance", "one_way"):
         if getattr(config, name) and not config.margin_penalty:
             raise ValueError(f"{name} needs margin_penalty above 0")
-    learner = Shac(task, params, config, seed) if config.horizon else WholeEpisodes(task, params, config, seed)
+    kind = Shac if config.horizon else WholeEpisodes
+    learner = kind(task, params, config, seed, randomization, history)
     if start is not None:
         learner.start_from(start)
     return learner

@@ -1,0 +1,126 @@
+"""Controllers on robots that nobody told them: their regret on the tracks of `ballbot_gym.randomization`, in three parts.
+
+Every episode has an optimum of its own: that of its robot, whose first forces are none while its delay lasts. Who reaches it
+would have to know what was drawn. In units of that optimum J, regret splits into what adds up:
+
+- what not knowing costs: how far the best controller of the table is from J in the same episode,
+- what the controller loses: how much dearer it is than that one.
+
+What delay costs is told beside them, because no controller could avoid it: J less the optimum without delay.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballbot_gym import files
+from ballbot_gym.env import make_task
+from ballbot_gym.randomization import TRACKS, checked_randomization
+from ballbot_gym.robots import PAPER
+from ballbot_train.evaluation import optima
+from ballbot_train.evaluation.results import Row, summarize, to_json, write_csv
+from ballbot_train.evaluation.robustness import Condition, StressResult
+from ballbot_train.executors import Workers
+
+HEADER = (
+    *("track", "task", "controller", "success, %", "failures", "mean regret, %", "95 % interval"),
+    *("delay costs, %", "not knowing costs, %", "controller loses, %"),
+)
+
+
+@dataclass(frozen=True)
+class TrackRow(Row):
+    """A leaderboard row on a track. Shares are of the mean, in units of the episode's optimum; NaN without an episode."""
+
+    track: str = ""
+    delay_costs: float = math.nan
+    """What delay adds to the optimum."""
+    not_knowing_costs: float = math.nan
+    """The best controller's regret in the episodes in which neither fails."""
+    controller_loses: float = math.nan
+    """The regret beyond that in the same episodes."""
+    best: str = ""
+    """The best controller: of those that succeed most often, the one of least mean regret."""
+
+
+def conditions(tracks: Sequence[str]) -> list[Condition]:
+    """The tracks of these names.
+
+    Raises:
+        ValueError: no track of such a name.
+    """
+    return [Condition(name, 0.0, checked_randomization(name), own_optima=True) for name in tracks]
+
+
+def find_optima(tasks: Sequence[str], tracks: Sequence[str], episodes: int, robot: str, workers: int | Workers) -> None:
+    """Computes those optima of the episodes of some tracks that neither the package nor the user's cache has."""
+    for task in tasks:
+        for track in tracks:
+            optima.known(task, robot, range(episodes), workers, TRACKS[track])
+
+
+def rows_of(results: Sequence[StressResult], robot: str = PAPER, seed: int = 0) -> list[TrackRow]:
+    """One row per track, task and controller; seed is of the bootstrap."""
+    groups: dict[tuple[str, str], dict[str, list[StressResult]]] = {}
+    for result in results:
+        groups.setdefault((result.stress, result.task), {}).setdefault(result.controller, []).append(result)
+    rows = []
+    for (track, task), group in groups.items():
+        plain = {name: summarize(done, seed) for name, done in group.items()}
+        best = min(plain, key=lambda name: (-plain[name].success, _last_if_nan(plain[name].regret_mean)))
+        episodes = [result.episode for result in group[best]]
+        known = optima.known(make_task(task, robot), robot, episodes, randomization=TRACKS[track])
+        delay = float(np.mean(1 - known.ideal[episodes] / known.costs[episodes]))
+        of_best = {result.episode: result.regret for result in group[best]}
+        for name, done in group.items():
+            pairs = np.array([(of_best[result.episode], result.regret) for result in done])
+            pairs = pairs[np.isfinite(pairs).all(axis=1)]
+            known_parts = (float(pairs[:, 0].mean()), float((pairs[:, 1] - pairs[:, 0]).mean())) if len(pairs) else ()
+            unknown, loses = known_parts or (math.nan, math.nan)
+            rows.append(TrackRow(**asdict(plain[name]), **_parts(track, delay, unknown, loses, best)))
+    return rows
+
+
+def _parts(track: str, delay: float, unknown: float, loses: float, best: str) -> dict[str, Any]:
+    return {
+        "track": track,
+        "delay_costs": delay,
+        "not_knowing_costs": unknown,
+        "controller_loses": loses,
+        "best": best,
+    }
+
+
+def _last_if_nan(value: float) -> float:
+    return value if math.isfinite(value) else math.inf
+
+
+def cells(row: TrackRow) -> list[str]:
+    """A line of the table."""
+
+    def percent(*values: float) -> str:
+        return " to ".join(f"{100 * value:.2f}" if math.isfinite(value) else "–" for value in values)
+
+    return [
+        row.track,
+        row.task,
+        row.controller,
+        f"{100 * row.success:.4g}",
+        f"{row.falls} of {row.episodes}",
+        percent(row.regret_mean),
+        percent(row.regret_low, row.regret_high),
+        percent(row.delay_costs),
+        percent(row.not_knowing_costs),
+        percent(row.controller_loses),
+    ]
+
+
+def write(rows: Sequence[TrackRow], results: Sequence[StressResult], facts: Mapping[str, Any], out: Path) -> None:
+    """Writes tracks.csv, episodes.csv and tracks.json, which holds the facts as "about", and rows."""
+    write_csv(out / "tracks.csv", rows)
+    write_csv(out / "episodes.csv", results)
+    files.write(out / "tracks.json", to_json({"about": facts, "rows": rows}))
