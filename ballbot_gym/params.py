@@ -241,7 +241,7 @@ class ModelNumbers(NamedTuple):
             rolls=params.rolls,
             ball_radius=params.ball_radius,
             friction=params.friction,
-            grips=params.grips,
+            grips=BallbotParams.grips.func(params),
         )
 
 

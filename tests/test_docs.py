@@ -126,12 +126,12 @@ def test_every_page_that_is_linked_exists():
 
 
 def test_the_documentation_says_of_every_shipped_policy_what_its_file_says():
-    text = (ROOT / "docs" / "policies.md").read_text()
+    text = "".join((ROOT / "docs" / page).read_text() for page in ("policies.md", "tracks.md"))
     for path in sorted(SHIPPED.glob("*.json")):
         about = json.loads(path.read_text())
         measured, training = about["measured"], about["training"]
         seconds = about["training_seconds"]
-        kind = f"{training['task']}, {training['robot']}" if "robot" in training else training["task"]
+        kind = ", ".join(training[name] for name in ("task", "robot", "randomization") if name in training)
         row = (
             f"| {kind} | {training['learner']} | {seconds / 60:.0f} min | {measured['success']:.1%} | "
             f"{measured['falls']} | {measured['regret_mean']:.2%} | {measured['regret_median']:.2%} |"

@@ -23,7 +23,9 @@ def test_severity_0_is_no_disturbance_and_every_level_is_one(name):
 
 
 def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
-    results = robustness.run({"stabilize": ["lqr"]}, ["delay"], 3, "rk4", tmp_path, 1, lambda name, count: None)
+    results = robustness.run(
+        {"stabilize": ["lqr"]}, robustness.conditions(["delay"]), 3, "rk4", tmp_path, 1, lambda name, count: None
+    )
     plain = benchmark.benchmark({"stabilize": ["lqr"]}, 3, "rk4", tmp_path / "plain", 1, lambda name, count: None)
     rows = robustness.rows_of(results)
     assert [(row.stress, row.level) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
@@ -35,7 +37,14 @@ def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
 def test_the_same_seed_draws_the_same_pushes(tmp_path):
     def costs(name, seed):
         results = robustness.run(
-            {"stabilize": ["lqr"]}, ["push"], 1, "rk4", tmp_path / name, 1, lambda name, count: None, seed
+            {"stabilize": ["lqr"]},
+            robustness.conditions(["push"]),
+            1,
+            "rk4",
+            tmp_path / name,
+            1,
+            lambda name, count: None,
+            seed,
         )
         return [result.cost for result in results]
 

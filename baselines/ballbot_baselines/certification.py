@@ -68,12 +68,22 @@ def _solved(
 ) -> Entry:
     x0, c = episode(task, params, index, draw)
     drawn = cache.drawn(task, randomization, index, draw)
-    if randomization.moves_optima:
-        params = randomization.robot(params, drawn)
-    delay = round(drawn[5]) if randomization.moves_optima else 0
+    delay = randomization.moves_optima and drawn[5] > 0
     try:
-        optimum = delayed_optimum(task, params, x0, c, delay, guesses)
-        ideal = find_optimum(task, params, x0, c, guesses=guesses) if delay else optimum
+        optimum = optimum_of(task, params, x0, c, randomization, drawn, guesses)
+        ideal = (
+            optimum_of(
+                task,
+                params,
+                x0,
+                c,
+                replace(randomization, actuator_delay=(0.0, 0.0)),
+                (*drawn[:5], 0.0, *drawn[6:]),
+                guesses,
+            )
+            if delay
+            else optimum
+        )
     except PlanError as error:
         return {"episode": index, "error": str(error)}
     for found in (optimum, ideal):
@@ -102,21 +112,32 @@ def _solved(
     )
 
 
-def delayed_optimum(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, delay: int, guesses: int = ALL_GUESSES
+def optimum_of(
+    task: Task,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    randomization: Randomization,
+    drawn: tuple[float, ...],
+    guesses: int = 5,
 ) -> Optimum:
-    """The cheapest episode in which no force comes in the first control steps.
+    """The optimum of an episode for which a randomization drew this: of its own robot, and no force comes while it is late.
 
     Args:
-        task: and params: the problem.
+        task: the problem.
+        params: the nominal robot.
         x0: (8,) initial state.
         c: (nc,) constants.
-        delay: how many control steps.
+        randomization: without an actuator that lags; noise and pushes move no optimum.
+        drawn: what its `draw` drew.
         guesses: as of `find_optimum`.
 
     Raises:
         PlanError: the robot violates a limit before it can be moved, or no try came to a feasible episode.
     """
+    if randomization.moves_optima:
+        params = randomization.robot(params, drawn)
+    delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
         return find_optimum(task, params, x0, c, guesses=guesses)
     dt, none, states, cost = task.control_dt, np.zeros(2), [np.asarray(x0, np.float64)], 0.0

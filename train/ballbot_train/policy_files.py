@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
 from ballbot_gym.env import check_history
+from ballbot_gym.randomization import TRACKS
 from ballbot_gym.robots import PAPER, ROBOTS, file_name
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
@@ -161,14 +162,27 @@ def read_description(path: str | Path) -> dict[str, Any]:
     return read
 
 
-def shipped_policies(task: Task, robot: str = PAPER) -> dict[str, Path]:
-    """The policies of a task and robot that come with the package: the paths of their .json by the learner's name."""
+def shipped_policies(task: Task, robot: str = PAPER, track: str | None = "") -> dict[str, Path]:
+    """The policies of a task and robot that come with the package: the paths of their .json by the learner's name.
+
+    Those that were trained on a track, as "shac-late", are among them where that track is given, and all where it is None.
+    """
     name = next((name for name, kind in TASKS.items() if type(task) is kind), None)
     if name is None:
         return {}
     start = f"{file_name(name, robot)}-"
     found = {path.stem.removeprefix(start): path for path in sorted(SHIPPED.glob(f"{start}*.json"))}
-    return {learner: path for learner, path in found.items() if learner.partition("-")[0] not in ROBOTS}
+    return {
+        learner: path
+        for learner, path in found.items()
+        if learner.partition("-")[0] not in ROBOTS and (track is None or track_in(learner) in ("", track))
+    }
+
+
+def track_in(name: str) -> str:
+    """The track that a policy's name says it was trained on, or ""."""
+    last = name.rpartition("-")[2]
+    return last if last in TRACKS else ""
 
 
 def weights_digest(path: str | Path) -> str:

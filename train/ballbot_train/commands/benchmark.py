@@ -105,7 +105,7 @@ def _benchmark_tracks(
     robot: str,
     names: Sequence[str],
 ) -> None:
-    wanted, chosen = tracks.conditions(names), controllers_of(tasks, controllers, robot)
+    wanted, chosen = tracks.conditions(names), controllers_of(tasks, controllers, robot, tracks=True)
     physics, episodes = physics_or_default(physics), checked_episodes(episodes, quick, few=8)
     facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes, tracks=list(names))
     tracks.find_optima(list(chosen), names, episodes, robot, workers)

@@ -3,11 +3,13 @@
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.randomization import Randomization, checked_randomization, track_of
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
@@ -47,6 +49,7 @@ def evaluate(
     out: Path | None = None,
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
+    randomization: str | None = None,
 ) -> None:
     """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
 
@@ -67,7 +70,12 @@ def evaluate(
             interrupted run continues here.
         workers: who does the work, for optima and certified episodes.
         robot: whose episodes.
+        randomization: name of the track on which the fresh episodes are, of robots and delays that the policy is not told;
+            certified episodes of tracks are run by `ballbot benchmark --randomization`.
     """
+    varied = checked_randomization(randomization)
+    if episodes and randomization:
+        raise ValueError("--episodes knows no tracks; give ballbot benchmark --randomization")
     task = task_name(policy, task, robot)
     chosen = controllers_of([task], [policy], robot)
     check_least(0, seed=seed, optima=optima, episodes=episodes)
@@ -88,9 +96,10 @@ def evaluate(
             f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a policy, "
             "or run the expert on certified episodes with --episodes"
         )
-    out = Path("runs") / "evaluate" / file_name(f"{task}-{Path(policy).stem}", robot) if out is None else out
+    named = f"{task}-{Path(policy).stem}" + (f"-on-{randomization}" if randomization else "")
+    out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
     if fresh:
-        _fresh(policy, task, fresh, seed, bins, optima, out, workers, robot)
+        _fresh(policy, task, fresh, seed, bins, optima, out, workers, robot, varied)
     if episodes:
         _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers, robot)
 
@@ -105,6 +114,7 @@ def _fresh(
     out: Path,
     workers: Workers,
     robot: str,
+    varied: Randomization,
 ) -> None:
     from ballbot_train.evaluation import fresh  # it imports torch
     from ballbot_train.report import figures
@@ -121,31 +131,35 @@ def _fresh(
         "physics": "closed form, batched, float64",
     }
     with progress_bars({"episodes": episodes}) as bars:
-        result = fresh.evaluate_fresh(
-            policy, task, episodes, seed, on_progress=lambda number: bars.advance("episodes", number), robot=robot
-        )
+        progress = partial(bars.advance, "episodes")
+        result = fresh.evaluate_fresh(policy, task, episodes, seed, None, progress, robot, varied)
     if optima:
         with progress_bars({task: optima}) as bars:
-            folder = out.parent / "optima" / f"{file_name(task, robot)}-{seed}"
-            found = fresh.find_optima(task, optima, seed, folder, workers, bars.advance, robot)
+            track = f"-{track_of(varied)}" if varied.moves_optima else ""
+            folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
+            found = fresh.find_optima(task, optima, seed, folder, workers, bars.advance, robot, varied)
         result = replace(result, optima=found)
     binned = result.bins(count)
-    worst = _worst(result, policy, task, out / "worst", robot)
+    worst = _worst(result, policy, task, out / "worst", robot, varied)
     fresh.write(result, binned, worst, facts, out)
     picture = figures.save(figures.fresh_figure(result, binned), out / "fresh.png")
     _print(result, binned, worst)
     console.print(f"figure: {picture}\nall episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
 
 
-def _worst(result: Any, policy: str, task: str, folder: Path, robot: str) -> list[dict[str, Any]]:
+def _worst(
+    result: Any, policy: str, task: str, folder: Path, robot: str, varied: Randomization
+) -> list[dict[str, Any]]:
     """The worst episodes, each with its trajectory in a file that `ballbot replay` draws."""
-    env = BallbotEnv(task, physics="rk4", robot=robot)
+    env = BallbotEnv(task, physics="rk4", robot=robot, randomization=varied)
     controller = make_controller(policy, env.task, env.params)
     for stale in folder.glob("episode-*.npz"):  # of an earlier evaluation
         stale.unlink()
     worst = []
     for i in result.worst(_WORST):
-        run = rollout(env, controller, options={"state": result.states[i], "constants": result.constants[i]})
+        drawn = {"drawn": result.drawn[i]} if varied.varies_episodes else {}
+        options = {"state": result.states[i], "constants": result.constants[i], **drawn}
+        run = rollout(env, controller, seed=0, options=options)
         path = run.trajectory.save(folder / f"episode-{i}.npz")
         constants = dict(zip(env.task.constant_names, result.constants[i].tolist(), strict=True))
         start = {"start": result.states[i].tolist(), "constants": constants}

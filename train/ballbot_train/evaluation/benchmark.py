@@ -29,8 +29,12 @@ CHUNK = 5
 """Episodes of a job."""
 
 
-def controllers_of(tasks: Sequence[str], names: Sequence[str] = (), robot: str = PAPER) -> dict[str, list[str]]:
+def controllers_of(
+    tasks: Sequence[str], names: Sequence[str] = (), robot: str = PAPER, tracks: bool = False
+) -> dict[str, list[str]]:
     """The controllers to run on each task: those named that the task has; without names, all it has but for variants.
+
+    Policies that were trained on tracks are among the latter if tracks are run.
 
     A policy is made for one task, and is left out for the others; tasks left without a controller are left out too.
 
@@ -39,7 +43,7 @@ def controllers_of(tasks: Sequence[str], names: Sequence[str] = (), robot: str =
         PolicyError: a policy file that is missing or damaged.
     """
     check_some("task", tasks, TASKS)
-    known = {task: registry.names(make_task(task, robot), robot) for task in tasks}
+    known = {task: registry.names(make_task(task, robot), robot, None if tracks or names else "") for task in tasks}
     if not names:
         return known
     known = {task: [*group, *VARIANTS] for task, group in known.items()}

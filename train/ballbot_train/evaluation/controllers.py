@@ -18,9 +18,9 @@ _SAVED_MODELS = (".zip", ".pt", ".pth")
 _BESIDE = (".json", ".safetensors", ".vecnormalize.npz")  # endings of files that belong to a policy or a saved model
 
 
-def names(task: Task, robot: str = PAPER) -> list[str]:
-    """The controllers that a task has for a robot, experts first."""
-    return [*CONTROLLERS, *shipped_policies(task, robot)]
+def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
+    """The controllers that a task has for a robot, experts first; tracks as of `shipped_policies`."""
+    return [*CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
 def is_expert(name: str) -> bool:
@@ -81,7 +81,7 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
     if is_expert(name):
         return ""
     robot = robot if isinstance(robot, str) else robot_name(robot)
-    return digest_of(str(shipped_policies(task, robot).get(name, name)))
+    return digest_of(str(shipped_policies(task, robot, None).get(name, name)))
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:
@@ -110,7 +110,7 @@ def policy_path(name: str, task: Task, robot: str = PAPER) -> Path:
     Raises:
         ValueError: it is an expert, or nothing of that name.
     """
-    shipped = shipped_policies(task, robot)
+    shipped = shipped_policies(task, robot, None)
     if name in shipped:
         return shipped[name]
     if name in CONTROLLERS:
@@ -163,7 +163,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
     if is_expert(name):
         return (CONTROLLERS | VARIANTS)[name](task, params)
     robot = robot_name(params)
-    shipped = shipped_policies(task, robot)
+    shipped = shipped_policies(task, robot, None)
     if name not in shipped and not is_file(name):
         raise ValueError(
             f"unknown controller {name!r}; {task.id} has {', '.join(names(task, robot))}, or give a policy's .json"

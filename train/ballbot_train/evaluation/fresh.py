@@ -22,6 +22,7 @@ from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import limit_names, make_task
 from ballbot_gym.lazy import missing
+from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
@@ -31,7 +32,7 @@ from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
-from ballbot_train.policy import load_network, shipped_policies
+from ballbot_train.policy import load_network, read_description, shipped_policies
 from ballbot_train.saved_models import load_actor
 from ballbot_train.weights import own_precision
 
@@ -124,6 +125,8 @@ class FreshResult:
     """What `Task.measures` says of each episode."""
     optima: np.ndarray
     """(k,) optimal costs of the first k ≤ n episodes; NaN where none was found."""
+    drawn: np.ndarray
+    """(n, 6 or 14) what a randomization drew for the episodes, or (n, 0)."""
 
     def __len__(self) -> int:
         return len(self.costs)
@@ -256,6 +259,32 @@ def draw(
     return np.array([x for x, _ in drawn]), np.array([c for _, c in drawn])
 
 
+def draw_robots(
+    task: Task,
+    episodes: Iterable[int],
+    seed: int,
+    randomization: Randomization,
+    purpose: Literal["evaluation", "validation", "training"] = "evaluation",
+) -> np.ndarray:
+    """(n, 6 or 14) what a randomization draws for the episodes that `draw` draws; (n, 0) where it draws nothing."""
+    if not randomization.varies_episodes:
+        return np.zeros((len(list(episodes)), 0))
+    entropy = zlib.crc32(task.id.encode())
+    drawn = []
+    for i in episodes:
+        rng = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, i, 1)))
+        drawn.append(randomization.draw(tuple(rng.random(len(Randomization.DRAWN)).tolist()), task.control_dt))
+    return np.array(drawn)
+
+
+def history_of(policy: Any, task: Task, robot: str = PAPER) -> int:
+    """How many earlier observations a policy wants to see, that is given as to `as_batch_policy`."""
+    if isinstance(policy, str | Path) and not is_saved_model(str(policy)):
+        path = shipped_policies(task, robot, None).get(str(policy), policy)
+        return int(read_description(path)["spec"].get("history", 0))
+    return getattr(getattr(policy, "spec", None), "history", 0)
+
+
 def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[torch.Tensor], torch.Tensor]:
     """A policy as a function from observations (B, no) to actions (B, 2), for one episode of each of B environments.
 
@@ -271,7 +300,7 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         TypeError: it is none of these.
     """
     if isinstance(policy, str | Path):
-        name, shipped = str(policy), shipped_policies(task, robot)
+        name, shipped = str(policy), shipped_policies(task, robot, None)
         if is_expert(name):
             raise ValueError(
                 f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
@@ -310,6 +339,7 @@ def evaluate_fresh(
     name: str | None = None,
     on_progress: Callable[[int], None] = lambda count: None,
     robot: str = PAPER,
+    randomization: Randomization | str | None = None,
 ) -> FreshResult:
     """Runs a policy on fresh episodes.
 
@@ -321,20 +351,25 @@ def evaluate_fresh(
         name: of the policy in the result; default, its own.
         on_progress: called with a number of finished episodes.
         robot: by name.
+        randomization: what the policy is not told, or a name in `TRACKS`; default, nothing.
 
     Raises:
         TypeError, ValueError, PolicyError: no such policy or task, or a number out of its range.
     """
-    task, params = make_task(task, robot), named_robot(robot)
+    task, params, varied = make_task(task, robot), named_robot(robot), checked_randomization(randomization)
     check_fresh(episodes, seed)
+    act, drawn = as_batch_policy(policy, task, robot), draw_robots(task, range(episodes), seed, varied)
+    world: dict[str, Any] = {"randomization": varied, "history": history_of(policy, task, robot)}
     states, constants = draw(task, range(episodes), seed, robot=robot)
     runs = []
     for start in range(0, episodes, _BATCH):
         x, c = states[start : start + _BATCH], constants[start : start + _BATCH]
-        batch = BallbotBatch(task, len(x), compile=False, dtype=torch.float64, robot=robot)
-        runs.append(run_episodes(batch, as_batch_policy(policy, task, robot), x, c))
+        batch = BallbotBatch(task, len(x), compile=False, dtype=torch.float64, robot=robot, **world)
+        some = drawn[start : start + _BATCH] if drawn.shape[1] else None
+        runs.append(run_episodes(batch, act, x, c, drawn=some))
         on_progress(len(x))
     described = [task.measures(x, c, params) for x, c in zip(states, constants, strict=True)]
+    vary = {name: row for name, row in zip(Randomization.DRAWN, drawn.T, strict=False) if np.ptp(row) > 0}
     names = limit_names(task, params)
     numbers = torch.cat([run.violated for run in runs]).tolist()
     return FreshResult(
@@ -348,8 +383,9 @@ def evaluate_fresh(
         failure=torch.cat([run.failure for run in runs]).numpy(),
         violated=tuple(names[number] if number >= 0 else "" for number in numbers),
         durations=torch.cat([run.steps for run in runs]).numpy() * task.control_dt,
-        measures={key: np.array([entry[key] for entry in described]) for key in described[0]},
+        measures={key: np.array([entry[key] for entry in described]) for key in described[0]} | vary,
         optima=np.zeros(0),
+        drawn=drawn,
     )
 
 
@@ -369,6 +405,7 @@ def find_optima(
     workers: int | Workers,
     on_progress: Callable[[str, int], None],
     robot: str = PAPER,
+    randomization: Randomization = Randomization(),
 ) -> np.ndarray:
     """(n,) optimal costs of the first fresh episodes of a seed, NaN where none was found.
 
@@ -380,11 +417,13 @@ def find_optima(
         workers: a number of processes, or `Workers`.
         on_progress: called with the task's name and a number of optima that are there.
         robot: by name.
+        randomization: what the robot and the delay of each episode are drawn from.
     """
-    jobs.claim(out, {"task": make_task(task, robot).problem(), "seed": seed, **robot_setting(robot)})
+    varied = {"randomization": repr(randomization)} if randomization.moves_optima else {}
+    jobs.claim(out, {"task": make_task(task, robot).problem(), "seed": seed, **robot_setting(robot), **varied})
     try:
         work = [
-            jobs.Job(f"optima-{start:06d}", _optima, (task, seed, robot), items, task)
+            jobs.Job(f"optima-{start:06d}", _optima, (task, seed, robot, randomization), items, task)
             for start in range(0, episodes, _CHUNK)
             for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
         ]
@@ -394,13 +433,16 @@ def find_optima(
     return np.array([entry.get("cost", math.nan) for entries in done for entry in entries])
 
 
-def _optima(task_name: str, seed: int, robot: str, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
-    from ballbot_baselines.optimum import find_optimum  # it imports CasADi
+def _optima(
+    task_name: str, seed: int, robot: str, randomization: Randomization, episodes: Sequence[int]
+) -> Iterator[jobs.Entry]:
+    from ballbot_baselines.certification import optimum_of  # it imports CasADi
 
     task = make_task(task_name, robot)
-    for i, x, c in zip(episodes, *draw(task, episodes, seed, robot=robot), strict=True):
+    robots = draw_robots(task, episodes, seed, randomization)
+    for i, x, c, drawn in zip(episodes, *draw(task, episodes, seed, robot=robot), robots, strict=True):
         try:
-            optimum = find_optimum(task, named_robot(robot), x, c)
+            optimum = optimum_of(task, named_robot(robot), x, c, randomization, tuple(drawn.tolist()))
         except PlanError as error:
             yield {"episode": i, "error": str(error)}
             continue

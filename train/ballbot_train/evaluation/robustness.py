@@ -17,6 +17,7 @@ from ballbot_train import jobs
 from ballbot_train.evaluation.benchmark import CHUNK, episode_job
 from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
 from ballbot_train.executors import Workers
+from ballbot_train.policy_files import track_in
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,12 @@ class Condition:
     own_optima: bool = False
     """Whether regret is over the optimum of each episode's own robot, and not over the undisturbed one."""
 
+    def chosen(self, controllers: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+        """Those controllers by task that meet it: all but the policies that were trained on other tracks."""
+        return {
+            task: [name for name in group if track_in(name) in ("", self.name)] for task, group in controllers.items()
+        }
+
 
 def conditions(stresses: Sequence[str]) -> list[Condition]:
     """Every level of some stresses in `STRESSES`, and the undisturbed once."""
@@ -117,8 +124,11 @@ def episodes_to_run(
     controllers: Mapping[str, Sequence[str]], wanted: Sequence[Condition], episodes: int
 ) -> dict[str, int]:
     """How many episodes `run` runs under every stress or track."""
-    names, each = [condition.name for condition in wanted], sum(map(len, controllers.values())) * episodes
-    return {name: each * names.count(name) for name in dict.fromkeys(names)}
+    counts: dict[str, int] = {}
+    for condition in wanted:
+        each = sum(map(len, condition.chosen(controllers).values())) * episodes
+        counts[condition.name] = counts.get(condition.name, 0) + each
+    return counts
 
 
 def run(
@@ -163,7 +173,7 @@ def run(
         )
         for condition in wanted
         for chunk in (CHUNK if condition.own_optima else episodes,)
-        for task, group in controllers.items()
+        for task, group in condition.chosen(controllers).items()
         for name in group
         for start in range(0, episodes, chunk)
     ]

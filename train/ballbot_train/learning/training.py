@@ -47,7 +47,6 @@ from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
 from ballbot_gym.batch import BallbotBatch, BatchEpisodes, run_episodes
-from ballbot_gym.certified import cache
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot
@@ -61,7 +60,7 @@ from ballbot_train.provenance import provenance
 from ballbot_train.weights import own_defaults, saved_by_torch
 
 _CONFIG = "config.json"
-_VALIDATION_SEED = 0
+_VALIDATION_SEED, _CERTIFIED_SEED = 0, 1
 _CHECKPOINT_LIMIT = 2**34  # bytes
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
 
@@ -200,20 +199,18 @@ def score_and_validate(
     """`score` and `validate` in one batch, in half the time; with a randomization, against the optima of its episodes."""
     known = certified.load(task, robot, randomization=randomization)
     fresh_set = _validation_set(task, robot, episodes, randomization)
-    drawn = known.drawn if known.drawn.shape[1] else _drawn(task, range(len(known)), randomization, -1)
+    drawn = known.drawn
+    if not drawn.shape[1]:  # as on a track that moves no optimum
+        drawn = fresh.draw_robots(task, range(len(known)), _CERTIFIED_SEED, randomization, "validation")
     scored, validated = _runs(policy, task, robot, randomization, (known.states, known.constants, drawn), fresh_set)
     return _score(scored, task, known.costs), _validation(validated, task)
 
 
 def _validation_set(task: Task, robot: str, episodes: int, randomization: Randomization) -> tuple[np.ndarray, ...]:
     """Initial states (B, 8), constants (B, nc) and what is drawn of the validation set."""
-    drawn = _drawn(task, range(episodes), randomization, _VALIDATION_SEED)
-    return *fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot), drawn
-
-
-def _drawn(task: Task, episodes: range, randomization: Randomization, seed: int) -> np.ndarray:
-    """(B, n) what a randomization draws for episodes, others than those of the certified sets."""
-    return np.array([cache.drawn(task, randomization, index, 1000 + seed) for index in episodes])
+    indices = range(episodes)
+    drawn = fresh.draw_robots(task, indices, _VALIDATION_SEED, randomization, "validation")
+    return *fresh.draw(task, indices, _VALIDATION_SEED, "validation", robot), drawn
 
 
 def _runs(
