@@ -1,4 +1,4 @@
-"""Films of certified episodes for gallery.md and leaderboard.md, which list them: python docs/make_gallery.py.
+"""Films of certified episodes for gallery.md and leaderboard.md, which list them, and regret.png: make gallery.
 
 Each row of the leaderboard has a film of its best and of its worst episode. The gallery shows one episode of each task under
 four rows, and the worst one of the best policy. A film is made where there is none of the row's submission. It shows what the
@@ -17,16 +17,19 @@ import make_leaderboard
 import numpy as np
 from PIL import Image
 
-from ballbot_baselines import CONTROLLERS
+from ballbot_baselines import CONTROLLERS, find_optimum
 from ballbot_gym import certified, files
+from ballbot_gym.engines import PHYSICS
+from ballbot_gym.env import make_task
 from ballbot_gym.picture import picture
 from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries
 from ballbot_train.policy_files import SHIPPED
-from ballbot_train.report import labels
+from ballbot_train.report import figures, labels
 from ballbot_train.report.replay import Ghost, Replay, Take, certified_replay
 
 PAGE = Path(__file__).parent / "gallery.md"
@@ -37,6 +40,7 @@ EPISODES = {"stabilize": 7, "turn": 34, "orbit": 122, "weave": 12}
 _LISTS = re.compile(r"(<!-- films -->\n).*(<!-- end of films -->)", flags=re.DOTALL)
 _SIZE, _FPS, _QUALITY = (240, 180), 10, 30  # of 50 to 80 kB
 _LONGEST, _AFTER = 5.0, 0.4  # s: of the motion; shown of a robot that has fallen
+_TOLERANCE = 1e-3  # of the optimum's cost beside the certified one
 _LAST_MS = 1500  # for which the last picture is shown
 
 
@@ -92,8 +96,13 @@ def take_of(row: Entry, episode: int) -> Replay:
         take = Take(
             row.name, _recorded(path, row, episode), labels.color(row.name, 0), failed=row.results()[episode].failure
         )
-    optimum = certified.load(row.task, row.robot, episodes=[episode]).trajectories[0]
-    return replace(replay, takes=(replace(take, ghosts=(Ghost("optimum", optimum, labels.OPTIMUM),)),))
+    known, task, params = certified.load(row.task, row.robot), make_task(row.task, row.robot), named_robot(row.robot)
+    optimum = find_optimum(task, params, known.states[episode], known.constants[episode])
+    if optimum.cost > (1 + _TOLERANCE) * known.costs[episode]:
+        raise PlanError(
+            f"{row.task} {episode}: the search found {optimum.cost}, and {known.costs[episode]} is certified"
+        )
+    return replace(replay, takes=(replace(take, ghosts=(Ghost("optimum", optimum.trajectory, labels.OPTIMUM),)),))
 
 
 def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
@@ -102,7 +111,9 @@ def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
     steps = held.lengths[:episode].sum()
     states, n = steps + np.count_nonzero(held.lengths[:episode]), held.lengths[episode]
     forces = held.actions[steps : steps + n] * named_robot(row.robot).force_limit
-    return Trajectory(TASKS[row.task]().control_dt * np.arange(n + 1), held.states[states : states + n + 1], forces)
+    return Trajectory(
+        make_task(row.task, row.robot).control_dt * np.arange(n + 1), held.states[states : states + n + 1], forces
+    )
 
 
 def film(replay: Replay) -> bytes:
@@ -148,6 +159,9 @@ def main() -> None:
         if path.name not in known:
             path.unlink()
     files.write(MADE, json.dumps(dict(sorted(known.items())), indent=1) + "\n")
+    rows = [row for row in read_entries() if (row.robot, row.physics) == (PAPER, next(iter(PHYSICS)))]
+    results = [result for task in TASKS for row in rows if row.task == task for result in row.results()]
+    figures.save(figures.regret_figure(results), FILMS.parent / "regret.png")
     files.write(PAGE, page(known))
     files.write(make_leaderboard.PAGE, make_leaderboard.page())
 

@@ -313,7 +313,7 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
 
 def _print_help(learner: str, settings: Any) -> None:
     """Prints the options in groups, with their defaults; tyro has no groups whose options keep their names."""
-    options = _options(Run()) | _options(settings)
+    options = _described(Run()) | _described(settings)
     groups = {
         "first": [options[name] for name in _FIRST],
         "recipe, tuned for --task": [text for name, text in options.items() if name not in (*_FIRST, *_LAST)],
@@ -330,7 +330,7 @@ def _print_help(learner: str, settings: Any) -> None:
                 console.print(f"{head:{_OPTION_WIDTH}}{line}".rstrip())
 
 
-def _options(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
+def _described(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
     """How to type each field of a dataclass, and what it means, by name."""
     found: dict[str, tuple[str, str]] = {}
     meanings, types = meanings_of(type(values)), get_type_hints(type(values))
@@ -339,7 +339,7 @@ def _options(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
         default = " ".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
         meaning = meanings[name] if value is None or value is False else f"{meanings[name]} [{default}]"
         if is_dataclass(value):
-            found |= _options(value, "" if name == "workers" else f"{name}.")
+            found |= _described(value, "" if name == "workers" else f"{name}.")
         elif isinstance(value, bool):
             found[name] = f"  --{typed}, --no-{typed}", meaning
         else:
