@@ -87,7 +87,7 @@ class BallbotParams:
             raise ValueError(f"BallbotParams: rolls must be True or False, not {self.rolls!r}")
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "rolls" or (field.name == "friction" and value == math.inf):
+            if field.name == "rolls" or (field.name == "friction" and is_number(value) and value == math.inf):
                 continue
             if isinstance(value, _NO_NUMBER):
                 raise ValueError(f"BallbotParams: {field.name} must be a number, not {value!r}")

@@ -306,6 +306,12 @@ def test_weak_actuator_gives_its_share_of_the_force_and_friction_is_a_share_too(
     assert env.step([0.2, -0.1])[4]["force"] == pytest.approx(0.5 * env.params.force_limit * np.array([0.2, -0.1]))
     assert env.episode_params.friction == env.params.friction / 2
     assert env.episode_params.force_limit == env.params.force_limit / 2
+    batch = BallbotBatch("stabilize", 3, robot="rolling", randomization="unknown", compile=False)
+    batch.reset(seed=0)
+    batch.step(torch.zeros(3, 2))
+    frictions = [batch.robot(i).friction for i in range(3)]
+    assert len(set(frictions)) == 3
+    assert 0.549 < min(frictions) < max(frictions) < 1.001
     plain = make_env(physics="rk4", randomization=robots)
     plain.reset(seed=0)
     assert plain.episode_params.friction == math.inf
