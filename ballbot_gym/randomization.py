@@ -71,7 +71,7 @@ class Randomization:
 
     DRAWN = (
         "body_mass", "ball_mass", "com_height", "inertia", "gain", "delay", "force", "friction",
-        "drift_x", "drift_y", "bias_γ", "bias_θ", "bias_γ̇", "bias_θ̇",
+        "drift_x", "drift_y", "bias_gamma", "bias_theta", "bias_gamma_rate", "bias_theta_rate",
     )  # fmt: skip
     """Names of what `draw` draws, of which the first 6 stand alone where nothing draws the others: factors, the gain and
     delay of `actuate`, and errors of the sensors in SI units."""
