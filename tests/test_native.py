@@ -226,7 +226,7 @@ def test_auto_takes_machine_code_unless_something_speaks_against_it():
     assert isinstance(BallbotVectorEnv(2000).batch, native.BallbotNative)
     assert isinstance(BallbotVectorEnv(2000, compile=False).batch, BallbotBatch)
     assert isinstance(BallbotVectorEnv(2, randomization=Randomization(body_mass=(0.9, 1.1))).batch, BallbotLoop)
-    with pytest.raises(ValueError, match='engine="native" knows no Randomization; take engine="torch" or "loop"'):
+    with pytest.raises(ValueError, match='"native" knows no Randomization and no history; take'):
         BallbotVectorEnv(2, engine="native", randomization=Randomization(body_mass=(0.9, 1.1)))
     with pytest.raises(ValueError, match="engine='native' runs on the CPU, not on cuda"):
         BallbotVectorEnv(2, engine="native", device="cuda")
