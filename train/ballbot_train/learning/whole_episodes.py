@@ -149,21 +149,22 @@ class WholeEpisodes:
         start = state.x
         total = torch.zeros(config.num_envs)
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
+        standing = alive  # an episode that has reached the goal goes on for a while, and may fail then
         ends, patience, ahead = [], _PATIENCE, int(self._batch.randomization.is_noisy)  # noise changes with the steps
         for k in range(task.steps):
             step = self._step(state)
-            total = total + torch.where(alive, step.cost, 0.0)
+            total = total + torch.where(alive & standing, step.cost, 0.0)
             if ahead and not task.first_exit and k >= task.steps - _RESTING:
                 total = total + torch.where(alive, _GOAL_PENALTY / _RESTING * step.lacking, 0.0)
-            alive = alive & ~(step.failed & ~reached)
+            alive, standing = alive & ~(step.failed & ~reached), standing & ~step.failed
             if task.first_exit:
-                ends.append(torch.where(alive, total + _GOAL_PENALTY * step.lacking, math.inf))
+                ends.append(torch.where(alive & standing, total + _GOAL_PENALTY * step.lacking, math.inf))
                 reached = reached | (alive & step.inside)
                 patience -= bool((reached | ~alive).all())
                 if not patience:
                     break
             # where an episode has failed, the model goes on from its start, which leads to no infinite numbers
-            x = torch.where(alive, step.x, start)
+            x = torch.where(alive & standing, step.x, start)
             if self._batch.randomization.active and x.requires_grad:
                 x.register_hook(_tamed)
             state = state._replace(x=x, actuator=step.actuator, past=step.past, steps=state.steps + ahead)
