@@ -160,7 +160,7 @@ class NmpcController:
                 )
         self._grid = Grid.make(steps, min(nodes or (steps if params.grips else _NODES), steps))
         self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
-        self._qp = horizon_qp(task, params, len(self._grid.lengths))
+        self._qp = horizon_qp(task, params.rolls, params.grips, len(self._grid.lengths))
         self.plan: Optimum | None = None
         self.predicted: np.ndarray | None = None
         self.disturbance: DisturbanceEstimator | None = None
@@ -285,6 +285,7 @@ class NmpcController:
         self._guess_x, self._guess_a = self._x_plan + self._dx, self._a_plan + self._da
         qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
         qp.x[0] = x
+        qp.set_robot(self._params)
         qp.distinct, qp.disturbance, qp.curvature = prepared.distinct, self.disturbance, self._curvature
         times = self._trajectory.t[0] + dt * self._nodes
         qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._task.at(self._c, times), self._reserve
