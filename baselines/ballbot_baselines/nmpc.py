@@ -37,8 +37,8 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-# of the plan; for the goal it is half of TrajoptController's
-_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02, grip=0.1)
+BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02, grip=0.1)
+"""Of the plan; for the goal it is half of `TrajoptController`'s."""
 _OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05, grip=0.1)  # what is left of a wrong model
 _NODES = 40
 _TOLERANCE = 1e-4  # a search has converged when no input changes by more than this fraction of the force limit
@@ -132,7 +132,7 @@ class NmpcController:
         nodes: int | None = None,
         horizon: float = 1.0,
         iterations: int = 1,
-        backoff: Backoff = _BACKOFF,
+        backoff: Backoff = BACKOFF,
         offset_free: bool = False,
         delay: float = 0.0,
     ):
