@@ -21,7 +21,7 @@ from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-_MOVED = 0.02  # of a factor of the robot: then the episode is planned anew
+_MOVED = 0.02  # of a factor of the robot, and at least twice its deviation: then the episode is planned anew
 
 
 class AdaptiveNmpcController:
@@ -46,19 +46,22 @@ class AdaptiveNmpcController:
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         if t > self._start:
             self.filter.update(t - self._start, x, self._u)
-            if self.filter.delay != self._delay or np.abs(self.filter.factors - self._factors).max() > _MOVED:
+            moved = np.abs(self.filter.factors - self._factors) > np.maximum(_MOVED, 2 * self.filter.deviations)
+            if self.filter.delay != self._delay or moved.any():
                 with contextlib.suppress(PlanError):  # the plan before is followed
                     self._plan(t)
-        begins, seen = self._when_free(t)
-        # what the estimated robot applies is a share of what it is asked for
-        share = self._robot.force_limit / self._params.force_limit
-        self._u = np.clip(self.nmpc.act(begins, seen) / share, -self._params.force_limit, self._params.force_limit)
+        robot = self.filter.robot
+        self.nmpc.adapt(robot)
+        limit = self._params.force_limit
+        # the robot applies a share of what it is asked for
+        u = self.nmpc.act(*self._when_free(t)) * limit / robot.force_limit
+        self._u = np.clip(u, -limit, limit)
         return self._u
 
     def _plan(self, t: float) -> None:
         """Plans the rest of the episode for the estimated robot from the state in which the next force begins to act."""
-        self._robot, self._factors, self._delay = self.filter.robot, self.filter.factors, self.filter.delay
-        nmpc = NmpcController(self._task, self._robot, backoff=self._backoff)
+        self._factors, self._delay = self.filter.factors, self.filter.delay
+        nmpc = NmpcController(self._task, self.filter.robot, backoff=self._backoff)
         nmpc.reset(*self._when_free(t), self._c)
         self.nmpc, self.plans = nmpc, self.plans + 1
 

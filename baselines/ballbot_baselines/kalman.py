@@ -38,6 +38,7 @@ class TrackFilter:
     |---|---|---|
     | `x` | (8,) | the state |
     | `factors` | (3,) | on the nominal values of what `FACTORS` names |
+    | `deviations` | (3,) | standard deviations of `factors` |
     | `errors` | (6,) | drift of odometry, m/s, biases of leans, rad, and of lean rates, rad/s |
     | `delay` | | control steps from a command to its force |
     """
@@ -70,11 +71,15 @@ class TrackFilter:
         forces = np.array([self._commands[delay] for delay in self._delays])
         after, slopes = (np.array(each) for each in self._step(self._z.T, forces.T))
         a = slopes.reshape(_SIZE, len(forces), _SIZE).transpose(1, 0, 2)
+        of_factors, moved = self._p[:, _FACTORS, _FACTORS], a[:, _X, _FACTORS]
+        # Factors multiply each other: what they move x by is wrong by about the share that they are.
+        second_order = np.einsum("kij,kjl,kil->ki", moved, of_factors, moved) * np.trace(of_factors, axis1=1, axis2=2)[:, None]
         self._z = after.T.copy()
         self._p = a @ self._p @ a.transpose(0, 2, 1)
         spread = np.diagonal(self._p, axis1=1, axis2=2)
         index = np.arange(_SIZE)
         self._p[:, index, index] += np.where(spread < self._prior, self._walk, 0.0)
+        self._p[:, index[_X], index[_X]] += second_order
         self._likelihood += self._correct(x, t)
         self._best = int(np.argmax(self._likelihood >= self._likelihood.max() - _EVIDENCE))
 
@@ -99,6 +104,10 @@ class TrackFilter:
     @property
     def factors(self) -> np.ndarray:
         return self._z[self._best, _FACTORS].copy()
+
+    @property
+    def deviations(self) -> np.ndarray:
+        return np.sqrt(np.diagonal(self._p[self._best])[_FACTORS])
 
     @property
     def errors(self) -> np.ndarray:

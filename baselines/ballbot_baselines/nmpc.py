@@ -181,6 +181,10 @@ class NmpcController:
         self._commanded = [np.zeros(2)] * self._delay
         self._follow(t, prepared)
 
+    def adapt(self, params: BallbotParams) -> None:
+        """Goes on with the model of another robot of the same kind. The plan stays."""
+        self._params = params
+
     def _follow(self, t: float, prepared: PreparedPlan) -> None:
         """Starts the horizon on a plan of the episode at time t."""
         self._start, self._prepared, self.plan, self.predicted = t, prepared, prepared.plan, None
