@@ -22,6 +22,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
 _MOVED = 0.02  # of a factor of the robot, and at least twice its deviation: then the episode is planned anew
+_NOISY_BACKOFF = Backoff(margin=0.03, goal=0.2, force=0.02, grip=0.1)  # with room for errors of the estimate
 
 
 class AdaptiveNmpcController:
@@ -83,9 +84,9 @@ def adaptive_nmpc(task: Task, params: BallbotParams) -> AdaptiveNmpcController:
 
 def filtered_nmpc(task: Task, params: BallbotParams) -> AdaptiveNmpcController:
     """For the track "noisy", whose robot is known."""
-    return AdaptiveNmpcController(task, params, TRACKS["noisy"])
+    return AdaptiveNmpcController(task, params, TRACKS["noisy"], _NOISY_BACKOFF)
 
 
 def filtered_adaptive_nmpc(task: Task, params: BallbotParams) -> AdaptiveNmpcController:
     """For the track "real", which has all of it."""
-    return AdaptiveNmpcController(task, params, TRACKS["real"])
+    return AdaptiveNmpcController(task, params, TRACKS["real"], _NOISY_BACKOFF)

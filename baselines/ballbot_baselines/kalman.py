@@ -71,9 +71,10 @@ class TrackFilter:
         forces = np.array([self._commands[delay] for delay in self._delays])
         after, slopes = (np.array(each) for each in self._step(self._z.T, forces.T))
         a = slopes.reshape(_SIZE, len(forces), _SIZE).transpose(1, 0, 2)
+        # Factors multiply each other: what they move x by is wrong by about the share that they are uncertain by.
         of_factors, moved = self._p[:, _FACTORS, _FACTORS], a[:, _X, _FACTORS]
-        # Factors multiply each other: what they move x by is wrong by about the share that they are.
-        second_order = np.einsum("kij,kjl,kil->ki", moved, of_factors, moved) * np.trace(of_factors, axis1=1, axis2=2)[:, None]
+        share = np.trace(of_factors, axis1=1, axis2=2)[:, None]
+        second_order = share * np.einsum("kij,kjl,kil->ki", moved, of_factors, moved)
         self._z = after.T.copy()
         self._p = a @ self._p @ a.transpose(0, 2, 1)
         spread = np.diagonal(self._p, axis1=1, axis2=2)
