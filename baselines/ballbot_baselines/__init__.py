@@ -37,7 +37,7 @@ VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
     "nmpc-ekf": called("ballbot_baselines.adaptive:filtered_nmpc"),
     "nmpc-adaptive-ekf": called("ballbot_baselines.adaptive:filtered_adaptive_nmpc"),
 }
-"""Controllers that run where they are named, and in the robustness track. They have no row on the leaderboard."""
+"""Controllers that run where they are named. They have no row on the leaderboard."""
 
 _MODULES = {
     "lqr": ("LqrController",),
