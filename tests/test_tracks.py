@@ -8,9 +8,13 @@ import pytest
 pytest.importorskip("casadi")
 pytest.importorskip("torch")
 
+from ballbot_baselines import LqrController
+from ballbot_baselines.adaptive import adaptive_nmpc
+from ballbot_baselines.cautious import cautious_trajopt
+from ballbot_baselines.kalman import TrackFilter
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.randomization import TRACKS
+from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
@@ -90,3 +94,48 @@ def test_fresh_episodes_of_a_track_draw_robots_and_say_what_each_costs():
     assert (result.costs != plain.costs).all()
     assert set(result.measures) > {"body_mass", "com_height", "force"}
     assert 0.7 <= result.measures["body_mass"].min() < result.measures["body_mass"].max() <= 1.4
+
+
+def test_adaptive_nmpc_learns_robot_and_delay_in_a_second():
+    drawn = Randomization(body_mass=(1.3, 1.3), com_height=(0.9, 0.9), force=(0.9, 0.9), actuator_delay=(0.04, 0.04))
+    env = BallbotEnv("stabilize", physics="rk4", randomization=drawn)
+    controller = adaptive_nmpc(env.task, env.params)  # it is told the nominal robot
+    _, info = env.reset(seed=0, options=certified.load("stabilize", "paper").options(0))
+    controller.reset(0.0, info["state"], info["constants"])
+    for k in range(50):
+        info = env.step(controller.act(k * env.task.control_dt, info["state"]) / env.params.force_limit)[-1]
+    assert controller.filter.factors == pytest.approx([1.3, 0.9, 0.9], rel=0.01)
+    assert controller.filter.delay == 2
+
+
+def test_filter_errs_less_than_half_of_what_noisy_sensors_do():
+    track = TRACKS["noisy"]
+    env = BallbotEnv("stabilize", physics="rk4", randomization=track)
+    estimate, lqr = TrackFilter(env.task, env.params, track), LqrController(env.task, env.params)
+    errors, noise = [], []
+    for seed in range(3):
+        _, info = env.reset(seed=seed, options={"state": [0.5, 0, 0.1, 0, 0, 1, 0, 0]})
+        lqr.reset(0.0, info["state"], info["constants"])
+        u = np.zeros(2)
+        for k in range(env.task.steps):
+            t, x, drawn = k * env.task.control_dt, info["state"], tuple(info["drawn"])
+            seen = np.array(track.sensed(tuple(x), tuple(env.np_random.random(8)), drawn, t))
+            if k:
+                estimate.update(t, seen, u)
+            else:
+                estimate.reset(seen)
+            u = np.clip(lqr.act(t, estimate.x), -env.params.force_limit, env.params.force_limit)
+            info = env.step(u / env.params.force_limit)[-1]
+            if k > 50:  # a second
+                errors.append(estimate.x - x)
+                noise.append(seen - x)
+    filtered, raw = (np.sqrt(np.mean(np.square(each), axis=0)) for each in (errors, noise))
+    assert (filtered[2:] < 0.5 * raw[2:]).all()  # odometry drifts, and nothing tells
+
+
+def test_cautious_plan_leaves_the_force_that_the_weakest_robot_lacks():
+    env = BallbotEnv("stabilize", physics="rk4")
+    cautious = cautious_trajopt(env.task, env.params)
+    cautious.reset(0.0, np.array([0, 0, 0.6, 0, 5.0, 0, 1.0, 0]), np.zeros(0))
+    asked = np.abs(cautious.plan.trajectory.u).max() / env.params.force_limit
+    assert asked == pytest.approx(TRACKS["unknown"].force[0], rel=1e-3)

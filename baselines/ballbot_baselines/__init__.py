@@ -32,8 +32,12 @@ CONTROLLERS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 
 VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
     "nmpc-offset-free": called("ballbot_baselines.nmpc:offset_free_nmpc"),
+    "cautious": called("ballbot_baselines.cautious:cautious_trajopt"),
+    "nmpc-adaptive": called("ballbot_baselines.adaptive:adaptive_nmpc"),
+    "nmpc-ekf": called("ballbot_baselines.adaptive:filtered_nmpc"),
+    "nmpc-adaptive-ekf": called("ballbot_baselines.adaptive:filtered_adaptive_nmpc"),
 }
-"""Controllers that run where they are named, and in the robustness track. They have no row on the leaderboard."""
+"""Controllers that run where they are named. They have no row on the leaderboard."""
 
 _MODULES = {
     "lqr": ("LqrController",),

@@ -12,6 +12,7 @@ import numpy as np
 
 from ballbot_baselines.compiled import LANES, InPlace, in_lanes
 from ballbot_baselines.disturbance import DisturbanceEstimator
+from ballbot_baselines.shooting import robot_names, robot_numbers, symbolic_robot
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -94,35 +95,34 @@ class HorizonQp:
     | `curvature` | (N,) | of the friction cone in the inputs, by the multipliers of the last program; 0 before the first |
     """
 
-    def __init__(self, task: Task, params: BallbotParams, nodes: int):
-        """Differentiates the stage and builds the solver; compiles on first use on a machine."""
+    def __init__(self, task: Task, rolls: bool, grips: bool, nodes: int):
+        """Differentiates the stage and builds the solver; compiles on first use on a machine. `set_robot` must follow."""
         count = len(task.margins((0.0,) * 8, (1.0,) * (len(task.constant_names) + task.clock)))
         self.distinct = np.arange(count)
         self.disturbance: DisturbanceEstimator | None = None
         self.curvature = np.zeros(nodes)
-        grips = len(dynamics.limits(params, (0.0,) * 8, (0.0, 0.0)))
-        # of the cone in an input, per multiplier
-        self._cone_curvature = 2 * (params.force_limit / (params.friction * params.weight)) ** 2 / _GRIP_UNIT
         self._margins = min(count, _MARGINS)
-        self._make_stage(task, params, nodes, count, grips)
-        self._make_program(nodes, self._margins, grips)
+        self._make_stage(task, rolls, 2 * grips, nodes, count)
+        self._make_program(nodes, self._margins, 2 * grips)
 
-    def _make_stage(self, task: Task, params: BallbotParams, n: int, m: int, grips: int) -> None:
+    def _make_stage(self, task: Task, rolls: bool, grips: int, n: int, m: int) -> None:
         blocks = -(-n // LANES)  # of intervals; the last one is filled up with zeros
         computed = slice(0, blocks * LANES)
 
         def rows(*shape: int) -> np.ndarray:
             return np.zeros((max(n + 1, computed.stop), *shape))
 
-        inputs = [rows(8), rows(2), rows(), rows(len(task.constant_names) + task.clock), *([rows()] if grips else [])]
+        numbers = rows(1 + len(robot_names(rolls, grips > 0)))  # an interval's length, and the robot
+        inputs = [rows(8), rows(2), numbers, rows(len(task.constant_names) + task.clock), *([rows()] if grips else [])]
         outputs = [rows(8), rows(10, 8), rows(10), rows(m), rows(8, m)]
         outputs += [rows(grips), rows(10, grips)] if grips else []
         self._stage = InPlace(
-            _stage_function(task, params).map(blocks),
+            _stage_function(task, rolls, grips > 0).map(blocks),
             [array[computed] for array in inputs],
             [array[computed] for array in outputs],
         )
-        self.x, self.a, self.h, self.c, *reserve = (array[: n + 1] for array in inputs)
+        self.x, self.a, _, self.c, *reserve = (array[: n + 1] for array in inputs)
+        self.h, self._robot = numbers[: n + 1, 0], numbers[:, 1:]
         self.reserve = reserve[0] if grips else np.zeros(n + 1)
         self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian, *grip = (
             array[: n + 1] for array in outputs
@@ -159,6 +159,12 @@ class HorizonQp:
         self._h.first[4:], self._h.inner[:, _OF_SLACK] = _SLACK_CURVATURE, _SLACK_CURVATURE
         self._g.first[2:], self._g.inner[:, _SLACK] = _SLACK_PRICE, _SLACK_PRICE
         self._high.first[_LIMITS], self._high.inner[:, _LIMITS] = np.inf, np.inf
+
+    def set_robot(self, params: BallbotParams) -> None:
+        """Sets the robot of the model: one of the kind that the program was made for, which rolls and grips or does not."""
+        self._robot[:] = robot_numbers(params)
+        # of the cone in an input, per multiplier
+        self._cone_curvature = 2 * (params.force_limit / (params.friction * params.weight)) ** 2 / _GRIP_UNIT
 
     def set_weights(self, q: np.ndarray, r: np.ndarray, p: np.ndarray, slope: np.ndarray, target: np.ndarray) -> None:
         """Sets the Hessian and the cost beyond the horizon.
@@ -235,23 +241,24 @@ class HorizonQp:
 
 
 @lru_cache(maxsize=16)
-def horizon_qp(task: Task, params: BallbotParams, nodes: int) -> HorizonQp:
-    """The program of a task, robot and number of intervals, made once and shared by all controllers."""
-    return HorizonQp(task, params, nodes)
+def horizon_qp(task: Task, rolls: bool, grips: bool, nodes: int) -> HorizonQp:
+    """The program of a task, kind of robot and number of intervals, made once and shared by all controllers."""
+    return HorizonQp(task, rolls, grips, nodes)
 
 
 @lru_cache(maxsize=16)
-def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
-    """(x, a, h, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
+def _stage_function(task: Task, rolls: bool, grips: bool) -> casadi.Function:
+    """(x, a, p, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
 
-    It computes `LANES` intervals at once, and matrices are columns.
+    It computes `LANES` intervals at once, and matrices are columns. p is the interval's length and the robot's numbers.
 
     Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
     """
-    x, a, h = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("h")
+    x, a, p = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("p", 1 + len(robot_names(rolls, grips)))
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
-    z, u = casadi.vertcat(x, a), params.force_limit * a
-    after = dynamics.step(params, x, u, h, 2)  # two RK4 steps, as the env takes per control step
+    robot, limit = symbolic_robot(rolls, grips, p)
+    z, u, h = casadi.vertcat(x, a), limit * a, p[0]
+    after = dynamics.step(robot, x, u, h, 2)  # two RK4 steps, as the env takes per control step
     margins = casadi.vertcat(*task.margins(x, c))
     outputs = [
         after,
@@ -260,13 +267,13 @@ def _stage_function(task: Task, params: BallbotParams) -> casadi.Function:
         margins,
         casadi.vec(casadi.densify(casadi.jacobian(margins, x))),
     ]
-    inputs = [x, a, h, c]
-    if params.grips:
+    inputs = [x, a, p, c]
+    if grips:
         reserve = casadi.SX.sym("reserve")
         inputs.append(reserve)
         begins, ends = (
-            casadi.vertcat(*dynamics.grip_limits(params, force, reserve))
-            for force in dynamics.held_contact(params, x, u, task.control_dt)
+            casadi.vertcat(*dynamics.grip_limits(robot, force, reserve))
+            for force in dynamics.held_contact(robot, x, u, task.control_dt)
         )
         # only the end of a control step that is nearer to slipping: each row costs time
         grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT

@@ -1,6 +1,6 @@
 """Linear models of the robot and quadratic models of a task's cost, by automatic differentiation."""
 
-from functools import cache
+from functools import cache, lru_cache
 
 import casadi
 import numpy as np
@@ -74,7 +74,7 @@ def _constants(task: Task, c: np.ndarray, t: np.ndarray | float, n: int) -> np.n
     return task.at(np.tile(np.asarray(c, np.float64), (n, 1)), np.broadcast_to(t, (n,))).T
 
 
-@cache
+@lru_cache(maxsize=64)  # controllers that estimate their robot come with many
 def _jacobians(params: BallbotParams, dt: float | None) -> casadi.Function:
     """Of the state after a control step of dt, s; of the state's derivative for None."""
     x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)

@@ -37,8 +37,8 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 
-# of the plan; for the goal it is half of TrajoptController's
-_BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02, grip=0.1)
+BACKOFF = Backoff(margin=0.01, goal=0.05, force=0.02, grip=0.1)
+"""Of the plan; for the goal it is half of `TrajoptController`'s."""
 _OFFSET_FREE_BACKOFF = Backoff(margin=0.02, goal=0.4, force=0.05, grip=0.1)  # what is left of a wrong model
 _NODES = 40
 _TOLERANCE = 1e-4  # a search has converged when no input changes by more than this fraction of the force limit
@@ -132,7 +132,7 @@ class NmpcController:
         nodes: int | None = None,
         horizon: float = 1.0,
         iterations: int = 1,
-        backoff: Backoff = _BACKOFF,
+        backoff: Backoff = BACKOFF,
         offset_free: bool = False,
         delay: float = 0.0,
     ):
@@ -160,7 +160,7 @@ class NmpcController:
                 )
         self._grid = Grid.make(steps, min(nodes or (steps if params.grips else _NODES), steps))
         self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
-        self._qp = horizon_qp(task, params, len(self._grid.lengths))
+        self._qp = horizon_qp(task, params.rolls, params.grips, len(self._grid.lengths))
         self.plan: Optimum | None = None
         self.predicted: np.ndarray | None = None
         self.disturbance: DisturbanceEstimator | None = None
@@ -180,6 +180,10 @@ class NmpcController:
         self._before: tuple[np.ndarray, np.ndarray] | None = None
         self._commanded = [np.zeros(2)] * self._delay
         self._follow(t, prepared)
+
+    def adapt(self, params: BallbotParams) -> None:
+        """Goes on with the model of another robot of the same kind. The plan stays."""
+        self._params = params
 
     def _follow(self, t: float, prepared: PreparedPlan) -> None:
         """Starts the horizon on a plan of the episode at time t."""
@@ -285,6 +289,7 @@ class NmpcController:
         self._guess_x, self._guess_a = self._x_plan + self._dx, self._a_plan + self._da
         qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
         qp.x[0] = x
+        qp.set_robot(self._params)
         qp.distinct, qp.disturbance, qp.curvature = prepared.distinct, self.disturbance, self._curvature
         times = self._trajectory.t[0] + dt * self._nodes
         qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._task.at(self._c, times), self._reserve

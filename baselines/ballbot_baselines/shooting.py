@@ -92,9 +92,9 @@ def _kind(task: Task, params: BallbotParams) -> tuple[Task, bool, bool]:
 
 @lru_cache(maxsize=64)
 def _ocp(task: Task, rolls: bool, grips: bool) -> Ocp:
-    nr = len(_robot_names(rolls, grips))
+    nr = len(robot_names(rolls, grips))
     nc = len(task.constant_names)
-    robot = partial(_symbolic_robot, rolls, grips)
+    robot = partial(symbolic_robot, rolls, grips)
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         return casadi.vertcat(*task.margins(x, _constants(task, nr, p, p[0]))) - p[1 + nr + nc]
@@ -136,17 +136,18 @@ def shooting_parameters(
 
 def robot_numbers(params: BallbotParams) -> list[float]:
     """What problems need to know of a robot, besides whether its ball rolls and whether it has to grip."""
-    return [getattr(params, name) for name in _robot_names(params.rolls, params.grips)]
+    return [getattr(params, name) for name in robot_names(params.rolls, params.grips)]
 
 
-def _robot_names(rolls: bool, grips: bool) -> list[str]:
+def robot_names(rolls: bool, grips: bool) -> list[str]:
+    """Fields of a robot of this kind that `robot_numbers` gives."""
     names = ["total_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "force_limit"]
     return names + ["moving_mass", "ball_radius"] * rolls + ["friction"] * grips
 
 
-def _symbolic_robot(rolls: bool, grips: bool, p: casadi.SX) -> tuple[Any, casadi.SX]:
-    """The robot of p of `shooting_ocp`, and its force limit."""
-    found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(_robot_names(rolls, grips))}
+def symbolic_robot(rolls: bool, grips: bool, p: casadi.SX) -> tuple[Any, casadi.SX]:
+    """A robot of this kind, whose numbers stand in p after the length of a step, and its force limit."""
+    found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(robot_names(rolls, grips))}
     limit = found.pop("force_limit")
     weight = found["total_mass"] * found["gravity"]
     numbers = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight} | found
@@ -201,8 +202,8 @@ def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolve
 
 @lru_cache(maxsize=8)
 def _free_time_solver(task: Task, rolls: bool, grips: bool, solver: str) -> OcpSolver:
-    fixed, nr = _ocp(task, rolls, grips), len(_robot_names(rolls, grips))
-    robot = partial(_symbolic_robot, rolls, grips)
+    fixed, nr = _ocp(task, rolls, grips), len(robot_names(rolls, grips))
+    robot = partial(symbolic_robot, rolls, grips)
 
     def with_length(s: casadi.SX, p: casadi.SX) -> casadi.SX:
         return casadi.vertcat(s[8], p[1:]) if task.clock else p  # the length is also what the stage's time is found by

@@ -4,7 +4,6 @@ import math
 import os
 from pathlib import Path
 
-from ballbot_baselines import VARIANTS
 from ballbot_gym import files
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
@@ -59,7 +58,7 @@ def robustness(
     """
     chosen = controllers_of(tasks, controllers, robot)
     if not controllers:
-        chosen = {task: [*group, *VARIANTS] for task, group in chosen.items()}
+        chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
     physics = physics_or_default(physics)
     check_some("stress", stresses, stressed.STRESSES)
     episodes = checked_episodes(episodes, quick, few=3)

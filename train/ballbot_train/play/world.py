@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ballbot_baselines import VARIANTS
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.randomization import Randomization
@@ -92,7 +91,13 @@ class World:
                 own += [policy] * is_made_for(policy, self.base, self.robot)
         known = names(self.base, self.robot)
         experts = [name for name in known if is_expert(name)]
-        self.controllers = [*experts, *VARIANTS, *(name for name in known if name not in experts), *own, *DRIVERS]
+        self.controllers = [
+            *experts,
+            "nmpc-offset-free",
+            *(name for name in known if name not in experts),
+            *own,
+            *DRIVERS,
+        ]
 
     def check_controllers(self, *wanted: str) -> None:
         """Refuses what no controller is called. What is in a policy file is found out when it is loaded."""
