@@ -158,8 +158,9 @@ class Ilqr:
         costs, missed = np.zeros(jobs), np.zeros(jobs)
         status, iterations = np.zeros(jobs, np.int64), np.zeros(jobs, np.int64)
         each = (np.ascontiguousarray(np.broadcast_to(steps, jobs), np.int64), *self._given(jobs, lengths, given))
-        after = x, a, gains, slopes, costs, missed, status, iterations
-        self._solve(jobs, n, *(array.ctypes.data for array in (np.array(astuple(options)), *each, *after)))
+        # named, because all have to live as long as the call
+        arrays = (np.array(astuple(options)), *each, x, a, gains, slopes, costs, missed, status, iterations)
+        self._solve(jobs, n, *(array.ctypes.data for array in arrays))
         return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, iterations)
 
     def follow(
