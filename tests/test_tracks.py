@@ -19,6 +19,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation.fresh import evaluate_fresh
+from ballbot_train.evaluation.tracks import EXPERTS, conditions, with_experts
 from ballbot_train.policy import load_network
 from ballbot_train.policy_files import read_description, shipped_policies, track_in
 
@@ -42,6 +43,16 @@ def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):
     best = rows["unknown", rows["unknown", "lqr"]["best"]]
     assert float(best["controller_loses"]) == 0 < float(best["not_knowing_costs"])
     assert (tmp_path / "tracks.md").read_text().count("orbit") == 4
+
+
+def test_experts_of_a_track_meet_that_track_alone_unless_they_are_named():
+    chosen, wanted = with_experts({"orbit": ["lqr", "shac-late"]}, conditions(["late", "noisy"]))
+    late, noisy = (condition.chosen(chosen)["orbit"] for condition in wanted)
+    assert late == ["lqr", "shac-late", "nmpc-adaptive"]
+    assert noisy == ["lqr", "nmpc-ekf"]
+    assert set(EXPERTS) == set(TRACKS)
+    named = {"orbit": ["nmpc-ekf"]}
+    assert conditions(["late"])[0].chosen(named) == named
 
 
 def test_unknown_track_is_refused_before_anything_runs(tmp_path):

@@ -52,7 +52,8 @@ def benchmark(
         workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.
         randomization: names of tracks, "unknown", "late", "noisy" or "real": robots, delays and sensors that nobody told the
-            controllers. Then the result is one table of controllers by tracks, with the parts of their regret.
+            controllers. Then the result is one table of controllers by tracks, with the parts of their regret; by default
+            with the experts that are made for each track.
     """
     if randomization:
         _benchmark_tracks(tasks, controllers, episodes, quick, physics, seed, out, workers, robot, randomization)
@@ -106,6 +107,8 @@ def _benchmark_tracks(
     names: Sequence[str],
 ) -> None:
     wanted, chosen = tracks.conditions(names), controllers_of(tasks, controllers, robot, tracks=True)
+    if not controllers:
+        chosen, wanted = tracks.with_experts(chosen, wanted)
     physics, episodes = physics_or_default(physics), checked_episodes(episodes, quick, few=8)
     facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes, tracks=list(names))
     tracks.find_optima(list(chosen), names, episodes, robot, workers)

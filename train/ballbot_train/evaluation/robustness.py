@@ -103,12 +103,16 @@ class Condition:
     randomization: Randomization
     own_optima: bool = False
     """Whether regret is over the optimum of each episode's own robot, and not over the undisturbed one."""
+    left_out: tuple[str, ...] = ()
+    """Controllers that do not meet it."""
 
     def chosen(self, controllers: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-        """Those controllers by task that meet it: all but the policies that were trained on other tracks."""
-        return {
-            task: [name for name in group if track_in(name) in ("", self.name)] for task, group in controllers.items()
-        }
+        """Those controllers by task that meet it: not the policies that were trained on other tracks."""
+
+        def meets(name: str) -> bool:
+            return name not in self.left_out and track_in(name) in ("", self.name)
+
+        return {task: [name for name in group if meets(name)] for task, group in controllers.items()}
 
 
 def conditions(stresses: Sequence[str]) -> list[Condition]:

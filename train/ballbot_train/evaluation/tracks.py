@@ -11,7 +11,7 @@ What delay costs is told beside them, because no controller could avoid it: J le
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,15 @@ class TrackRow(Row):
     """The best controller: of those that succeed most often, the one of least mean regret."""
 
 
+EXPERTS = {
+    "unknown": ("cautious", "nmpc-adaptive"),
+    "late": ("nmpc-adaptive",),
+    "noisy": ("nmpc-ekf",),
+    "real": ("nmpc-adaptive-ekf",),
+}
+"""The experts that are made for each track, which run there where no controllers are named."""
+
+
 def conditions(tracks: Sequence[str]) -> list[Condition]:
     """The tracks of these names.
 
@@ -54,6 +63,16 @@ def conditions(tracks: Sequence[str]) -> list[Condition]:
         ValueError: no track of such a name.
     """
     return [Condition(name, 0.0, checked_randomization(name), own_optima=True) for name in tracks]
+
+
+def with_experts(
+    controllers: Mapping[str, Sequence[str]], wanted: Sequence[Condition]
+) -> tuple[dict[str, list[str]], list[Condition]]:
+    """The same controllers by task and the experts of these tracks, each of which is left out on the other tracks."""
+    experts = list(dict.fromkeys(name for condition in wanted for name in EXPERTS[condition.name]))
+    others = {c.name: tuple(name for name in experts if name not in EXPERTS[c.name]) for c in wanted}
+    chosen = {task: [*group, *experts] for task, group in controllers.items()}
+    return chosen, [replace(condition, left_out=others[condition.name]) for condition in wanted]
 
 
 def find_optima(tasks: Sequence[str], tracks: Sequence[str], episodes: int, robot: str, workers: int | Workers) -> None:
