@@ -71,19 +71,7 @@ def _solved(
     delay = randomization.moves_optima and drawn[5] > 0
     try:
         optimum = optimum_of(task, params, x0, c, randomization, drawn, guesses)
-        ideal = (
-            optimum_of(
-                task,
-                params,
-                x0,
-                c,
-                replace(randomization, actuator_delay=(0.0, 0.0)),
-                (*drawn[:5], 0.0, *drawn[6:]),
-                guesses,
-            )
-            if delay
-            else optimum
-        )
+        ideal = find_optimum(task, randomization.robot(params, drawn), x0, c, guesses=guesses) if delay else optimum
     except PlanError as error:
         return {"episode": index, "error": str(error)}
     for found in (optimum, ideal):

@@ -58,7 +58,8 @@ def certify(
         raise ValueError(
             f"episodes must be at most {most}, not {episodes}" + (most < _MOST_IN_SHARDS) * "; or give --shards"
         )
-    if not checked_randomization(randomization).moves_optima and randomization:
+    varied = checked_randomization(randomization)
+    if randomization and not varied.moves_optima:
         raise ValueError(f"{randomization} moves no optimum: its episodes have the optima without --randomization")
     if install and episodes < certified.EPISODES:
         raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
@@ -69,7 +70,6 @@ def certify(
         return
     jobs.make_folder(out)
     params, failures, sets = named_robot(robot), [], {}
-    varied = checked_randomization(randomization)
     for name in tasks:
         task = make_task(name, robot)
         try:

@@ -22,7 +22,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.randomization import TRACKS, checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.results import Row, summarize, to_json, write_csv
+from ballbot_train.evaluation.results import Row, shown, summarize, to_json, write_csv
 from ballbot_train.evaluation.robustness import Condition, StressResult
 from ballbot_train.executors import Workers
 
@@ -98,20 +98,12 @@ def rows_of(results: Sequence[StressResult], robot: str = PAPER, seed: int = 0) 
         for name, done in group.items():
             pairs = np.array([(of_best[result.episode], result.regret) for result in done])
             pairs = pairs[np.isfinite(pairs).all(axis=1)]
-            known_parts = (float(pairs[:, 0].mean()), float((pairs[:, 1] - pairs[:, 0]).mean())) if len(pairs) else ()
-            unknown, loses = known_parts or (math.nan, math.nan)
-            rows.append(TrackRow(**asdict(plain[name]), **_parts(track, delay, unknown, loses, best)))
+            row = TrackRow(**asdict(plain[name]), track=track, delay_costs=delay, best=best)
+            if len(pairs):
+                unknown, loses = float(pairs[:, 0].mean()), float((pairs[:, 1] - pairs[:, 0]).mean())
+                row = replace(row, not_knowing_costs=unknown, controller_loses=loses)
+            rows.append(row)
     return rows
-
-
-def _parts(track: str, delay: float, unknown: float, loses: float, best: str) -> dict[str, Any]:
-    return {
-        "track": track,
-        "delay_costs": delay,
-        "not_knowing_costs": unknown,
-        "controller_loses": loses,
-        "best": best,
-    }
 
 
 def _last_if_nan(value: float) -> float:
@@ -122,7 +114,7 @@ def cells(row: TrackRow) -> list[str]:
     """A line of the table."""
 
     def percent(*values: float) -> str:
-        return " to ".join(f"{100 * value:.2f}" if math.isfinite(value) else "–" for value in values)
+        return " to ".join(shown(100 * value, ".2f") for value in values)
 
     return [
         row.track,
