@@ -40,7 +40,7 @@ def observations_of_an_episode(env, policy):
 def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path):
     task, *others, learner = name.split("-")
     robot = others[0] if others else "paper"
-    export(learner, task=task, onnx=tmp_path / "policy.onnx", robot=robot)
+    export(learner, task=task, out=tmp_path / "policy.onnx", robot=robot)
     runtime = session(tmp_path / "policy.onnx")
     policy = load_policy(SHIPPED / f"{name}.json")
     # in the closed form a ball that would slip ends the episode

@@ -23,8 +23,8 @@ from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
 from ballbot_train.policy_files import BEST, SHIPPED, shipped_policies
 from ballbot_train.report import playground
-from ballbot_train.report.javascript import javascript_function
 from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
+from ballbot_train.report.printed import javascript_function
 
 CLOSE = 1e-6  # with policies in double precision on both sides; measured: 1e-12
 FLOAT32 = 2e-5  # with Python's policy in single precision; measured: 5e-6
@@ -326,8 +326,8 @@ def test_a_push_brings_the_energy_of_its_impulse_times_the_mean_speed_of_the_pus
     assert gained == pytest.approx(impulse @ (speed(before) + speed(behind)) / 2)
 
 
-def test_a_function_that_has_no_javascript_is_refused():
-    with pytest.raises(ValueError, match=r"f: the CasADi operation .* has no JavaScript"):
+def test_a_function_with_an_unknown_operation_is_refused():
+    with pytest.raises(ValueError, match=r"f: the CasADi operation .* cannot be printed"):
         javascript_function("f", lambda x: casadi.erf(x), {"x": 1})
 
 
