@@ -88,8 +88,8 @@ class Algorithm:
             seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
             start: a policy to train on from, or None; it may be of another robot.
-            randomization: what varies in training, for ppo and shac.
-            history: how many earlier observations and actions the policy sees, for ppo and shac.
+            randomization: what varies in training, for dagger, ppo and shac.
+            history: how many earlier observations and actions the policy sees, for dagger, ppo and shac.
 
         Returns:
             The learner before its first iteration.
@@ -104,8 +104,8 @@ class Algorithm:
             )
         given: dict[str, Any] = {"demos": demos} | ({"start": start} if self.starts else {})
         if randomization is not None or history:
-            if self.name not in ("ppo", "shac"):
-                raise ValueError(f"{self.name} knows no randomization and no history; train ppo or shac")
+            if self.name == "sac":
+                raise ValueError("sac knows no randomization and no history; train dagger, ppo or shac")
             given |= {"randomization": randomization, "history": history}
         with load("ballbot_train.weights:own_defaults")():
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
