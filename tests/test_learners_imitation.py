@@ -98,8 +98,8 @@ def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way():
     drawn = Randomization(body_mass=(1.3, 1.3), force=(0.9, 0.9), actuator_delay=(0.02, 0.02))
     config = replace(TINY_DAGGER, batch_episodes=32, label_seconds=0.5)
     with pytest.raises(ValueError, match="give --batch-episodes"):
-        dagger.make(task, params, TINY_DAGGER, 0, None, drawn)
-    learner = dagger.make(task, params, config, 0, None, drawn, history=1)
+        dagger.make(task, params, TINY_DAGGER, 0, None, randomization=drawn)
+    learner = dagger.make(task, params, config, 0, None, randomization=drawn, history=1)
     assert learner.iterate()["train/labelled"] > 0.5  # from some states no robot so heavy and weak can be saved
     observations, actions = (part.double().numpy()[:64] for part in learner.state_dict()["samples"][:2])
     robot = replace(params, body_mass=1.3 * params.body_mass, force_limit=0.9 * params.force_limit)

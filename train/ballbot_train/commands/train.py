@@ -57,7 +57,7 @@ class Run:
     demos: str | None = None
     """Dataset of `ballbot demos`, or the URL of shards."""
     start: Path | None = None
-    """Policy file to train on from; ppo, sac, shac."""
+    """Policy file to train on from."""
     randomization: str | None = None
     """Track: unknown, late, noisy or real; not sac."""
     history: int = 0

@@ -40,7 +40,7 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry
+from ballbot_train.learning.actors import RoutedSymmetry, check_start, started
 from ballbot_train.learning.datasets import Demos, StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
@@ -198,7 +198,7 @@ class Dagger:
             raise ValueError(
                 f"optima of {task.id} with this robot are not found at once; give --batch-episodes 0, which plans each alone"
             )
-        self.config, self.iteration = config, 0
+        self.config, self.iteration, self._warm = config, 0, False
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
         self._randomization, self._history = randomization, history
@@ -211,9 +211,15 @@ class Dagger:
     def network(self) -> PolicyNetwork:
         return self._fit.network
 
+    def start_from(self, network: PolicyNetwork) -> None:
+        """As of `Shac`."""
+        check_start(network.spec, self.network.spec)
+        self.network.load_state_dict(started(network, self.network.spec).state_dict())
+        self._warm = True
+
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes
-        if routes is not None and self.iteration == 0:
+        if routes is not None and self.iteration == 0 and not self._warm:
             fit_routes(routes, self._task, self._params, self._seed)
         rng = np.random.default_rng([self._seed, self.iteration])
         if self._streamed is not None:  # one shard after the other is in memory
@@ -344,7 +350,6 @@ class Dagger:
             change = -np.einsum("bij,bj->bi", optima.gains[:, k], off)
             label = np.clip((optima.forces[:, k] + change) / limits, -1, 1)
             near = (np.abs(change) < _SMALL * limits).all(1) & running & optima.solved & (k < optima.steps)
-            near &= rng.random(len(near)) < _BATCH_STATES / np.minimum(steps, optima.steps)
             seen.append(observation[near])
             labels.append(label[near])
             weights.append(1 / np.maximum(costs[near], _MIN_COST))
@@ -352,6 +357,8 @@ class Dagger:
                 actions = np.where(expert, label, self.network(observation))
             state, result = batch.transition(state, torch.as_tensor(actions))
             running &= ~(result.terminated | result.truncated).numpy()
+            if not running.any():
+                break
         self._samples.add(Samples.of(torch.cat(seen).numpy(), np.concatenate(labels), np.concatenate(weights)))
         return states, lasted, optima.costs
 
@@ -587,6 +594,7 @@ def make(
     config: DaggerConfig,
     seed: int,
     demos: str | Path | None,
+    start: PolicyNetwork | None = None,
     randomization: Randomization | None = None,
     history: int = 0,
 ) -> Dagger:
@@ -606,7 +614,10 @@ def make(
         samples = Samples.of(loaded.observations, loaded.actions, weights)
     elif not config.gathering_iterations:
         raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
-    return Dagger(task, params, config, seed, samples, randomization, history)
+    learner = Dagger(task, params, config, seed, samples, randomization, history)
+    if start is not None:
+        learner.start_from(start)
+    return learner
 
 
 def _median_cost(demos: Demos, task: Task) -> float:
