@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from ballbot_baselines import batched
 from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_gym import dynamics
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import routing, training
 from ballbot_train.learning.datasets import load_demos
@@ -87,6 +90,25 @@ def test_dagger_goes_on_from_its_state_as_if_never_stopped(demos):
     task, params = make_task("stabilize"), default_params()
     whole, continued = stopped_and_whole(lambda: dagger.make(task, params, TINY_DAGGER, 0, demos))
     assert torch.equal(parameters(whole), parameters(continued))
+
+
+def test_expert_of_a_track_knows_the_robot_and_the_forces_on_their_way():
+    """A label is the optimal force from where the robot will be once the last force, which the learner sees, has acted."""
+    task, params = make_task("stabilize"), default_params()
+    drawn = Randomization(body_mass=(1.3, 1.3), force=(0.9, 0.9), actuator_delay=(0.02, 0.02))
+    config = replace(TINY_DAGGER, batch_episodes=32, label_seconds=0.5)
+    with pytest.raises(ValueError, match="give --batch-episodes"):
+        dagger.make(task, params, TINY_DAGGER, 0, None, randomization=drawn)
+    learner = dagger.make(task, params, config, 0, None, randomization=drawn, history=1)
+    assert learner.iterate()["train/labelled"] > 0.5  # from some states no robot so heavy and weak can be saved
+    observations, actions = (part.double().numpy()[:64] for part in learner.state_dict()["samples"][:2])
+    robot = replace(params, body_mass=1.3 * params.body_mass, force_limit=0.9 * params.force_limit)
+    x, under_way = observations[:, :8] * task.observation_scale, robot.force_limit * observations[:, 16:]
+    later = np.stack(dynamics.step(robot, tuple(x.T), tuple(under_way.T), task.control_dt, 2), 1)
+    best = batched.find_optima(task, robot, later, np.zeros((len(x), 0)))
+    off = np.abs(actions - np.clip(best.forces[:, 0] / robot.force_limit, -1, 1)).max(1)[best.solved]
+    assert np.percentile(off, 25) < 1e-5  # where the expert acts: an optimum goes on being optimal
+    assert np.percentile(off, 90) < 0.1  # where the learner acts: feedback about it is linear
 
 
 @pytest.mark.parametrize("name", TASKS)

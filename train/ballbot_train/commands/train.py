@@ -57,9 +57,9 @@ class Run:
     demos: str | None = None
     """Dataset of `ballbot demos`, or the URL of shards."""
     start: Path | None = None
-    """Policy file to train on from; ppo, sac, shac."""
+    """Policy file to train on from."""
     randomization: str | None = None
-    """Track: unknown, late, noisy or real; ppo, shac."""
+    """Track: unknown, late, noisy or real; not sac."""
     history: int = 0
     """Earlier observations and actions that are seen."""
     seed: int = 0
@@ -134,8 +134,8 @@ def train(
         seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
         workers: how many runs of `seeds` go on at once, or `Workers`.
         robot: name of a robot.
-        randomization: name of the track on which the policy is trained and measured, for ppo and shac.
-        history: how many earlier observations and actions the policy sees, for ppo and shac.
+        randomization: name of the track on which the policy is trained and measured, for dagger, ppo and shac.
+        history: how many earlier observations and actions the policy sees, for dagger, ppo and shac.
     """
     check_names("learner", [learner], LEARNERS)
     check_names("task", [task], TASKS)
