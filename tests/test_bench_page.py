@@ -1,7 +1,6 @@
 """The page of `make bench`: what it compares, what it marks, and that it goes on where it was."""
 
 import importlib.util
-import os
 import sys
 from pathlib import Path
 
@@ -83,34 +82,6 @@ def test_a_benchmark_that_fails_is_named_and_runs_again_the_next_time(page, monk
     assert "It failed; see what it printed." in written(page, monkeypatch, "aaaa", 1)
     monkeypatch.delenv("FAIL")
     assert "| walk, 0.5 | 2 s |" in written(page, monkeypatch, "aaaa", 1)
-
-
-@pytest.mark.parametrize(("others", "marked"), [(0.0, False), (0.03, False), (0.5, True)])
-def test_a_section_is_marked_where_others_took_much_of_the_cores(page, monkeypatch, others, marked):
-    clock = iter([100.0, 110.0])
-    cores = os.cpu_count() or 1
-    used = iter([(0.0, 0.0), (others * 10 * cores + 7.0, 7.0)])
-    monkeypatch.setattr(page, "_processor_seconds", lambda: next(used))
-    monkeypatch.setattr(page.time, "monotonic", lambda: next(clock))
-    monkeypatch.setenv("FAST", "1")
-    monkeypatch.setattr(page.subprocess, "run", _written_at_once)
-    (section,) = page.SECTIONS
-    record = page._measured(section, Path("bench/aaaa/fake"), quick=False, again=False)
-    monkeypatch.undo()
-    assert record["others"] == pytest.approx(others)
-    text = page._markdown(Path("bench/aaaa"), [(section, record)], None)
-    assert ("## Fakes (busy machine)" in text) is marked
-
-
-def _written_at_once(command, check):
-    out = Path(command[command.index("--out") + 1])
-    out.mkdir(parents=True)
-    (out / "fake.csv").write_text("what,size,s,speed\nwalk,1,1,1\n")
-
-    class Done:
-        returncode = 0
-
-    return Done()
 
 
 def test_a_section_that_does_not_exist_is_refused_with_the_names_of_those_that_do(page):

@@ -66,14 +66,7 @@ def test_compare_says_whether_b_is_better(tmp_path, capsys):
     assert (row["verdict"], row["regret"]) == ("better", pytest.approx(-0.1))
 
 
-def test_a_folder_with_another_unfinished_run_is_refused(tmp_path, typed):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "unfinished.json").write_text('{"episodes": 3}')
-    ended, printed = typed("benchmark", "--tasks", "stabilize", "--episodes", 1, "--out", "out")
-    assert (ended, "unfinished run" in printed) == (1, True), printed
-
-
-def test_paper_writes_plans_and_figures(tmp_path, typed):
+def test_paper_writes_plans_and_figures(tmp_path, typed, interpreted):
     ended, printed = typed("paper", "--only", "stabilize-1", "--out", "figures")
     assert (ended, "106.3652" in printed) == (0, True), printed
     names = {path.name for path in (tmp_path / "figures").iterdir()}
@@ -202,21 +195,6 @@ def test_damaged_files_of_other_commands_are_named_and_skipped_and_paths_are_pri
     assert "skipped: runs/train/config.json" in printed
     assert "report: runs/[red]x[/b]:smile:/report.html" in printed
     assert (runs / "[red]x[/b]:smile:" / "leaderboard.csv").exists()
-
-
-def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_path, typed):
-    arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "trajopt", "--workers", "1", "--out", "out")
-    first = subprocess.Popen(
-        [sys.executable, "-m", "ballbot_train.cli", *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not (tmp_path / "out" / "unfinished").exists():
-        time.sleep(0.05)
-    ended, printed = typed(*arguments)
-    first.send_signal(signal.SIGKILL)
-    first.wait()
-    assert (ended, "another run is using out right now" in printed) == (1, True), printed
-    assert not (tmp_path / "out" / "leaderboard.csv").exists()
 
 
 def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):

@@ -29,13 +29,6 @@ def backwards(starts=None, **options):
     return made
 
 
-def of_its_own(made):
-    """The batch, whose curriculum has come to the task itself."""
-    made._goal_factor, made._ramp["max_speed"] = 1.0, made._own.max_speed
-    made._set_difficulty()
-    return made
-
-
 def some_starts(task, count=20):
     x = torch.zeros(8, count, dtype=torch.float64)
     x[0], x[1], x[5] = -torch.rand(count) - 1, -0.5, 3.0
@@ -104,12 +97,6 @@ def test_the_goal_narrows_and_then_the_speed_rises_whenever_enough_episodes_succ
     assert made.task == make_task("turn", duration=0.2)
 
 
-def test_easier_speeds_are_drawn_first(constants):
-    constants(RAMPS={"max_speed": (2.5, 0.1)})
-    made = backwards(num_envs=200)
-    assert 2.0 <= float(made.state.c.min()) < float(made.state.c.max()) <= 2.5
-
-
 def test_shaping_adds_up_to_the_potential_of_the_start(constants):
     gamma = 0.9
     constants(RAMPS={})  # the same episodes are drawn
@@ -124,19 +111,6 @@ def test_shaping_adds_up_to_the_potential_of_the_start(constants):
     assert bool(results[-1].truncated.all())
     rest = made.task.goal_distance(results[-1].final_x.unbind(0), start.c.unbind(0))
     torch.testing.assert_close(total, curricula._SHAPING * (distance - gamma**steps * rest), rtol=1e-4, atol=1e-3)
-
-
-def test_a_terminal_state_has_no_potential():
-    made = backwards(gamma=1.0)
-    x = torch.tensor([0.0, 0, 1.39, 0, 0, 0, 5.0, 0])[:, None].repeat(1, made.num_envs)  # about to fall
-    made.reset(x=x, c=torch.full((1, made.num_envs), 3.0))
-    plain = batch(pay=False)
-    plain.reset(x=x, c=torch.full((1, made.num_envs), 3.0))
-    ours, theirs = run(made, 1)[0], run(plain, 1)[0]
-    assert bool(ours.failure.all())
-    distance = curricula._SHAPING * made.task.goal_distance(x.unbind(0), torch.full((1, 6), 3.0).unbind(0))
-    dearer = curricula._EARLY_FAILURE_PRICE - curricula.FAILURE_PRICE
-    torch.testing.assert_close(ours.reward - theirs.reward, distance - dearer)
 
 
 @pytest.mark.parametrize("name", ["stabilize", "turn"])
@@ -171,40 +145,6 @@ def test_half_of_the_episodes_begin_on_optima_with_the_time_that_is_left():
     assert torch.equal(made.state.x[:2, own], torch.tensor([[0.0], [-1.0]]).expand(2, int(own.sum())))
 
 
-def test_episodes_that_begin_on_optima_do_not_make_the_task_harder(constants):
-    constants(ON_OPTIMA=1.0, EPISODES=1, SUCCESS=0.0, OPTIMA_SUCCESS=0.0, RETRIES=0.0, REACH=1.0)
-    made = backwards()
-    made._on_optima.share = 1.0
-    run(made, 10)  # the task's own starts
-    reached = made.difficulty["goal_factor"]
-    run(made, 30)
-    assert reached < 5
-    assert made.difficulty["goal_factor"] == reached
-
-
-def test_episodes_on_optima_begin_ever_earlier_as_they_succeed(constants):
-    constants(ON_OPTIMA=1.0, REACH=0.04, REACH_STEP=0.02, EPISODES=4)
-    made = backwards(num_envs=200)
-    of_four, everywhere = torch.ones(4, dtype=torch.bool), torch.ones(200, dtype=torch.bool)
-    for steps_left in (2, 3, 4, 5):
-        made.step(torch.zeros(200, 2))
-        made._start_on_optima(everywhere)
-        assert int((5 - made.state.steps).max()) == steps_left
-        made._count_starts(of_four, torch.tensor([True, True, False, False]))
-        assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * steps_left)
-        made._count_starts(of_four, torch.tensor([True, True, True, False]))
-        assert made.difficulty["starts_seconds"] == pytest.approx(0.02 * (steps_left + 1))
-
-
-def test_no_episode_begins_on_an_optimum_once_the_task_is_its_own(constants):
-    constants(ON_OPTIMA=1.0, RETRIES=0.0)
-    made = backwards(num_envs=50)
-    run(made, made.task.steps)
-    assert (made._kind == curricula._ON_OPTIMUM).all()
-    run(of_its_own(made), made.task.steps)
-    assert (made._kind == curricula._OWN).all()
-
-
 def test_a_share_of_the_episodes_repeats_starts_that_went_wrong(constants):
     constants(ON_OPTIMA=0.0, RAMPS={})
     made = backwards(num_envs=400)
@@ -230,40 +170,6 @@ def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     assert starts.x[:2, 0].tolist() == [0.0, -1.0]
     assert float(starts.x[5, 0]) == pytest.approx(float(starts.c[0, 0]))
     assert not task.is_goal(starts.x[:, -1].numpy(), starts.c[:, -1].numpy())
-
-
-def test_optima_with_a_reserve_end_deeper_in_the_goal():
-    task = make_task("turn", duration=8.0)
-
-    def last_excess(reserve):
-        starts = curricula.optimal_starts(task, default_params(), 1, 100, reserve)
-        return max(float(excess) for excess in task.goal(starts.x[:, -1], starts.c[:, -1]))
-
-    assert last_excess(0.5) < last_excess(0.0)
-
-
-@pytest.mark.parametrize(
-    ("share", "over", "retried"), [(0.99, True, 0.1), (0.99, False, 0.4), (0.5, True, 0.4), (1.0, True, 0.0)]
-)
-def test_fewer_starts_are_repeated_as_fewer_go_wrong(share, over, retried):
-    made = backwards()
-    assert made._retried_share == 0.4  # nothing is known yet
-    made._own_episodes.share = share
-    if over:
-        of_its_own(made)._has_settled = True
-    assert made._retried_share == pytest.approx(retried)
-
-
-@pytest.mark.parametrize(("over", "price"), [(True, curricula.FAILURE_PRICE), (False, curricula._EARLY_FAILURE_PRICE)])
-def test_a_failure_has_its_last_price_once_the_curriculum_is_over(over, price, constants):
-    constants(SHAPING=0.0)
-    made = backwards(duration=2.0)
-    if over:
-        of_its_own(made)._has_settled = True
-    results = [made.step(torch.ones(made.num_envs, 2)) for _ in range(made.task.steps - 1)]
-    fell = torch.cat([result.reward[result.failure] for result in results])
-    assert len(fell) >= made.num_envs
-    assert fell == pytest.approx(-price, abs=10.0)  # besides the cost of the step
 
 
 def test_the_curriculum_is_over_once_enough_episodes_of_the_task_itself_succeed(constants):

@@ -13,7 +13,7 @@ import minari
 import numpy as np
 import pytest
 
-from ballbot_baselines import CONTROLLERS, trajopt
+from ballbot_baselines import trajopt
 from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.env import BallbotEnv, make_task
@@ -112,26 +112,6 @@ def test_a_finished_dataset_is_kept_and_another_never_overwrites_it(tmp_path):
     with pytest.raises(ValueError, match="NAME-vNUMBER"):
         make(tmp_path / "unversioned")
     assert [path.name for path in tmp_path.iterdir()] == ["kept-v0"]
-
-
-class Damper:
-    """A controller that takes no back-off and makes no plan."""
-
-    def __init__(self, task, params):
-        pass
-
-    def reset(self, t, x, c):
-        pass
-
-    def act(self, t, x):
-        return -100 * x[4:6]
-
-
-def test_a_new_controller_can_demonstrate(tmp_path, monkeypatch):
-    monkeypatch.setitem(CONTROLLERS, "damper", Damper)
-    folder = make(tmp_path / "damped-v0", expert="damper")
-    data = minari.MinariDataset(folder / "data")
-    assert {m["expert"] for m in data.storage.get_episode_metadata(data.episode_indices)} == {"damper"}
 
 
 def test_a_policy_that_comes_with_the_package_can_demonstrate(tmp_path):

@@ -63,13 +63,6 @@ def digest(task, physics):
 # --- Gymnasium's rules ---
 
 
-def test_every_task_is_registered_under_its_id(task, physics):
-    env = gymnasium.make(task.id, physics=physics)
-    assert isinstance(env.unwrapped.task, type(task))
-    assert env.spec.id == task.id
-    env.close()
-
-
 OWN = replace(default_params(), body_mass=12.0)
 VARIED = Randomization(body_mass=(0.8, 1.2), lean_noise=0.01)
 
@@ -107,11 +100,6 @@ def test_the_spec_of_an_env_makes_the_same_env_again(keywords, through):
         vector.close()
 
 
-def test_of_a_range_as_a_list_the_same_randomization_is_made():
-    assert Randomization(body_mass=[1, 1]) == Randomization()
-    assert not Randomization(body_mass=[1.0, 1.0]).active
-
-
 def test_a_reward_threshold_is_of_the_papers_robot_alone():
     for keywords, threshold in (
         ({}, Stabilize.reward_threshold),
@@ -124,7 +112,7 @@ def test_a_reward_threshold_is_of_the_papers_robot_alone():
 @pytest.mark.parametrize(
     ("mode", "limit", "steps"),
     [
-        *((mode, 7, 7) for mode in (None, "sync", "async", "vector_entry_point")),
+        *((mode, 7, 7) for mode in (None, "sync", "vector_entry_point")),
         *((mode, limit, 20) for mode in (None, "vector_entry_point") for limit in (1000, -1, None)),
     ],
 )
@@ -156,11 +144,11 @@ def test_gymnasium_checker_has_no_complaint(task, physics):
         env.close()
 
 
-def test_stable_baselines3_checker_has_no_complaint(task, physics):
+def test_stable_baselines3_checker_has_no_complaint(task):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make(task.id, physics=physics)
+        env = gymnasium.make(task.id, physics="rk4")
         checker.check_env(env.unwrapped, warn=True, skip_render_check=True)
         env.close()
 
@@ -186,23 +174,6 @@ def test_return_and_cost_recomputed_from_states_and_forces_add_up_to_the_surviva
         # random forces topple it, so that a failure's price is among what was summed
         assert info["cost"] == pytest.approx(running + task.survival_reward * (task.duration - lived))
         assert total + cost == pytest.approx(task.survival_pay, rel=1e-12)  # the order of additions differs
-
-
-def test_success_is_told_under_the_name_that_stable_baselines3_looks_for(make_env):
-    env = make_env(physics="rk4", duration=0.1)
-    _, info = env.reset(options={"state": UPRIGHT})
-    infos = [info, *(step[-1] for step in play(env, [[0.0, 0.0]] * 5))]
-    assert [info["is_success"] for info in infos] == [info["success"] for info in infos] == [False] * 5 + [True]
-
-
-def test_reset_costs_nothing_and_reports_the_start(task, physics, make_env):
-    env = make_env(task, physics=physics)
-    observation, info = env.reset(seed=1)
-    assert info["cost"] == 0
-    assert not any(info[name] for name in ("success", "failure", "clipped"))
-    np.testing.assert_array_equal(info["force"], [0, 0])
-    expected = task.observe(info["state"], info["constants"])
-    np.testing.assert_array_equal(observation, np.float32(expected))
 
 
 def test_observation_is_the_tasks_of_the_state_reported(task, physics, make_env):
@@ -312,7 +283,8 @@ def test_stabilize_succeeds_if_it_rests_at_the_end_and_not_before(make_env, phys
     env = make_env(physics=physics, duration=0.1)
     env.reset(options={"state": UPRIGHT})
     steps = play(env, [[0.0, 0.0]] * 9)
-    assert [step[-1]["success"] for step in steps] == [False] * 4 + [True]
+    for name in ("success", "is_success"):  # as Stable-Baselines3 looks for it
+        assert [step[-1][name] for step in steps] == [False] * 4 + [True]
     env.reset(options={"state": [0.2, 0, 0, 0, 0, 0, 0, 0]})
     assert not play(env, [[0.0, 0.0]] * 9)[-1][-1]["success"]
 
@@ -328,12 +300,6 @@ def test_turn_ends_in_success_at_the_gate_at_no_further_cost(make_env, physics):
     assert info["cost"] == pytest.approx(env.task.time_weight * env.task.control_dt)
     assert info["reward_goal"] == pytest.approx(env.task.survival_reward * (env.task.duration - env.task.control_dt))
     assert reward == pytest.approx(env.task.survival_pay - info["cost"])
-
-
-def test_turn_is_no_success_at_the_gate_in_the_wrong_direction(make_env):
-    env = make_env("turn", physics="rk4")
-    env.reset(options={"constants": {"speed": 3.0}, "state": [1.0, 0.0, 0, 0, 0, 3.0, 0, 0]})
-    assert not env.step([0.0, 0.0])[-1]["success"]
 
 
 def test_touching_an_obstacle_with_the_balls_rim_fails(make_env, physics):
@@ -365,13 +331,6 @@ def test_action_beyond_one_is_clipped_and_info_says_so(task, physics, make_env):
     np.testing.assert_array_equal(beyond["state"], limit["state"])
 
 
-@pytest.mark.parametrize("action", [np.array([0.25, -0.5], np.float32), [0.25, -0.5], (0.25, -0.5)])
-def test_action_is_the_force_in_units_of_the_limit(make_env, action):
-    env = make_env(physics="rk4")
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.step(action)[-1]["force"], [87.5, -175.0])
-
-
 def test_bad_action_is_refused_and_changes_nothing(make_env, physics):
     env = make_env(physics=physics)
     env.reset(seed=0)
@@ -384,11 +343,6 @@ def test_bad_action_is_refused_and_changes_nothing(make_env, physics):
 
 
 # --- bad input ---
-
-
-def test_unknown_task_field_through_gymnasium_make_is_a_type_error(task):
-    with pytest.raises(TypeError, match=f"{task.id} got an unexpected keyword argument 'colour'; it has"):
-        gymnasium.make(task.id, colour="red")
 
 
 def test_step_after_the_end_is_refused(physics, make_env):
@@ -490,13 +444,12 @@ def test_keys_push_in_the_directions_of_the_picture(make_env):
     assert ahead[0] * left[1] - ahead[1] * left[0] > 0  # left is left of ahead
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_gymnasium_plays_every_task(name, monkeypatch):
+def test_gymnasium_plays_it(monkeypatch):
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     from gymnasium.utils.play import play
 
-    env = gymnasium.make(TASKS[name].id, render_mode="rgb_array", physics="rk4")
+    env = gymnasium.make("BallbotTurn-v0", render_mode="rgb_array", physics="rk4")
     forces = []
 
     def quit_after_three_steps(*step):
@@ -509,21 +462,9 @@ def test_gymnasium_plays_every_task(name, monkeypatch):
     env.close()
 
 
-def test_render_without_a_mode_warns(make_env):
-    env = make_env(physics="rk4")
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert env.render() is None
-
-
 def test_render_before_reset_is_refused(make_env):
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"render\(\) before reset"):
         make_env(render_mode="rgb_array").render()
-
-
-def test_frame_rate_is_that_of_the_control_steps(make_env):
-    assert make_env(physics="rk4").metadata["render_fps"] == 50
-    assert make_env(physics="rk4", control_dt=0.04).metadata["render_fps"] == 25
 
 
 if __name__ == "__main__":  # the other process of test_same_seed_is_bit_identical_across_processes

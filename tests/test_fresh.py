@@ -48,11 +48,6 @@ def test_fresh_episodes_are_neither_certified_nor_for_validation_nor_of_another_
     assert len(np.unique(starts, axis=0)) == 3 * count + len(episodes)
 
 
-def test_more_fresh_episodes_begin_with_the_same_ones(task):
-    for few, many in zip(fresh.draw(task, range(3), 7), fresh.draw(task, range(8), 7), strict=True):
-        np.testing.assert_array_equal(few, many[:3])
-
-
 def test_every_task_measures_its_episodes_in_finite_numbers(task):
     for x, c in zip(*fresh.draw(task, range(20), 0), strict=True):
         assert all(math.isfinite(value) for value in task.measures(x, c, default_params()).values())
@@ -176,12 +171,6 @@ def test_bins_are_drawn_for_every_measure():
     result = evaluate_fresh("shac", "stabilize", 30)
     drawn = figures.fresh_figure(result, result.bins())
     assert len(drawn.axes) >= 3 * len(result.measures)
-
-
-def test_a_policy_file_names_its_task(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    evaluate(str(shipped_policies(Turn())["dagger"]), fresh=10, out=tmp_path / "out")
-    assert json.loads((tmp_path / "out" / "fresh.json").read_text())["about"]["task"] == "turn"
 
 
 def test_what_does_not_act_is_refused():

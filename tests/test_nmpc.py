@@ -121,17 +121,6 @@ def test_one_iteration_per_step_is_nearly_as_good_as_converging(make_env):
     assert costs[0] == pytest.approx(costs[1], rel=0.01)
 
 
-def test_converged_solution_no_longer_changes(params):
-    controller = NmpcController(Stabilize(), params, iterations=20)
-    controller.reset(0.0, REST, NO_CONSTANTS)
-    x = pushed(3.0, 0.8)
-    first = controller.act(0.0, x)
-    needed = controller.counts.iterations
-    assert 1 < needed < 20
-    np.testing.assert_allclose(controller.act(0.0, x), first, atol=0.1)
-    assert controller.counts.iterations == needed + 1
-
-
 class AtRest:
     """A controller that planned to stand still, and does not know what hit the robot."""
 
@@ -198,13 +187,6 @@ def test_delay_that_is_known_costs_little(make_env):
     # what cannot be avoided is the start without force
     unavoidable = late.cost / known.costs[2] - 1
     assert aware == pytest.approx(unavoidable, abs=0.03)
-
-
-def test_delay_that_is_not_known_costs_more(make_env):
-    task = Stabilize()
-    aware, *_ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2), delay=0.04)
-    unaware, *_ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2))
-    assert unaware > aware
 
 
 def coasted(params, x, steps):

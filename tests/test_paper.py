@@ -147,12 +147,6 @@ def test_papers_straight_line_guess_leads_to_the_same_optimum(plan_of, params, n
     assert plan.iterations <= 60
 
 
-@pytest.mark.parametrize(("name", "share"), [("stabilize-5", 0.5), ("stabilize-5", 1.5), ("turn-3", 1.5)])
-def test_straight_line_may_take_half_as_long_again_or_half_as_long(plan_of, params, name, share):
-    plan = solve(PAPER_PROBLEMS[name].problem, params, line_of(name, params, share * LINES[name]), "fatrop")
-    assert plan.cost == pytest.approx(plan_of(name).cost, rel=1e-7)
-
-
 def test_collocation_error_shrinks_as_knots_are_added(plan_of, params):
     for name, factor in (("stabilize-1", 4), ("turn-3", 4), ("stabilize-5", 2)):
         coarse, entry = plan_of(name), PAPER_PROBLEMS[name]
@@ -213,13 +207,6 @@ def test_guess_stays_within_force_and_lean(params):
     assert np.abs(u).max() <= params.force_limit
     assert np.abs(x[1:, 2:4]).max() <= 1
     np.testing.assert_array_equal(x[0], np.arange(8.0))
-
-
-def test_resampling_keeps_the_ends_and_straight_lines():
-    values = np.column_stack([np.linspace(0, 1, 5), np.linspace(3, -1, 5)])
-    np.testing.assert_allclose(
-        guesses.resampled(values, 10), np.column_stack([np.linspace(0, 1, 11), np.linspace(3, -1, 11)])
-    )
 
 
 def test_plan_is_tracked_within_a_centimetre_in_bullet(plan_of, params):

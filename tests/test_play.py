@@ -17,16 +17,22 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.play import views
+from ballbot_train.play import crew, views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.play.tunable import Tunable, weight_names
 from ballbot_train.play.world import PLANT, randomization
-from ballbot_train.policy_files import BEST, PolicyError
+from ballbot_train.policy_files import BEST
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
+
+
+@pytest.fixture
+def no_optimum(monkeypatch):
+    """The optimum of the episode is not searched, which would compile a problem that no other test solves."""
+    monkeypatch.setattr(crew, "_optimum_costs", lambda task, *problem: np.zeros(task.steps + 1))
 
 
 @pytest.fixture
@@ -75,17 +81,6 @@ def test_the_optimum_costs_what_is_certified(play):
     assert 0 < early < playground.optimum_cost_so_far < playground.optimum_cost
 
 
-def test_a_push_makes_the_robot_lean(play):
-    playground = play()
-    go(playground, 7.0)
-    before = playground.main.samples[-1].tilt
-    playground.push(30.0, 0.0)
-    go(playground, 0.2)
-    assert before < math.radians(0.5)
-    assert max(sample.tilt for sample in list(playground.main.samples)[-10:]) > math.radians(5)
-    assert views.drawing(playground).robots[-1].push is not None
-
-
 def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shipped_policy(play):
     playground = play(controller=None, ghosts=["lqr"], episode="rest")
     assert playground.main.name == BEST["stabilize"]
@@ -120,17 +115,6 @@ def test_ghosts_get_the_same_start_and_the_same_pushes(play):
     ghost, main = playground.crew.runners[1], alone.main
     np.testing.assert_array_equal(ghost.x, main.x)
     assert playground.main.x != ghost.x
-
-
-def test_a_ghost_that_is_added_begins_where_the_robot_is(play):
-    playground = play()
-    go(playground, 0.5)
-    here = playground.main.x
-    playground.set_ghosts(["you"])
-    assert playground.crew.runners[1].x == here
-    playground.settle()
-    go(playground, 0.1)
-    assert playground.crew.ghosts == ("you",)
 
 
 def test_controllers_change_without_a_jump(play):
@@ -176,14 +160,6 @@ def test_after_a_fall_the_same_episode_begins_again(play):
     assert playground.episode == FALLING
 
 
-def test_next_begins_the_next_certified_episode(play):
-    playground = play(episode=FALLING)
-    playground.at_end = "next"
-    for _ in range(110):
-        playground.step()
-    assert playground.episode == FALLING + 1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
@@ -209,15 +185,6 @@ def test_lqr_reacts_to_a_weight(play):
     playground.set_weight("effort_weight", playground.world.base.effort_weight)
     playground.settle()
     np.testing.assert_allclose(playground.main.controller.act(0.0, np.ones(8)), before)
-
-
-def test_the_cost_so_far_is_counted_with_the_new_weights(play):
-    playground = play()
-    go(playground, 0.5)
-    before = playground.main.cost
-    for name in weight_names(playground.world.base):
-        playground.set_weight(name, 2 * getattr(playground.world.base, name))
-    assert playground.main.cost == pytest.approx(2 * before)
 
 
 def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
@@ -268,7 +235,7 @@ def test_a_stick_reaches_no_farther_than_one():
 
 
 @pytest.mark.parametrize(("physics", "seed"), [("rk4", 0), ("bullet", 1)])
-def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
+def test_an_episode_of_another_robot_is_that_of_the_env(play, no_optimum, seed, physics):
     if physics == "bullet":
         pytest.importorskip("pybullet")
     playground = play(robot="rolling", episode=None, seed=seed, physics=physics)
@@ -282,7 +249,7 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
     assert (score.failure != "") == expected.failure
 
 
-def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, interpreted):
+def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, no_optimum):
     playground = play(controller="lqr", ghosts=["you", "shac"])
     playground.set_robot("kugle")
     playground.settle()
@@ -354,14 +321,6 @@ def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_m
     assert playground.crew.notice == ""
     playground.set_task("orbit")  # its observations are others
     assert saved_model not in playground.controllers
-
-
-def test_a_file_that_was_used_once_is_offered_from_then_on(play, saved_model):
-    playground = play(ghosts=[saved_model])
-    playground.set_ghosts([])
-    assert saved_model in playground.controllers
-    with pytest.raises(PolicyError, match="gone"):
-        play(policies=["gone.pt"])
 
 
 def test_a_controller_that_fails_gives_no_force_and_is_named(play):
@@ -486,19 +445,6 @@ def test_a_short_hold_up_is_caught_up_and_a_long_one_is_given_up():
     assert LATE == 0.02
 
 
-def test_speed_stretches_time_and_a_pause_owes_no_steps():
-    watch = Watch()
-    clock = Clock(0.02, speed=0.5, now=watch)
-    clock.take()
-    watch.now += 0.03
-    assert not clock.take()
-    assert clock.wait() == pytest.approx(0.01)
-    clock.stop()
-    watch.now += 100.0
-    assert clock.take()
-    assert not clock.take()
-
-
 def test_while_a_slider_moves_only_its_last_value_is_worked_on(play, monkeypatch):
     playground, hold, made = play(), threading.Event(), []
 
@@ -538,12 +484,6 @@ def test_a_job_of_another_process_does_not_hold_up_the_end():
     job = background.submit(lambda: background.compute(time.sleep, 60.0))
     background.close()
     assert job.done()
-
-
-def test_a_job_that_raises_gives_its_error():
-    background = Background()
-    assert isinstance(background.submit(lambda: 1 / 0).exception(5), ZeroDivisionError)
-    background.close()
 
 
 def test_every_episode_of_a_track_has_a_robot_of_its_own(play):

@@ -116,28 +116,6 @@ def test_the_optimum_drives_along_its_trajectory_and_costs_what_is_certified(eng
         assert run["costs"][-1] == pytest.approx(episodes.costs[run["episode"]], rel=1e-6)
 
 
-def test_who_leans_towards_the_goal_comes_to_rest_on_it(engine, tmp_path):
-    script = """
-    const driver = new Driver();
-    const thrown = DATA.scenarios.find(({ title }) => title === "Throw");
-    const [mine] = robotsOf(thrown, null, driver);
-    while (mine.steps < 400 && !mine.ended) {
-      driver.hold(...[0, 1].map((i) => -0.1 * mine.x[i] - 0.25 * mine.x[4 + i]));
-      mine.advance();
-    }
-    driver.hold(3, 4);
-    const bounded = driver.goal;
-    driver.hold(NaN, 1);
-    answer({ x: mine.x, ended: mine.ended, share: mine.cost / thrown.optimum, bounded, nothing: driver.goal });
-    """
-    found = run_in_node(engine + script, tmp_path)
-    assert found["ended"] == ""
-    assert np.abs(found["x"]).max() < 0.1  # it still creeps
-    assert 1 < found["share"] < 2
-    assert found["bounded"] == pytest.approx([0.6, 0.8])
-    assert found["nothing"] == [0, 0]
-
-
 HASHES = [
     "",
     "#",
@@ -349,17 +327,6 @@ def test_the_page_is_the_same_every_time(page):
     assert playground.playground_page() == page.read_text()
 
 
-def test_two_policies_of_one_task_are_refused():
-    with pytest.raises(ValueError, match="both policies for stabilize"):
-        engine_script([str(SHIPPED / "stabilize-ppo.json"), str(SHIPPED / "stabilize-sac.json")])
-
-
-def test_saved_models_of_other_libraries_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(playground, "task_name", lambda policy, task: "stabilize")
-    with pytest.raises(ValueError, match="saved model of another library"):
-        engine_script([str(tmp_path / "model.zip")])
-
-
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
     driver = start_chromium(tmp_path_factory.mktemp("chromium"), "800,600")
@@ -433,19 +400,6 @@ def test_buttons_and_keys_push_along_the_screen_and_a_drag_on_a_robot_pushes_it_
     actions.move_to_element_with_offset(view, int(middle[0] - width / 2), int(middle[1] - height / 2))
     actions.click_and_hold().move_by_offset(120, 0).release().perform()
     assert np.array(opened.execute_script(speed)) @ along > 1
-
-
-def test_a_drag_on_the_floor_turns_the_camera_and_pushes_nobody(opened):
-    from selenium.webdriver import ActionChains
-
-    opened.execute_script("playground.due = null; playground.draw(1)")
-    yaw = opened.execute_script("return playground.scene.camera.yaw")
-    view = opened.find_element("css selector", ".view")
-    ActionChains(opened).move_to_element_with_offset(view, -250, 60).click_and_hold().move_by_offset(
-        50, 10
-    ).release().perform()
-    assert opened.execute_script("return playground.scene.camera.yaw") != yaw
-    assert opened.execute_script("return playground.robots.every(robot => robot.x.every(value => value === 0))")
 
 
 def test_senseless_pushes_do_nothing_and_huge_ones_are_bounded(opened):
@@ -581,16 +535,6 @@ def wait_for(browser, condition, seconds=20):
         time.sleep(0.05)
 
 
-def test_the_page_is_dark_where_the_reader_likes_it_dark(opened):
-    ground = "return getComputedStyle(document.body).backgroundColor"
-    light = opened.execute_script(ground)
-    opened.find_element("css selector", ".theme").click()
-    assert opened.execute_script(ground) != light
-    assert opened.find_element("css selector", ".theme").get_attribute("aria-pressed") == "true"
-    opened.find_element("css selector", ".theme").click()
-    assert opened.execute_script(ground) == light
-
-
 def test_everything_that_can_be_used_has_a_name(opened):
     unnamed = """
     return [...document.querySelectorAll("button, input, select, canvas")].filter((control) =>
@@ -600,9 +544,9 @@ def test_everything_that_can_be_used_has_a_name(opened):
     assert opened.execute_script(unnamed) == []
 
 
-@pytest.mark.parametrize("width", [390, 1400])
-def test_the_page_fits_its_window(browser, page, width):
-    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
+def test_the_page_fits_a_phone(browser, page):
+    width = 390
+    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     browser.get(page.as_uri())
     needed, inner = browser.execute_script("return [document.documentElement.scrollWidth, innerWidth]")

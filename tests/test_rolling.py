@@ -5,25 +5,22 @@ import dataclasses
 import math
 from types import SimpleNamespace
 
-import casadi
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from ballbot_baselines import certification, righting
-from ballbot_baselines.collocation import hermite_simpson
 from ballbot_baselines.linearize import linearize
 from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.paper_problems import between_states
 from ballbot_gym import certified, dynamics
 from ballbot_gym.engines.bullet import BulletContactSimulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.env import BallbotEnv, limit_names, make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, UrdfError, default_params
-from ballbot_gym.robots import ROBOTS, checked_robot, named_robot, robot_name
+from ballbot_gym.robots import ROBOTS, checked_robot, named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import Orbit, Stabilize
 from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
@@ -160,15 +157,6 @@ def test_the_paper_has_no_limits_of_grip(params, rng):
     assert params.moving_mass == params.total_mass
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_a_robots_urdf_is_read_back_exactly(name, tmp_path):
-    robot = named_robot(name)
-    path = tmp_path / "robot.urdf"
-    path.write_text(robot.to_urdf())
-    assert BallbotParams.from_urdf(path) == robot
-    assert robot_name(robot) == name
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -279,12 +267,6 @@ def test_slipping_is_no_failure_in_bullet():
     env.close()
 
 
-def test_the_papers_info_has_no_grip(make_env):
-    env = make_env(physics="rk4")
-    assert "grip" not in env.reset(seed=0)[1]
-    assert limit_names(env.task, env.params) == env.task.limit_names
-
-
 @pytest.mark.parametrize("engine", ["torch", "loop"])
 def test_batches_lose_grip_as_single_envs_do(engine):
     torch = pytest.importorskip("torch")
@@ -340,16 +322,6 @@ def test_nmpc_keeps_the_friction_cone(rolling):
     limits = dynamics.limits(rolling, episode.trajectory.x[:-1], episode.trajectory.u, hold=0.02)
     assert np.min(limits) >= 0
     assert episode.cost == pytest.approx(controller.plan.cost, rel=0.02)
-
-
-def test_every_knot_of_collocation_keeps_the_cone(rolling):
-    problem = between_states("grip", np.zeros(8), np.zeros(8))
-    s, w = casadi.SX.sym("s", 11), casadi.SX.sym("w", 8)
-    rows = [
-        (ocp.inequalities(s, w, casadi.SX(0, 1)).shape[0], ocp.final_inequalities(s, casadi.SX(0, 1)).shape[0])
-        for ocp in (hermite_simpson(problem, robot) for robot in (default_params(), rolling))
-    ]
-    assert rows == [(0, 0), (2, 2)]
 
 
 def test_simulated_recoveries_grip(rolling):

@@ -16,7 +16,7 @@ from ballbot_train.evaluation import fresh
 from ballbot_train.learning import routing
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
+from ballbot_train.policy import PolicyNetwork
 from ballbot_train.policy_files import PolicySpec
 
 TASK, PARAMS = make_task("weave"), default_params()
@@ -111,18 +111,6 @@ def test_routes_learn_to_cost_less_than_the_nearer_sides():
     assert (regrets.min(1) == 0).all()
     learnt = routing.fit_routes(network.routes, TASK, PARAMS, 0, episodes=6000, gradient_steps=1000)
     assert learnt < 0.8 * nearer
-
-
-def test_a_policy_with_routes_is_saved_whole_and_acts_alike_alone_and_in_a_batch(network, slaloms, tmp_path):
-    save_policy(tmp_path / "routed", network, {})
-    loaded = load_network(tmp_path / "routed", TASK)
-    observation = observed(*slaloms)
-    with torch.no_grad():
-        expected = network(observation)
-    assert torch.equal(loaded(observation), expected)
-    controller = PolicyController(TASK, PARAMS, loaded)
-    for seen, action in zip(observation.numpy(), expected.numpy(), strict=True):
-        np.testing.assert_allclose(controller.predict(seen)[0], action, atol=1e-6)
 
 
 def test_a_spec_with_routes_needs_a_frame_with_a_route():

@@ -93,15 +93,6 @@ def test_statistics_of_vecnormalize_are_applied(normalized):
     assert policy_digests({"stabilize": [str(path)]}) != before
 
 
-def test_statistics_that_normalize_rewards_alone_change_no_observation(normalized):
-    model, path = normalized
-    venv = model.get_vec_normalize_env()
-    venv.norm_obs = False
-    save_vecnormalize(venv, path.with_suffix(""))
-    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
-    np.testing.assert_allclose(acts(path), np.clip(expected, -1, 1), atol=1e-5)
-
-
 def test_a_model_whose_statistics_are_missing_is_refused_with_how_to_write_them(normalized):
     _, path = normalized
     with pytest.raises(PolicyError, match=r"was trained with VecNormalize, and .*save_vecnormalize"):

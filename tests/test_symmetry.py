@@ -12,7 +12,7 @@ from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.fitting import Fit
 from ballbot_train.learning.learners.shac import Shac, ShacConfig
-from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
+from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 MIRRORED = [(name, i) for name, kind in TASKS.items() for i in range(len(kind().mirrors))]
 
@@ -143,32 +143,6 @@ def test_the_fine_gate_shows_leans_and_their_rates_in_units_of_the_tolerances():
         np.testing.assert_allclose(fine, 0.5**0.5 * (np.array([2, 3, 6, 7]) == state), atol=1e-6)
 
 
-def test_the_fine_gate_shows_the_speed_in_steps_that_are_not_sharp():
-    task = TASKS["turn"]()
-    state = np.array([0.3, -0.5, 0.1, 0.2, 1, 3, 0.5, 0.6])
-
-    def seen(name, speed):
-        return np.array(FRAMES[name].features(tuple(task.observe(state, np.array([speed]))))[0])
-
-    assert len(seen("fine_gate", 4.0)) == FRAMES["fine_gate"].size
-    for speed in (2.0, 3.95, 4.23, 8.0):
-        sharp, smooth = seen("gate", speed), seen("fine_gate", speed)[:-4]
-        np.testing.assert_array_equal(smooth[:9], sharp[:9])
-        np.testing.assert_array_equal(smooth[22:], sharp[22:])
-        assert (np.sign(smooth[9:22]) == np.sign(sharp[9:22])).all()
-    assert np.abs(seen("fine_gate", 4.201) - seen("fine_gate", 4.199))[9:22].max() < 0.02
-    assert np.abs(seen("gate", 4.201) - seen("gate", 4.199))[9:22].max() == 1
-
-
-def test_a_fine_frame_shows_what_the_task_or_its_frame_shows(params, rng):
-    for task, added in ((TASKS["stabilize"](), 6), (TASKS["weave"](), 6)):
-        seen = tuple(task.observe(*task.sample(rng, params)))
-        shown = seen if task.frame is None else FRAMES[task.frame].features(seen)[0]
-        fine = FRAMES[task.fine_frame].features(seen)[0]
-        assert fine[:-added] == tuple(shown)
-        assert len(fine) == FRAMES[task.fine_frame].size
-
-
 def test_the_radial_frame_shows_small_errors_and_none_on_a_steady_orbit(params, rng):
     task = TASKS["orbit"]()
     frame = FRAMES[task.frame]
@@ -216,29 +190,6 @@ def test_policies_that_are_fitted_or_follow_gradients_have_the_symmetry_that_is_
     for network in (Fit(task, params, symmetry, (8,), 0).network, Shac(task, params, config).network):
         assert network.spec == spec_for(task, symmetry, (8,), linear=True)
         assert network.spec.squash == "tanh"
-
-
-def test_where_the_policy_sees_the_frame_the_critic_of_shac_does_too(params, rng):
-    task = TASKS["weave"]()
-    critic = Shac(task, params, ShacConfig(num_envs=2, hidden=(8,), symmetry="frame")).critic
-    torch.nn.init.normal_(critic.mlp[-1].weight)  # it starts at zero
-    seen = torch.tensor(np.array([task.observe(*task.sample(rng, params)) for _ in range(20)]), dtype=torch.float32)
-    signs = torch.tensor(task.observation_signs(task.mirrors[0]))
-    value, image = critic(seen), critic(signs * seen)
-    torch.testing.assert_close(image, value)
-    assert value.std() > 0
-
-
-@pytest.mark.parametrize("fields", [{"mirrors": True}, {"frame": "radial"}])
-def test_a_policy_file_keeps_frame_and_mirror_images(fields, tmp_path, rng):
-    task = TASKS["orbit"]()
-    if "mirrors" in fields:
-        fields = {"mirrors": tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)}
-    network = PolicyNetwork(PolicySpec.of(task, hidden=(16,), **fields))
-    again = load_network(save_policy(tmp_path / "policy", network, {}), task)
-    observation = torch.as_tensor(rng.normal(size=(50, 13)), dtype=torch.float32)
-    assert again.spec == network.spec
-    assert torch.equal(again(observation), network(observation))
 
 
 def steady_motion(task, c, params, rng):

@@ -1,6 +1,4 @@
-import ast
 import dataclasses
-import inspect
 import math
 import re
 
@@ -10,7 +8,7 @@ import pytest
 from ballbot_gym import dynamics
 from ballbot_gym.env import make_task
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.tasks.base import Reference, Task
+from ballbot_gym.tasks.base import Reference
 from ballbot_gym.tasks.orbit import Orbit, orbit_speed, orbit_tilt, steady_orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
@@ -132,10 +130,6 @@ def test_weave_margin_is_about_the_distance_from_rim_to_rim(params):
         assert margin == pytest.approx(gap, rel=0.05)  # exact but for gap²/2R
 
 
-def test_weaves_ball_is_as_big_as_the_robots(params):
-    assert Weave().ball_radius == params.ball_radius
-
-
 def test_goal_of_a_resting_task_is_rest_there(params):
     for task, c in ((Stabilize(), ()), (Weave(), tuple(draw(Weave(), params, 1)[1][0]))):
         x = np.zeros(8)
@@ -187,13 +181,6 @@ def test_sampled_constants_are_named_and_accepted(task, params):
         task.check_constants(constants, params)
 
 
-def test_sampled_observations_fit_the_space_by_far(task, params):
-    x, c = draw(task, params, 500)
-    observations = task.observe(x, c)
-    assert observations.shape == (500, len(task.observation_scale))
-    assert np.abs(observations).max() < 20  # scaled to order 1
-
-
 def test_the_fastest_way_out_of_the_arena_stays_in_the_space(task, make_env, params):
     # 20 m/s² until the edge, about what 350 N can do, from a lean that holds it
     env = make_env(task, physics="rk4")
@@ -213,13 +200,6 @@ def test_the_fastest_way_out_of_the_arena_stays_in_the_space(task, make_env, par
 def far_away(task):
     """Constants with nothing in the way of a drive along x at y = 1.5 m."""
     return {"orbit": {"radius": 3.0}}.get(next(name for name, kind in TASKS.items() if isinstance(task, kind)), {})
-
-
-def test_env_draws_what_the_task_samples(task, make_env, params):
-    _, info = make_env(task, physics="rk4").reset(seed=11)
-    x, c = task.sample(np.random.default_rng(11), params)
-    np.testing.assert_array_equal(info["state"], x)
-    np.testing.assert_array_equal(info["constants"], c)
 
 
 def test_batches_and_torch_draw_the_same_episodes_as_single_robots(task, params, rng):
@@ -390,18 +370,6 @@ def test_field_that_is_not_positive_is_named(task, value):
             dataclasses.replace(task, **{field.name: value})
 
 
-def test_tasks_are_values(task):
-    same = type(task)()
-    assert same == task
-    assert hash(same) == hash(task)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        task.duration = 1.0
-
-
-def test_ids_are_unique_and_say_the_name():
-    assert [task.id for task in TASKS.values()] == [f"Ballbot{name.capitalize()}-v0" for name in TASKS]
-
-
 def test_task_is_made_by_name_with_its_fields():
     assert make_task("stabilize", duration=4.0) == Stabilize(duration=4.0)
     assert make_task(Stabilize(duration=4.0)) == Stabilize(duration=4.0)
@@ -430,25 +398,9 @@ def test_docstring_tabulates_every_observation_with_its_scale(task):
     assert f"float32 ({len(task.observation_scale)},)" in task.__doc__
 
 
-def test_docstring_tabulates_every_constant(task):
-    first_cells = " ".join(cells[0] for cells in table_rows(task.__doc__))
-    for name in task.constant_names:
-        generic = re.sub(r"\d+", "{i}", name)
-        stem, _, last = generic.rpartition("_")
-        assert name in first_cells or generic in first_cells or (stem in first_cells and f"_{last}" in first_cells)
-
-
 def test_docstring_names_every_argument(task):
     missing = [field.name for field in dataclasses.fields(task) if field.name not in task.__doc__]
     assert missing == []
-
-
-def test_every_field_has_a_docstring():
-    for cls in (Task, *TASKS.values()):
-        (body,) = [node for node in ast.parse(inspect.getsource(cls)).body if isinstance(node, ast.ClassDef)]
-        for statement, following in zip(body.body, body.body[1:], strict=False):
-            if isinstance(statement, ast.AnnAssign):
-                assert isinstance(following, ast.Expr), f"{cls.__name__}.{statement.target.id} has no docstring"
 
 
 # --- one way ---

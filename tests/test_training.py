@@ -70,19 +70,6 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     assert training.score(learner.network, task).cost_ratio < 0.7 * before.cost_ratio
 
 
-def test_shac_starts_a_share_of_its_episodes_where_its_critic_expects_most():
-    task, params = TASKS["stabilize"](), default_params()
-    config = shac.ShacConfig(num_envs=100, hidden=(8,), reset_fraction=0.5, hard_fraction=0.4)
-    learner = shac.Shac(task, params, config)
-    which = torch.arange(100) % 2 == 0
-    before = learner._start
-    seen = learner._new_episodes(which)
-    assert torch.equal(seen[~which], before[~which])
-    costs = learner.target(seen).detach()[which]
-    assert costs[:20].min() > costs[20:].median() * 2
-    assert torch.equal(learner._batch.observe(learner._state), seen)
-
-
 def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
     task, params = TASKS["turn"](), default_params()
     config = shac.ShacConfig(iterations=41, num_envs=4, horizon=2, hidden=(8,))
@@ -231,21 +218,6 @@ def test_of_policies_that_never_succeed_the_one_with_the_least_mean_cost_is_kept
     assert json.loads((tmp_path / "policy.json").read_text())["iteration"] == 1
 
 
-def test_a_policy_of_the_preparation_is_kept_only_until_there_is_a_later_one(short_run, tmp_path, monkeypatch):
-    costs, kept = iter((30.0, 20.0, 25.0)), []
-    monkeypatch.setattr(shac.Shac, "preparation", 1, raising=False)
-    monkeypatch.setattr(training._Run, "_save_policy", lambda run, network: kept.append(run._about()))
-    monkeypatch.setattr(training._Run, "save", lambda run: None)
-    monkeypatch.setattr(
-        training,
-        "score_and_validate",
-        lambda *policy: (training.Score(1.1, 0.1, 0.1, 0.1, 1.0, 0), training.Validation(next(costs), 1.0, 0, 1.0)),
-    )
-    short_run()
-    assert [about["chosen_by"]["cost"] for about in kept] == [30.0, 20.0, 25.0]
-    assert [about["iteration"] for about in kept] == [0, 1, 2]
-
-
 def parsed(command):
     """Learner, options of the run and settings that a recorded command gives."""
     words, calls = shlex.split(command), []
@@ -301,16 +273,6 @@ def test_every_setting_says_what_it_is():
     for algorithm in LEARNERS.values():
         config = getattr(importlib.import_module(algorithm.module), algorithm.config)
         assert {field.name for field in fields(config)} <= set(meanings_of(config))
-
-
-def test_help_of_train_imports_no_torch():
-    command = str(SHIPPED.parent / "commands" / "train.py")  # as a file: the package may import other commands
-    code = (
-        f"import runpy, sys\nparse = runpy.run_path({command!r})['parse']\n"
-        "try: parse(['--help'], None)\nexcept SystemExit: pass\n"
-        "assert not {'torch', 'casadi', 'stable_baselines3'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
 class Stand(Stabilize):
