@@ -80,18 +80,14 @@ ENVS = [
     (lambda f: env(physics="dart"), "unknown physics 'dart'; known: 'bullet', 'mujoco', 'rk4'"),
     (lambda f: env(render_mode="ascii"), "unknown render_mode 'ascii'; known"),
     (lambda f: env(frameskip=4), "got an unexpected keyword argument 'frameskip'; it has"),
-    (lambda f: env(params={"body_mass": 12.0}), "params must be a BallbotParams, for instance dataclasses.replace("),
     (lambda f: env(randomization={"lean_noise": 0.1}), "randomization must be a Randomization, for instance"),
     (lambda f: env(physics_dt=0.003), "physics_dt = 0.003 s must be a whole fraction"),
     (lambda f: env(physics_dt=1e-30), "at least 1/10000 of it"),
     (lambda f: env(physics_dt="0.001"), "physics_dt must be a number of seconds, not '0.001'"),
     (lambda f: env(task=make_task("turn"), duration=4.0), "fields ['duration'] cannot be given together with a Task"),
     (lambda f: started(seed=-1), "-1"),
-    (lambda f: started(options=[1]), "options must be a dict with 'state' and 'constants', not [1]"),
     (lambda f: started(options={"sate": np.zeros(8)}), "unknown reset options ['sate']; known: 'state', 'constants'"),
     (lambda f: started(options={"state": np.zeros(7)}), "state must be 8 finite numbers"),
-    (lambda f: started(options={"state": [0, 0, 1.5, 0, 0, 0, 0, 0]}), "tilt 85.9° of at most 80.0°"),
-    (lambda f: started(options={"constants": [0.0] * 99}), "constants must be"),
     (constants("stabilize", colour=1.0), "has no constants ['colour']; its episodes have none"),
     (lambda f: started(options={"state": [1e200] + [0.0] * 7}), "state must be numbers within ±1e+06"),
     (constants("turn", sped=3.0), "has no constants ['sped']; it has ['speed']"),
@@ -109,13 +105,8 @@ ENVS = [
 NO_REAL_NUMBERS = {
     "complex": lambda zeros: [complex(zero) for zero in zeros],
     "complex array": lambda zeros: np.array(zeros, complex),
-    "complex number": lambda zeros: [1j, *zeros[1:]],
-    "truth values": lambda zeros: [False for _ in zeros],
     "truth array": lambda zeros: np.zeros(len(zeros), bool),
     "words": lambda zeros: ["0" for _ in zeros],
-    "word array": lambda zeros: np.array(["0" for _ in zeros]),
-    "objects": lambda zeros: np.array(zeros, object),
-    "nothing": lambda zeros: [None for _ in zeros],
     "dates": lambda zeros: np.array(["2020" for _ in zeros], "M8[Y]"),
     "masked": lambda zeros: np.ma.masked_array(zeros, [True, *zeros[1:]]),
     "ragged": lambda zeros: [[0.0], *zeros[1:]],
@@ -156,24 +147,19 @@ def test_single_and_vector_envs_clip_the_same_actions(huge):
 
 TASKS = [
     (task("stabilize", duration="8"), "Stabilize: duration must be a number, not '8'"),
-    (task("stabilize", rest_weight=np.float32(math.inf)), "rest_weight must be positive and finite, not inf"),
     (task("stabilize", duration=1e9), "must be 1 to 1,000,000 control steps"),
     (task("stabilize", duration=1.01), "is not a whole number of control steps"),
     (task("stabilize", control_dt=0), "control_dt must be positive and finite, not 0"),
     (task("stabilize", max_tilt=math.pi / 2), "max_tilt must be below 90°"),
     (task("turn", max_speed=200.0), "max_speed 200 must be in order, and at most 12 m/s"),
-    (task("turn", min_speed=9.0, max_speed=3.0), "min_speed 9 and max_speed 3 must be in order"),
     (task("orbit", min_radius=5.0), "min_radius 5 exceeds max_radius 3 m"),
-    (task("orbit", min_steady_tilt=1.0), "min_steady_tilt 1 and max_steady_tilt"),
 ]
 
 ROBOTS = [
     (params(body_mass=math.nan), "body_mass must be positive and finite, not nan"),
     (params(inertia="1"), "inertia must be a number, not '1'"),
-    (lambda f: BallbotParams.from_urdf(gravity=-9.81), "gravity must be positive and finite"),
     (lambda f: BallbotParams.from_urdf(f / "none.urdf"), "none.urdf: no such file"),
     (lambda f: BallbotParams.from_urdf(f), "is no regular file; give the path of a URDF"),
-    (lambda f: BallbotParams.from_urdf("/dev/zero"), "/dev/zero is no regular file"),
     (lambda f: BallbotParams.from_urdf("a\0b"), "give the path of a URDF"),
 ]
 
@@ -217,15 +203,12 @@ def body(old, new):
 
 
 URDFS = [
-    (written("", BallbotParams.from_urdf), "not well-formed XML"),
     (written('<?xml version="1.0" encoding="klingon"?><robot/>', BallbotParams.from_urdf), "not well-formed XML"),
     (written("<robot>" + "<link>" * 100_000 + "</link>" * 100_000 + "</robot>", BallbotParams.from_urdf), "missing"),
     (written("<robot/>", BallbotParams.from_urdf), "joint 'x' is missing"),
     (urdf('<link name="body">', '<link name="ball">'), "link 'ball' is there 2 times"),
     (body("mass value=", 'mass value="inf" was='), "value = 'inf' is not a number"),
     (body("ixx=", 'ixx="1e999" was='), "ixx = '1e999' is not a number"),
-    (body("xyz=", 'xyz="0 0 nan" was='), "xyz = '0 0 nan' is not three numbers"),
-    (urdf("effort=", 'effort="nan" was='), "effort = 'nan' is not a number"),
 ]
 
 RANDOMIZATIONS = [
@@ -233,11 +216,9 @@ RANDOMIZATIONS = [
     (randomization(body_mass=(0.0, 1.0)), "body_mass must be positive factors"),
     (randomization(body_mass=(1.0, 1e300)), "body_mass must be at most 1000"),
     (randomization(lean_noise=-0.1), "lean_noise must be finite and at least 0"),
-    (randomization(lean_noise="0.1"), "lean_noise must be a number, not '0.1'"),
     (randomization(push_interval=0.0), "push_interval must be positive"),
     (randomization(actuator_lag=(-0.1, 0.1)), "actuator_lag must be at least 0"),
     (lambda f: env(randomization=Randomization(actuator_delay=(0.0, 0.03))), "must be whole control steps of 0.02 s"),
-    (lambda f: env(randomization=Randomization(actuator_delay=(0.0, 1e5))), "must be at most 1000 control steps"),
 ]
 
 
@@ -310,7 +291,6 @@ TRAJECTORIES = [
     (trajectory(x=np.zeros((3, 8)) * 1j), "x must be real numbers"),
     (lambda f: Trajectory([0, 1], "rest", np.zeros((1, 2))), "x must be real numbers"),
     (lambda f: Trajectory([0, 1e9], np.zeros((2, 8)), np.zeros((1, 2))).resampled(0.02), "more than 1,000,000 times"),
-    (lambda f: files.read(URDF_PATH, 10), "is larger than 0 MiB, the most that is read"),
 ]
 
 
@@ -331,12 +311,9 @@ SETS = [
         'compute all of it with "ballbot certify --tasks turn"',
     ),
     (lambda f: certified.load(make_task("turn", duration=4.0), "paper"), "was computed for Turn("),
-    (lambda f: certified.load("stabilize", "paper", certified.path_of(make_task("turn"))), "was computed for Turn("),
-    (written(b"garbage", lambda path: certified.load("turn", "paper", path)), "is no evaluation set"),
     (written(bomb(), lambda path: certified.load("turn", "paper", path)), "unpacks to 2384 MiB"),
     (evaluation_set(costs=None), "it has no array costs"),
     (evaluation_set(states=np.zeros((200, 7))), "states has the shape (200, 7)"),
-    (evaluation_set(costs=np.full(200, math.nan)), "costs must be finite numbers"),
     (evaluation_set(lengths=np.array([10**9])), "lengths must be 0 to 400 control steps"),
 ]
 
@@ -375,25 +352,19 @@ POLICIES = [
     (lambda f: load_policy(f / "none.json"), "none.json is not a policy"),
     (policy(text="{"), "holds no JSON"),
     (policy(text="[" * 100_000), "it is nested too deeply"),
-    (policy(text="{}"), "it has no 'spec'"),
     (policy(text='{"spec": 3}'), "its spec is no object"),
-    (policy(task=MISSING), "it has no 'task'"),
     (policy(squash="sigmoid"), "squash must be one of tanh, clip, tanh_in_frame, not 'sigmoid'"),
     (policy(activation="exec"), "activation must be one of tanh, relu, silu, not 'exec'"),
     (policy(linear="false"), "linear must be true or false, not 'false'"),
     (policy(odd=True, activation="relu"), "odd needs the activation tanh"),
-    (policy(centred=True), "centred needs a frame with a steady motion, not None"),
     (policy(hidden=[10**12]), "hidden must be whole numbers from 0 to 1000000"),
     (policy(hidden=[10**6] * 9), "the weights do not fit their description"),
-    (policy(hidden=[4] * 10_000), "at most 64 layers"),
     (policy(observations=9), "takes 9 observations"),
     (policy(observation_version=0), "reads observation version 0"),
     (policy(raw=b"\x80\x04pickled"), "mine.safetensors is not a policy"),
-    (policy(raw=header(b"[" * 100_000)), "mine.safetensors is not a policy"),
     (policy(raw=header({"w": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 4]}}, bytes(4))), "not a policy"),
     (policy(weights=lambda w: {"mlp.0.weight": w["mlp.0.weight"] * math.nan}), "mlp.0.weight holds NaN or infinity"),
     (policy(weights=lambda w: {"mlp.0.bias": torch.full((4,), 3e38)}), "mlp.0.bias holds numbers beyond ±1e+06"),
-    (policy(weights=lambda w: {"mlp.0.bias": torch.zeros(4, dtype=torch.int32)}), "mlp.0.bias holds torch.int32"),
 ]
 
 
@@ -422,14 +393,12 @@ def entry(**changes):
 
 RESULTS = [
     (lambda f: read_results(f), "leaderboard.json: no such file"),
-    (lambda f: read_results(f / "none.csv"), "holds no episodes of a benchmark"),
     (results(lambda text: text[:-5]), "its last line is cut off"),
     (results(lambda text: text.replace("12.0", "12.x", 1)), "holds no episodes of a benchmark"),
     (results(lambda text: text.replace("12.0", "nan", 1)), "has the cost nan"),
     (results(lambda text: "a" * (csv.field_size_limit() + 1) + "\n1\n"), "holds no episodes of a benchmark"),
     (results(lambda text: "[" * 100_000, "leaderboard.json"), "nested too deeply"),
     (entry(optimum=0), "the optimum 0"),
-    (entry(cost="12"), "cost of an episode is '12'"),
 ]
 
 
@@ -452,16 +421,13 @@ DEMOS = [
     (dataset(), 'is no dataset of "ballbot demos"'),
     (dataset("[" * 100_000), "nested too deeply"),
     (dataset('{"demos": 3}'), "not made by ballbot demos"),
-    (dataset(json.dumps(DESCRIBED | {"observation_version": 0})), "holds observations of version 0"),
     (dataset(json.dumps(DESCRIBED)), 'is damaged; make it anew with "ballbot demos"'),
     (lambda f: DemoConfig(episodes=0), "episodes must be 1 to 1000000, not 0"),
     (lambda f: DemoConfig(noise=math.nan), "noise must be finite and at least 0"),
-    (lambda f: DemoConfig(task="dance"), "unknown task 'dance'"),
     (lambda f: DemoConfig(expert="me"), "unknown expert me; known: lqr"),
     (lambda f: write_demos(DemoConfig(), f / "name", 1, lambda n: None), "is named NAME-vNUMBER"),
     (lambda f: write_demos(DemoConfig(), f / "mine-v0", 0, lambda n: None), "workers must be at least 1"),
     (lambda f: Backoff(margin=-0.1), "Backoff: margin must be at least 0"),
-    (lambda f: Backoff(force=math.nan), "Backoff: force must be at least 0 and below 1"),
 ]
 
 
@@ -500,24 +466,18 @@ FINITE = "must be finite numbers within ±1e+06"
 
 BATCHES = [
     (batch(x=lambda x: x * math.nan), f"x {FINITE}"),
-    (batch(x=lambda x: x[:7]), "x must be a tensor of shape (8, 3), not one of shape (7, 3)"),
     (batch(x=lambda x: x + 1.5), "start states of envs [0, 1, 2] violate limits of BallbotTurn-v0"),
     (batch(c=lambda c: c + 23), "speed must be in (0, 12] m/s, not 23"),
-    (batch(c=lambda c: c.repeat(2, 1)), "c must be a tensor of shape (1, 3), not one of shape (2, 3)"),
     (batch(mask=lambda _: [True] * 3), "mask must be a tensor of 3 bools, not [True, True, True]"),
     (batch(seed=lambda _: "abc"), "seed must be a whole number, or one or None for each env, not 'abc'"),
-    (batch(seed=lambda _: [1.5, 2, 3]), "seeds must be whole numbers, not 1.5"),
     (batch(seed=lambda _: [1, 2]), "seed has 2 entries for 3 envs"),
     (batch(seed=lambda _: 2**63), "seeds must be in [0, 2^63)"),
     (batch(seed=lambda _: itertools.count()), "seed has more than 3 entries for 3 envs"),
-    (batch(x=lambda x: x + 0j), "x must be real numbers, not one of shape (8, 3), torch.complex64"),
     (batched([[1.0, 0.0]] * 3), "actions must be a tensor of shape (3, 2), not [[1.0, 0.0]"),
     (batched(torch.zeros(2, 3)), "actions must be a tensor of shape (3, 2), not one of shape (2, 3)"),
-    (batched(torch.zeros(3, 2) + 0j), "actions must be real numbers, not one of shape (3, 2), torch.complex64"),
     (lambda f: BallbotBatch("turn", 10**9), "num_envs must be at most 1048576, not 1000000000"),
     (lambda f: gymnasium.make_vec("BallbotTurn-v0", num_envs=10**9), "num_envs must be at most 1048576"),
     (lambda f: BallbotVectorEnv(2, "turn").reset(options=[1]), "options must be a dict with 'reset_mask' and 'state'"),
-    (lambda f: BallbotVectorEnv(0), "num_envs"),
     (lambda f: BallbotVectorEnv(2, compile="yes"), "compile"),
     (lambda f: BallbotVectorEnv(2, physics="bullet"), 'num_envs=2, vectorization_mode="sync", physics="bullet"'),
     (lambda f: BallbotVectorEnv(2, autoreset_mode="never"), "unknown autoreset_mode 'never'; known: 'NextStep'"),
@@ -562,7 +522,6 @@ def nothing(observation):
 
 EVALUATION = [
     (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, or a list of indices, not 0"),
-    (lambda f: evaluate(nothing, episodes=[]), "episodes is empty; give at least one index"),
     (lambda f: evaluate(nothing, episodes=[0, 0]), "names an episode twice; give each once"),
     (lambda f: evaluate(nothing, episodes=[200]), "indices of episodes must be 0 to 199, not 200"),
     (lambda f: evaluate(nothing, episodes=[0.5]), "indices of episodes must be whole numbers, not 0.5"),
@@ -575,7 +534,6 @@ EVALUATION = [
     (lambda f: evaluate(lambda o: np.zeros(3), episodes=1, physics="rk4"), "action must have shape (2,)"),
     (lambda f: evaluate(lambda o: [math.nan, 0], episodes=1, physics="rk4"), "action must be finite"),
     (lambda f: controllers_of([]), "give at least one task"),
-    (lambda f: controllers_of(["turn", "turn"]), "task turn is given more than once"),
     (lambda f: controllers_of(["turn"], ["lqr", "lqr"]), "controller lqr is given more than once"),
     (lambda f: jobs.run([], f, 0, print), "workers must be at least 1"),
     (written("{", lambda path: jobs.claim(path.parent, {}), jobs.MARKER), "is damaged"),
@@ -616,12 +574,6 @@ TYPED = [
     ("benchmark --tasks dance", "unknown task dance; known: stabilize"),
     ("benchmark --controllers pid", "unknown controller pid; known: lqr"),
     ("benchmark --episodes 0", "episodes must be 1 to 200, not 0"),
-    ("benchmark --workers 0", "workers must be at least 1, not 0"),
-    ("benchmark --physics dart", "invalid choice"),
-    ("robustness --stresses wind", "unknown stress wind; known: push"),
-    ("basins --points 4", "points must be odd, and 3 to 501, not 4"),
-    ("certify --episodes 100000000000", "episodes must be at most 100000, not 100000000000"),
-    ("certify --ray ray://head:10001", "is the address of a Ray client, which is not supported"),
     ("certify --install --shards set", "give --install without --shards"),
     ("certify --episodes 1 --shards nowhere://set", "nowhere://set/stabilize cannot be read"),
     ("train ppo --ray auto", "--ray does the runs of --seeds"),
@@ -630,42 +582,27 @@ TYPED = [
     ("demos --pushes 1e9", "pushes must be at most 50 per second, one in every control step"),
     ("certify --episodes 3 --install", "the package needs sets of 200 episodes"),
     ("paper --only fig9", "unknown problem fig9"),
-    ("optimize dance", "unknown task dance"),
     ("optimize stabilize --duration 1000", "is too long to optimize; give at most 100 s"),
-    ("optimize stabilize --force-limit nan", "force_limit must be positive and finite, not nan"),
-    ("optimize turn --constants sped 3", "has no constants ['sped']; it has ['speed']"),
     ("compare a b", "no such file"),
-    ("replay stabilize --episode 500", "episode must be 0 to 199, not 500"),
-    ("replay stabilize --seconds nan", "seconds must be positive, not nan"),
-    ("replay stabilize --width 3", "width must be 64 to 7680 px"),
     ("replay stabilize --controllers lqr --physics rk4 --format gif --speed 1e-9", "frames; give another speed or fps"),
-    ("demos --expert me", "unknown expert me"),
     ("demos --out mine", "is named NAME-vNUMBER"),
     ("train dance", "unknown learner dance; known: dagger, ppo"),
-    ("train shac --threads 0", "threads must be 1 to"),
     ("train shac --demos x", "shac uses no demonstrations"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),
     ("train dagger --gathering-iterations 0", "gathering_iterations 0 needs demonstrations: give --demos"),
     ("evaluate shac --bins 0", "bins must be at least 1, not 0"),
-    ("evaluate shac --fresh -5", "fresh must be at least 0, not -5"),
     ("evaluate shac --fresh 0", "nothing to run: give --fresh or --episodes"),
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),
-    ("evaluate lqr --episodes 201", "episodes must be at most 200"),
     ("evaluate nothere", "unknown controller nothere"),
     ("benchmark --tasks turn --controllers lqr --physics rk4 --out /dev/null", "/dev/null cannot be a folder"),
-    ("train ppo --std 0", "std must be finite and positive, not 0.0"),
-    ("train ppo --symmetry dance", "invalid choice 'dance'"),
     ("train ppo --task stabilize --symmetry frame", "has no frame"),
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("benchmark --controllers mine.json", "mine.json is not a policy"),
     ("train shac --test-episodes 201", "test_episodes must be 1 to 200, not 201"),
-    ("train shac --validation-episodes 0", "validation_episodes must be 1 to 100000, not 0"),
     ("evaluate dagger --fresh 10", "unknown controller dagger"),  # Stabilize has none
     ("replay stabilize turn", "give one task"),
-    ("replay", "give the name of a task"),
-    ("replay stabilize --controllers", "at least one controller"),
     ("replay stabilize --ghost-by nobody --ghost-at 0.1", "unknown expert nobody"),
     ("replay none.npz --ghost-at 1.0", "has no ghost"),
     ("replay none.npz --ghosts lqr", "give the ghosts as files too"),
@@ -674,7 +611,6 @@ TYPED = [
         "LQR ends at 0.40 s: no ghost can start at 0.5 s",
     ),
     ("export lqr", "lqr is an expert"),
-    ("export nobody", "unknown policy 'nobody'; BallbotStabilize-v0 has ppo, sac, shac"),
 ]
 
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from ballbot_gym import certified, dynamics
-from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
-from ballbot_gym.rollout import FunctionController, PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 
@@ -174,48 +173,8 @@ def test_a_set_is_of_one_problem_and_one_robot(name):
         certified.load(task, robot)
 
 
-@pytest.mark.parametrize("name", ["half the mass", "a weight"])
-def test_evaluation_asks_for_the_optimum_of_the_very_problem(name, monkeypatch):
-    """One by one, as `evaluate` and training measure certified episodes."""
-    task, robot, _ = OTHERS[name]
-    evaluate = pytest.importorskip("ballbot_train.evaluation.evaluate")
-    asked = []
-
-    def find(*problem, **options):
-        asked.append(problem[:2])
-        raise PlanError("no plan")
-
-    monkeypatch.setattr("ballbot_baselines.certification.find_optimum", find)
-    env = BallbotEnv(task, physics="rk4", robot=robot)
-    with pytest.raises(PlanError, match=r"no optimum of .*\nepisode 0: no plan"):
-        evaluate.evaluate(lambda observation: np.zeros(2), task, 1, "rk4", robot=robot)
-    with pytest.raises(PlanError):
-        evaluate.run_episodes(env, FunctionController(lambda t, x: np.zeros(2)), "idle", "stabilize", [0])
-    assert set(asked) == {(env.task, env.params)}
-
-
 def test_all_sets_together_are_under_7_megabytes():
     assert sum(certified.path_of(make_task(task, robot), robot).stat().st_size for robot, task in SHIPPED) < 7e6
-
-
-def test_a_set_is_improved_by_what_is_cheaper_in_another_alone(task, evaluation):
-    costs = evaluation.costs.copy()
-    costs[1] *= 0.99
-    costs[2] *= 1.01
-    costs[3] *= 1 - 1e-12
-    states = evaluation.states.copy()
-    states[4], costs[4] = 0.0, costs[4] + 1
-    statuses = np.array(["again"] * 200)
-    trajectories = tuple(replace(trajectory, t=trajectory.t + 1) for trajectory in evaluation.trajectories)
-    other = replace(evaluation, costs=costs, states=states, statuses=statuses, trajectories=trajectories)
-    merged = evaluation.improved_by(other)
-    taken = np.flatnonzero(merged.statuses == "again")
-    assert taken.tolist() == [1, 4]  # cheaper; and of another start
-    for name in ("states", "constants", "costs", "durations", "violations"):
-        np.testing.assert_array_equal(getattr(merged, name)[taken], getattr(other, name)[taken])
-        kept = np.setdiff1d(np.arange(200), taken)
-        np.testing.assert_array_equal(getattr(merged, name)[kept], getattr(evaluation, name)[kept])
-    assert [trajectory.t[0] for trajectory in merged.trajectories[:6]] == [0, 1, 0, 0, 1, 0]
 
 
 @pytest.mark.parametrize(

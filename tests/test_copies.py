@@ -87,16 +87,6 @@ def test_copy_of_a_closed_env_is_closed_and_of_one_never_reset_draws_the_same_ep
     other.close()
 
 
-def test_drawing_is_not_copied_and_starts_again_in_the_copy():
-    env = BallbotEnv("weave", physics="rk4", render_mode="rgb_array")
-    env.reset(seed=0)
-    frame = env.render()
-    other = copy.deepcopy(env)
-    env.close()
-    np.testing.assert_array_equal(other.render(), frame)
-    other.close()
-
-
 def test_state_goes_to_another_env_made_alike(physics):
     first, second = (BallbotEnv("orbit", physics=physics, randomization=ALL) for _ in range(2))
     first.reset(seed=1)

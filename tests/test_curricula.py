@@ -1,11 +1,11 @@
 """Training episodes: what is easier in them, step by step, and what stays as it is."""
 
-import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from resuming import goes_on_as_if_never_stopped
 
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task
@@ -128,23 +128,6 @@ def test_without_pay_the_reward_is_minus_the_cost_and_a_failure_has_its_price(na
     assert run(made, 1)[0].reward.max() < 1 - curricula.FAILURE_PRICE
 
 
-def test_half_of_the_episodes_begin_on_optima_with_the_time_that_is_left():
-    made = backwards(num_envs=400)
-    starts = made._starts
-    torch.manual_seed(0)
-    made._hard = [torch.zeros(10, 0)] * 2
-    for _ in range(made.task.steps):
-        made._hard = [torch.zeros(10, 0)] * 2  # none are repeated
-        result = made.step(torch.zeros(400, 2))
-    moved = made._kind == curricula._ON_OPTIMUM
-    assert 0.4 < float(moved.double().mean()) < 0.6
-    known = {(*x, int(k)) for x, k in zip(starts.x.float().T.tolist(), starts.steps, strict=True)}
-    own = ~moved & ~made._again
-    assert {(*x, int(k)) for x, k in zip(made.state.x.T[moved].tolist(), made.state.steps[moved], strict=True)} <= known
-    torch.testing.assert_close(result.observation, made.observe(made.state))
-    assert torch.equal(made.state.x[:2, own], torch.tensor([[0.0], [-1.0]]).expand(2, int(own.sum())))
-
-
 def test_a_share_of_the_episodes_repeats_starts_that_went_wrong(constants):
     constants(ON_OPTIMA=0.0, RAMPS={})
     made = backwards(num_envs=400)
@@ -172,26 +155,6 @@ def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     assert not task.is_goal(starts.x[:, -1].numpy(), starts.c[:, -1].numpy())
 
 
-def test_the_curriculum_is_over_once_enough_episodes_of_the_task_itself_succeed(constants):
-    constants(EPISODES=4, SUCCESS=0.5, SETTLED_SUCCESS=0.75, RAMPS={}, GOAL_FACTOR=1.01, REACH=1.0)
-    made = backwards()
-    made._on_optima.share = 1.0
-    all_ended = torch.ones(4, dtype=torch.bool)
-
-    def look(successes):
-        made._count(all_ended, torch.arange(4) < successes)
-        return made.difficulty["goal_factor"], made.is_settled
-
-    assert look(1) == (1.01, False)
-    assert look(4) == (1.0, False)  # that was with a wider goal
-    assert look(2) == (1.0, False)
-    assert look(3) == (1.0, True)
-    assert look(0) == (1.0, True)
-    resumed = backwards()
-    resumed.load_curriculum_state(made.curriculum_state())
-    assert resumed.is_settled
-
-
 def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
     torch.manual_seed(0)
     task = replace(make_task("stabilize"), duration=2.0)
@@ -215,25 +178,9 @@ def test_training_backwards_goes_on_from_its_state_as_if_never_stopped(monkeypat
     tiny = {"iterations": 3, "num_envs": 4, "num_steps": 24, "episode_seconds": 0.2, "batch_size": 16, "hidden": (8,)}
     settings = replace(LEARNERS["ppo"].settings("turn"), **tiny)
 
-    def make(seed):
-        return LEARNERS["ppo"].make(make_task("turn"), default_params(), settings, seed)
-
-    whole = make(0)
-    for _ in range(3):
-        figures = whole.iterate()
-    first, second = make(0), make(1)
-    for _ in range(2):
-        first.iterate()
-    buffer = io.BytesIO()
-    torch.save(first.state_dict(), buffer)
-    second.load_state_dict(torch.load(io.BytesIO(buffer.getvalue()), weights_only=True))
-    torch.manual_seed(99)
-    second.iterate()
-    for ours, theirs in zip(second.network.parameters(), whole.network.parameters(), strict=True):
-        assert torch.equal(ours, theirs)
-    assert second.difficulty == pytest.approx(whole.difficulty, nan_ok=True, rel=0, abs=0)
-    assert 1 < whole.difficulty["goal_factor"] < 5
-    assert figures["curriculum/goal_factor"] == whole.difficulty["goal_factor"]
+    assert goes_on_as_if_never_stopped(
+        lambda seed: LEARNERS["ppo"].make(make_task("turn"), default_params(), settings, seed)
+    )
 
 
 @pytest.mark.parametrize(

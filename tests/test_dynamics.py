@@ -140,14 +140,6 @@ def test_tilt_is_zero_where_rounding_makes_a_cosine_exceed_one(monkeypatch):
     np.testing.assert_array_equal(dynamics.tilt(torch.tensor([above, below], dtype=torch.float64)), [0, math.pi])
 
 
-def test_tilt_of_a_state_that_is_not_a_number_is_not_a_number():
-    torch = pytest.importorskip("torch")
-    x = np.full(8, np.nan)
-    assert math.isnan(dynamics.tilt(tuple(x.tolist())))
-    assert math.isnan(dynamics.tilt(x))
-    assert math.isnan(dynamics.tilt(torch.as_tensor(x)))
-
-
 def test_potential_energy_is_of_the_bodys_height():
     params = default_params()
     rest = dynamics.energy(params, (0.0,) * 8)

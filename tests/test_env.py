@@ -20,7 +20,6 @@ from ballbot_gym import BallbotEnv, Randomization
 from ballbot_gym.engines import installed_physics
 from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
-from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
@@ -58,9 +57,6 @@ def digest(task, physics):
             done = terminated or truncated
     env.close()
     return sha.hexdigest()
-
-
-# --- Gymnasium's rules ---
 
 
 OWN = replace(default_params(), body_mass=12.0)
@@ -153,9 +149,6 @@ def test_stable_baselines3_checker_has_no_complaint(task):
         env.close()
 
 
-# --- return and cost ---
-
-
 def test_return_and_cost_recomputed_from_states_and_forces_add_up_to_the_survival_pay(task, physics, make_env, rng):
     env = make_env(task, physics=physics)
     for seed in range(3):
@@ -185,9 +178,6 @@ def test_observation_is_the_tasks_of_the_state_reported(task, physics, make_env)
         assert info["tilt"] == pytest.approx(math.acos(math.cos(info["state"][2]) * math.cos(info["state"][3])))
 
 
-# --- reproducibility ---
-
-
 def test_same_seed_is_bit_identical_across_processes():
     result = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=True)
     theirs = json.loads(result.stdout.splitlines()[-1])
@@ -200,18 +190,6 @@ def test_every_physics_draws_the_same_episodes(task, physics, make_env):
     (_, a), (_, b) = (make_env(task, physics=name).reset(seed=4) for name in (physics, "rk4"))
     np.testing.assert_array_equal(a["state"], b["state"])
     np.testing.assert_array_equal(a["constants"], b["constants"])
-
-
-# --- options ---
-
-
-def test_given_start_state_takes_effect(task, physics, make_env):
-    state = [0.1, -0.2, 0.3, -0.1, 0.5, 0.6, -0.7, 0.8]
-    env = make_env(task, physics=physics)
-    _, info = env.reset(seed=0, options={"state": state})
-    np.testing.assert_array_equal(info["state"], state)
-    *_, info = env.step([0.0, 0.0])
-    assert info["state"][0] == pytest.approx(0.1 + 0.5 * 0.02, abs=5e-3)  # it moved from there
 
 
 def test_given_constants_take_effect_by_name_and_as_a_vector(task, make_env):
@@ -247,9 +225,6 @@ def test_own_robot_is_simulated(physics, make_env, params):
         speeds.append(env.step([1.0, 0.0])[-1]["state"][4])
     assert speeds[1] < speeds[0]
     assert speeds[2] == pytest.approx(speeds[0] * 100 / 350, rel=0.05)  # nearly linear for one step
-
-
-# --- ends ---
 
 
 def test_falling_terminates_and_costs_the_time_not_lived(task, physics, make_env):
@@ -315,9 +290,6 @@ def test_touching_an_obstacle_with_the_balls_rim_fails(make_env, physics):
     assert steps[-1][-1]["failure"]
 
 
-# --- actions ---
-
-
 def test_action_beyond_one_is_clipped_and_info_says_so(task, physics, make_env):
     env = make_env(task, physics=physics)
     env.reset(seed=0, options={"state": UPRIGHT})
@@ -342,9 +314,6 @@ def test_bad_action_is_refused_and_changes_nothing(make_env, physics):
     np.testing.assert_array_equal(env.step([0.1, 0.1])[0], after)
 
 
-# --- bad input ---
-
-
 def test_step_after_the_end_is_refused(physics, make_env):
     for start in (UPRIGHT, leaning(1.39)):  # truncated; terminated
         env = make_env(physics=physics, duration=0.2)
@@ -362,9 +331,6 @@ def test_closed_environment_refuses_everything_but_close(physics, make_env):
         with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="closed"):
             use()
     env.close()
-
-
-# --- rendering ---
 
 
 def test_frames_are_images_that_show_the_lean(task, physics, make_env):
@@ -434,16 +400,6 @@ def test_what_an_env_is_made_of_cannot_be_set(name, make_env):
     assert getattr(copy.deepcopy(env), name) == before
 
 
-def test_keys_push_in_the_directions_of_the_picture(make_env):
-    keys = make_env(physics="rk4").get_keys_to_action()
-    space = make_env(physics="rk4").action_space
-    assert all(action in space for action in keys.values())
-    np.testing.assert_allclose(keys["w",], -keys["s",])
-    np.testing.assert_allclose(keys["w", "a"], keys["w",] + keys["a",], rtol=1e-6)
-    ahead, left = keys["w",], keys["a",]
-    assert ahead[0] * left[1] - ahead[1] * left[0] > 0  # left is left of ahead
-
-
 def test_gymnasium_plays_it(monkeypatch):
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -469,27 +425,3 @@ def test_render_before_reset_is_refused(make_env):
 
 if __name__ == "__main__":  # the other process of test_same_seed_is_bit_identical_across_processes
     print(json.dumps({f"{task} {physics}": digest(task, physics) for task in TASKS for physics in installed_physics()}))
-
-
-# --- functions of the observation as controllers ---
-
-
-def test_action_controller_sees_the_envs_observations_and_applies_its_forces(task, make_env, rng):
-    env = make_env(type(task)(duration=0.2), physics="rk4")
-    seen = []
-
-    def act(observation, begins):
-        seen.append((observation, begins))
-        return np.array([0.2, -0.1])
-
-    controller = ActionController(env.task, env.params, act)
-    for _ in range(2):
-        seen.clear()
-        episode = rollout(env, controller, seed=5)
-        observation, _ = env.reset(seed=5)
-        for k, (observed, begins) in enumerate(seen):
-            assert observed.dtype == np.float32
-            np.testing.assert_array_equal(observed, observation)
-            assert begins == (k == 0)
-            observation, *_, info = env.step(np.array([0.2, -0.1]))
-            np.testing.assert_allclose(info["force"], episode.trajectory.u[k], rtol=1e-12)

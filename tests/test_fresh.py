@@ -165,14 +165,6 @@ def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path
     assert worst["replay"] in capsys.readouterr().out
 
 
-def test_bins_are_drawn_for_every_measure():
-    from ballbot_train.report import figures
-
-    result = evaluate_fresh("shac", "stabilize", 30)
-    drawn = figures.fresh_figure(result, result.bins())
-    assert len(drawn.axes) >= 3 * len(result.measures)
-
-
 def test_what_does_not_act_is_refused():
     with pytest.raises(TypeError, match="is no policy"):
         evaluate_fresh(3, "turn", 1)

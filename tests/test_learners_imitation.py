@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from resuming import goes_on_as_if_never_stopped
 
 from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_baselines.tvlqr import TvlqrController
@@ -37,26 +38,6 @@ def demos(tmp_path_factory):
     return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1, lambda count: None)
 
 
-def parameters(learner):
-    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
-
-
-def stopped_and_whole(make):
-    """The same learner run through, and stopped in the middle, saved, and continued by another."""
-    whole = make()
-    for _ in range(whole.iterations):
-        whole.iterate()
-    first = make()
-    for _ in range(first.iterations // 2):
-        first.iterate()
-    second = make()
-    torch.manual_seed(99)  # nothing depends on what else is drawn
-    second.load_state_dict(first.state_dict())
-    while second.iteration < second.iterations:
-        second.iterate()
-    return whole, second
-
-
 def test_cloning_lowers_the_loss_and_comes_near_its_expert(demos):
     learner = dagger.make(make_task("stabilize"), default_params(), CLONING, 0, demos)
     losses = [learner.iterate()["loss/imitation"] for _ in range(learner.iterations)]
@@ -74,8 +55,7 @@ def test_cloning_without_demonstrations_says_what_it_needs():
 
 def test_dagger_goes_on_from_its_state_as_if_never_stopped(demos):
     task, params = make_task("stabilize"), default_params()
-    whole, continued = stopped_and_whole(lambda: dagger.make(task, params, TINY_DAGGER, 0, demos))
-    assert torch.equal(parameters(whole), parameters(continued))
+    assert goes_on_as_if_never_stopped(lambda seed: dagger.make(task, params, TINY_DAGGER, 0, demos))
 
 
 @pytest.mark.parametrize("name", ["turn", "weave"])

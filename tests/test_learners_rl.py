@@ -1,18 +1,17 @@
 """PPO and SAC, with and without demonstrations: they run, and go on from a state as if never stopped."""
 
-import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from resuming import goes_on_as_if_never_stopped, parameters, through_a_file
 
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.learning.critics import CriticInputs, value_of_living
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.frames import demos_in_frame
@@ -20,32 +19,12 @@ from ballbot_train.learning.learners import LEARNERS, model_free, ppo, sac
 from ballbot_train.learning.learners.model_free import TrainingEnv
 from ballbot_train.policy import PolicyNetwork, load_network, save_policy, shipped_policies
 
+SHARED = {"gamma": 0.995, "final_gamma": 0.999, "iterations": 3, "num_envs": 4, "hidden": (16, 8)}
+RELATIVE = {"relative_advantages": False, "relative_values": False}
 TINY = {
-    "ppo": ppo.PpoConfig(
-        iterations=3,
-        num_envs=4,
-        num_steps=16,
-        gamma=0.995,
-        final_gamma=0.999,
-        episode_seconds=0.4,
-        hidden=(16, 8),
-        batch_size=32,
-        gae_lambda=0.95,
-        relative_advantages=False,
-        relative_values=False,
-    ),
+    "ppo": ppo.PpoConfig(num_steps=16, episode_seconds=0.4, batch_size=32, gae_lambda=0.95, **RELATIVE, **SHARED),
     "sac": sac.SacConfig(
-        products=True,
-        gamma=0.995,
-        final_gamma=0.999,
-        iterations=3,
-        num_envs=4,
-        num_steps=8,
-        gradient_steps=2,
-        episode_seconds=0.2,
-        hidden=(16, 8),
-        batch_size=16,
-        n_steps=1,
+        products=True, num_steps=8, gradient_steps=2, episode_seconds=0.2, batch_size=16, n_steps=1, **SHARED
     ),
 }
 CLONED = 2  # iterations
@@ -91,33 +70,9 @@ def observed(batch, size=8):
     return torch.randn(batch, size, generator=torch.Generator().manual_seed(0))
 
 
-def parameters(learner):
-    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
-
-
-def through_a_file(state):
-    """As a checkpoint does: tensors and plain values only."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    return torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
-
-
 @pytest.mark.parametrize("demonstrated", [False, True])
 def test_a_learner_goes_on_from_its_state_as_if_never_stopped(name, demonstrated, demos):
-    demos = demos if demonstrated else None
-    whole = make(name, demos)
-    start = parameters(whole)
-    run(whole)
-    for stop in (0, whole.iterations // 2, whole.iterations - 1):
-        first = run(make(name, demos), stop) if stop else make(name, demos)
-        state = through_a_file(first.state_dict())
-        second = make(name, demos, seed=1)
-        second.load_state_dict(state)
-        torch.manual_seed(99)  # nothing depends on what else is drawn
-        np.random.seed(99)
-        assert torch.equal(parameters(run(second)), parameters(whole))
-    assert not torch.equal(parameters(whole), start)
-    assert not torch.equal(parameters(run(make(name, demos, seed=1))), parameters(whole))
+    assert goes_on_as_if_never_stopped(lambda seed: make(name, demos if demonstrated else None, seed))
 
 
 def test_the_policy_acts_as_the_actor_does(name, tmp_path):
@@ -129,29 +84,6 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
         actions = load_network(tmp_path / "policy", task)(torch.as_tensor(observation))
     expected, _ = learner._model.predict(observation, deterministic=True)
     np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
-
-
-@pytest.mark.parametrize("products", [False, True])
-def test_the_discount_rises_and_takes_all_values_with_it(name, products):
-    learner = make(name, gamma=0.99, final_gamma=0.999, **({"products": products} if name == "sac" else {}))
-    model, seen = learner._model, observed(20)
-
-    def values():
-        with torch.no_grad():
-            return model.critic(seen, torch.zeros(20, 2)) if name == "sac" else (model.policy.predict_values(seen),)
-
-    before = values()
-    learner._raise_gamma(0.999)
-    change = value_of_living(make_task("stabilize"), SCALE, 0.999) - value_of_living(
-        make_task("stabilize"), SCALE, 0.99
-    )
-    for ours, value in zip(values(), before, strict=True):
-        torch.testing.assert_close(ours, value + change)
-    learner._raise_gamma(0.99)
-    logged = [learner.iterate()["train/gamma"] for _ in range(3)]
-    assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
-    buffer = learner._replay if name == "sac" else model.rollout_buffer
-    assert buffer.gamma == learner._env.batch.gamma == model.gamma
 
 
 def test_learning_rate_and_deviation_fall_as_they_are_set(name):
@@ -271,19 +203,6 @@ def test_demonstrations_without_pay_cost_what_the_episodes_did(name):
     np.testing.assert_allclose(paid.without_pay(task, 40.0).rewards, -np.array(costs), atol=1e-3)
 
 
-@pytest.mark.parametrize("frame", [None, "radial", "slalom"])
-def test_a_quadratic_value_is_linear_in_what_the_critic_sees(frame):
-    entries = 8 if frame is None else FRAMES[frame].size
-    observation = observed(400, {None: 8, "radial": 13, "slalom": 23}[frame])
-    seen = CriticInputs(observation.shape[1], products=True, frame=frame)(observation).double()
-    plain = CriticInputs(observation.shape[1], products=False, frame=frame)(observation).double()
-    form = torch.randn(entries, entries, dtype=torch.double)
-    wanted = ((plain @ form) * plain).sum(1, keepdim=True) + plain[:, :1]
-    fitted = seen @ torch.linalg.lstsq(seen, wanted, driver="gelsd").solution
-    torch.testing.assert_close(fitted, wanted, rtol=1e-4, atol=1e-4)
-    assert seen.shape[1] == entries + entries * (entries + 1) // 2
-
-
 @pytest.mark.parametrize(
     ("task", "symmetry"),
     [*((task, LEARNERS["ppo"].settings(task).symmetry) for task in TASKS), ("turn", "frame"), ("weave", "mirrors")],
@@ -304,17 +223,6 @@ def test_the_actor_of_ppo_has_the_symmetry_of_its_task(task, symmetry):
 def test_ppo_refuses_a_symmetry_that_the_task_has_not():
     with pytest.raises(ValueError, match="BallbotTurn-v0 has no mirror images"):
         LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], symmetry="mirrors"), 0, None)
-
-
-def test_sac_holds_forces_longer_from_scratch_and_living_pays_as_much(monkeypatch):
-    monkeypatch.setattr(sac, "_CONTROL_DT", 0.05)
-    learner = make("sac", gamma=0.9)
-    assert learner._model.gamma == pytest.approx(0.9**2.5)
-    run(learner)
-    assert learner._env.batch.task.control_dt == 0.05
-    assert learner.network.spec.task == make_task("stabilize").problem()
-    paid = SCALE * make_task("stabilize").survival_reward * 0.05
-    assert learner._value_of_living(0.9) == pytest.approx(paid / 0.1)
 
 
 @pytest.mark.parametrize(

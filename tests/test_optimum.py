@@ -10,7 +10,6 @@ from ballbot_baselines import optimum as optimum_module
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.ocp import FEASIBLE, Bounds, Ocp, OcpSolver
 from ballbot_baselines.optimum import Backoff, find_optimum, plan_to_track
-from ballbot_baselines.shooting import robot_numbers, shooting_ocp, shooting_parameters
 from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
@@ -35,9 +34,6 @@ def optimum_of():
         return optima[task]
 
     return find
-
-
-# --- every task's optimum ---
 
 
 def test_a_plan_is_an_episode_of_its_cost_that_obeys_the_limits_and_ends_at_the_goal(task, optimum_of, params):
@@ -142,20 +138,6 @@ def test_an_episode_where_fatrop_goes_in_circles_has_an_optimum_nevertheless(par
     assert found.cost == pytest.approx(19.5707702, rel=1e-6)  # that of other guessed paths too
 
 
-@pytest.mark.slow
-def test_exhaustive_search_over_sides_rarely_finds_a_better_slalom(params):
-    task, better = Weave(), []
-    for seed in range(30):
-        x0, c = episode(task, seed)
-        found = find_optimum(task, params, x0, c)
-        best = find_optimum(task, params, x0, c, guesses=32)
-        if best.cost < found.cost * (1 - 0.005):
-            better.append((seed, found.cost / best.cost))
-    assert len(better) <= 2, better
-
-
-# --- the solver itself, on a small problem that uses every kind of constraint ---
-
 N = 8
 
 
@@ -235,20 +217,6 @@ def test_staged_derivatives_are_exact_to_second_order():
     assert solve_toy("ipopt").iterations == iterations
 
 
-def test_violation_is_the_largest_of_constraints_and_bounds():
-    ocp = toy()
-    solution = OcpSolver(ocp, N, "ipopt", max_iterations=1).solve(
-        np.zeros((N + 1, 3)), np.zeros((N, 2)), toy_bounds(ocp), [0.4]
-    )
-    s, w = solution.states, solution.inputs
-    defects = [s[k + 1] - np.array(ocp.next(*(casadi.DM(v) for v in (s[k], w[k])), 0.4)).ravel() for k in range(N)]
-    assert not solution.success
-    assert not solution.is_optimal
-    assert "Maximum_Iterations" in solution.status
-    assert solution.violation >= np.abs(defects).max()
-    assert solution.violation >= abs(s[0] @ ocp.initial_matrix[0])
-
-
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_infeasible_bounds_are_reported_not_hidden(solver):
     ocp = toy()
@@ -267,23 +235,6 @@ def test_compiled_and_interpreted_functions_lead_to_the_same_solution(monkeypatc
     slow = solve_toy(solver)
     assert slow.cost == pytest.approx(fast.cost, rel=1e-12)
     np.testing.assert_allclose(slow.states, fast.states, atol=1e-9)
-
-
-def test_the_dynamics_of_a_task_depend_on_how_long_forces_are_held_and_on_the_robot_and_on_nothing_else(task, params):
-    compiled_dynamics = shooting_ocp(task, params).stages.dynamics
-    assert compiled_dynamics.params <= 1 + len(robot_numbers(params))
-    x, a = task.sample(np.random.default_rng(0), params)[0], np.array([0.3, -0.2])
-    for coarseness in (1, 2):
-        p = shooting_parameters(task, params, np.zeros(len(task.constant_names)), Backoff(), coarseness)
-        held = coarseness * task.control_dt
-        columns = [
-            np.tile(column[:, None], compiled.LANES)
-            for column in (np.append(x, a), np.array(p[: compiled_dynamics.params]))
-        ]
-        reached = np.array(compiled_dynamics.value(*columns))[:, 0]
-        np.testing.assert_allclose(
-            reached, dynamics.step(params, x, params.force_limit * a, held), rtol=1e-13, atol=1e-13
-        )
 
 
 def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(params, monkeypatch):

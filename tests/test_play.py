@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballbot_baselines import CONTROLLERS, find_optimum
+from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified, dynamics
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
@@ -23,7 +23,6 @@ from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.play.tunable import Tunable, weight_names
-from ballbot_train.play.world import PLANT, randomization
 from ballbot_train.policy_files import BEST
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
@@ -54,9 +53,6 @@ def play():
 def go(playground, seconds):
     for _ in range(round(seconds / playground.world.task.control_dt)):
         assert playground.step()
-
-
-# --- the episode ---
 
 
 @pytest.mark.parametrize("episode", [STANDING, FALLING])
@@ -134,16 +130,6 @@ def test_controllers_change_without_a_jump(play):
     assert len(playground.trajectory().u) > 25  # one episode all along
 
 
-def test_after_an_episode_the_robot_goes_on_where_it_is(play):
-    playground = play()
-    go(playground, 7.9)
-    before = np.array(playground.main.x)
-    go(playground, 0.2)
-    assert len(playground.scores) == 1
-    assert playground.seconds < 0.2
-    assert np.abs(np.array(playground.main.x) - before)[:2].max() < 0.05
-
-
 def test_after_a_fall_the_same_episode_begins_again(play):
     playground = play(episode=FALLING)
     go(playground, 0.5)
@@ -172,9 +158,6 @@ def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
     assert views.drawing(playground).paths[-1].name in ("plan", "robot")
 
 
-# --- what the user changes ---
-
-
 def test_lqr_reacts_to_a_weight(play):
     playground = play()
     before = playground.main.controller.act(0.0, np.ones(8))
@@ -196,16 +179,6 @@ def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     np.testing.assert_array_equal(playground.main.controller.act(0.0, np.ones(8)), gain)
     go(playground, 0.02)
     assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
-
-
-def test_every_hidden_change_can_go_to_both_ends_while_the_robot_moves(play):
-    playground = play(episode=STANDING)
-    for stress, span in PLANT.items():
-        for severity in (span.low, span.high, 0.0):
-            playground.set_plant(stress, severity)
-            go(playground, 0.04)
-    assert playground.crew.notice == ""
-    assert randomization(playground.plant).active is False
 
 
 def test_a_human_drives_the_robot_that_balances_itself(play):
@@ -260,9 +233,6 @@ def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, no_optimu
     playground.settle()
     assert playground.step()
     assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
-
-
-# --- bad input ---
 
 
 def test_no_push_harms(play):
@@ -351,9 +321,6 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
     assert "LQR does instead" in playground.crew.notice
 
 
-# --- what is kept ---
-
-
 def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
     playground = play(ghosts=["you"])
     go(playground, 0.5)
@@ -364,19 +331,6 @@ def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
     command = views.optimize_command(playground).split()
     assert command[:4] == ["ballbot", "optimize", "stabilize", "--state"]
     assert [float(value) for value in command[4:]] == pytest.approx(playground.main.x, rel=1e-8)
-
-
-def test_the_history_that_is_plotted_stays_short(play):
-    playground = play(ghosts=["you"])
-    go(playground, 9.0)
-    history = views.history(playground, 200)
-    assert len(history.seconds) == 200
-    assert (np.diff(history.seconds) > 0).all()
-    assert all(np.isfinite(line).all() and line.shape == (200, 4) for line in history.lines.values())
-    assert len(playground.main.trace) == 400
-
-
-# --- weights as constants ---
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -393,20 +347,6 @@ def test_a_tunable_task_costs_what_the_task_with_these_weights_costs(task, param
     assert tunable.margins(x, full) == pytest.approx(base.margins(x, c))
     np.testing.assert_array_equal(tunable.observe(x, full), base.observe(x, c))
     assert tunable.steps == base.steps
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
-def test_the_optimum_of_a_tunable_task_is_that_of_the_task(task, params, rng):
-    base = TASKS[task]()
-    tunable = Tunable.of(base)
-    x, c = base.sample(rng, params)
-    assert find_optimum(tunable, params, x, tunable.constants(c, {})).cost == pytest.approx(
-        find_optimum(base, params, x, c).cost, rel=1e-6
-    )
-
-
-# --- time ---
 
 
 class Watch:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import start_chromium
 
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.viewer import Viewer
@@ -82,9 +81,6 @@ def quiet(capfd):
     said = capfd.readouterr()
     assert "Traceback" not in said.out + said.err
     assert "never retrieved" not in said.err
-
-
-# --- controls ---
 
 
 def test_controls_change_the_playground(opened, visitor):
@@ -201,49 +197,29 @@ def test_a_pause_holds_everything_and_a_step_moves_once(opened, visitor):
     assert opened.playground.seconds == pytest.approx(before + 0.02)
 
 
-def test_files_are_saved_and_handed_to_the_browser(opened, visitor, tmp_path):
-    opened.goes_on()
-    visitor.change("Trajectory file")
-    wait_for(lambda: visitor.files)
-    assert list(visitor.files) == ["stabilize-lqr-1.npz"]
-    assert len(Trajectory.load(tmp_path / "stabilize-lqr-1.npz").u) > 3
-
-
-def test_only_so_much_can_be_saved(opened, visitor, tmp_path, monkeypatch):
+def test_files_are_saved_and_handed_to_the_browser_but_only_so_many(opened, visitor, tmp_path, monkeypatch):
     monkeypatch.setattr(saving, "MOST_FILES", 3)
     opened.goes_on()
     for _ in range(6):
         visitor.change("Trajectory file")
     wait_for(lambda: "start ballbot play again to save more" in opened.playground.crew.notice)
     assert len(list(tmp_path.iterdir())) == 3
-
-
-# --- what a browser sends ---
+    wait_for(lambda: "stabilize-lqr-1.npz" in visitor.files)
+    assert len(Trajectory.load(tmp_path / "stabilize-lqr-1.npz").u) > 3
 
 
 NONSENSE = [
     ("Speed", math.nan),
-    ("Speed", -1.0),
     ("Speed", "fast"),
-    ("Speed", None),
-    ("Speed", [1.0, 2.0]),
-    ("Speed", True),
     ("Speed", 1e18),
     ("Masses, %", math.inf),
-    ("Masses, %", -1e300),
     ("effort × 10^", 1e9),
-    ("effort × 10^", math.nan),
     ("Task", "dance"),
-    ("Task", 3),
     ("Controller", "../../etc/passwd"),
     ("Controller", {"a": 1}),
-    ("Certified episode", math.nan),
     ("Certified episode", -5),
-    ("Certified episode", 1e18),
     ("Certified episode", 1e300),
     ("At the end", "explode"),
-    ("Start", "Nowhere"),
-    ("Policy file", 7),
     ("Policy file", "x" * 5000),
     ("Push", "hard"),
 ]
@@ -272,12 +248,8 @@ def works(opened, visitor, k=0):
 UPDATES = [
     {"gui_api": 5},
     {"value": 0.5, "gui_api": 5},
-    {"update_cb": []},
     {"removed": True},
-    {"props": None},
-    {"disabled": True},
     {"label": "<script>"},
-    {"__class__": "int"},
     {"no_such_field": 1},
     {},
 ]
@@ -295,16 +267,11 @@ MESSAGES = [
     {"type": "NoSuchMessage"},
     {"type": "GuiUpdateMessage", "uuid": "no", "updates": {"value": 1}},
     {"type": "GuiFormDirtyMessage", "uuid": "x" * 1000},
-    {"type": "GuiFormSubmitMessage", "uuid": "x"},
     {"type": "ShareUrlRequest"},
-    {"type": "ShareUrlDisconnect"},
     {"type": "RunJavascriptMessage", "source": "alert(1)"},
-    {"type": "GetRenderResponseMessage", "payload": b"0"},
     {"type": "SceneNodeDragMessage", "phase": "sideways", "name": "/world"},
     CAMERA | {"position": ["a", "b", "c"]},
-    CAMERA | {"look_at": [1.0]},
     CAMERA | {"wxyz": [math.nan] * 4, "position": [math.inf] * 3},
-    CAMERA | {"image_width": "wide"},
     CAMERA | {"image_width": math.nan},
 ]
 
@@ -403,9 +370,6 @@ def runs(pid):
     return False
 
 
-# --- who may connect ---
-
-
 def asked(port, path="/", **headers):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
     connection.request("GET", path, headers=headers)
@@ -494,57 +458,3 @@ def test_what_is_no_request_is_dropped(quiet, opened):
 def test_where_nothing_can_listen_is_said(host, port):
     with pytest.raises(OSError, match="cannot listen on"):
         Viewer(host, port)
-
-
-# --- in a browser ---
-
-
-@pytest.fixture
-def chromium(tmp_path_factory):
-    started = []
-
-    def start():
-        browser = start_chromium(
-            tmp_path_factory.mktemp("chromium"), "640,480", "use-gl=angle", "use-angle=swiftshader"
-        )
-        started.append(browser)
-        return browser
-
-    yield start
-    for browser in started:
-        browser.quit()
-
-
-def focus(browser, has):
-    """Whether the page has the focus; without it viser's page does not try again where its first connection fails."""
-    browser.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", {"enabled": has})
-
-
-def severe(browser):
-    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-
-
-@pytest.mark.slow
-def test_keys_drive_the_robot_and_not_the_camera_and_a_phones_panel_is_folded(opened, chromium):
-    from selenium.webdriver import ActionChains
-
-    browser = chromium()
-    browser.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride", {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    )
-    focus(browser, True)
-    browser.get(f"{opened.viewer.address}/?fixedDpr=0.1")
-    wait_for(lambda: opened.page.visitors, 60)
-    folded = "return [...document.querySelectorAll('[role=tab]')].every(tab => !tab.getBoundingClientRect().height)"
-    wait_for(lambda: browser.execute_script(folded), 60)
-    opened.do(lambda: opened.playground.set_controller("you"))
-    wait_for(lambda: opened.playground.is_driven)
-    (client,) = opened.viewer.server.get_clients().values()
-    before = np.array(client.camera.position)
-    for key in ("w", "\ue012"):  # and the arrow to the left
-        ActionChains(browser).key_down(key).perform()
-        wait_for(lambda: opened.playground.stick.value != (0.0, 0.0))
-        ActionChains(browser).pause(0.5).key_up(key).perform()
-        wait_for(lambda: opened.playground.stick.value == (0.0, 0.0))
-    np.testing.assert_allclose(client.camera.position, before, atol=1e-6)
-    assert severe(browser) == []

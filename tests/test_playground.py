@@ -140,9 +140,6 @@ def test_a_link_holds_task_episode_and_score_and_any_other_is_none(engine, tmp_p
     assert challenge["regret"] == 12.3
 
 
-# --- policies from ONNX files ---
-
-
 def network_file(path, activation, steps=("Gemm",)):
     """An ONNX file as other tools write it: two layers, of Gemm, or of MatMul and Add."""
     onnx = pytest.importorskip("onnx")
@@ -230,62 +227,31 @@ def test_damaged_onnx_files_are_refused_or_act_with_two_numbers(engine, tmp_path
     assert not [answer for answer in found if isinstance(answer, str) and "undefined" in answer]
 
 
-def test_every_function_of_every_task_is_what_python_computes(engine, tmp_path, rng):
-    script, expected = "const found = [];\n", []
-    for name in TASKS:
-        task = make_task(name)
-        x, c = task.sample(rng, BallbotEnv(task, physics="rk4").params)
-        x = x + rng.normal(scale=0.3, size=8)
-        u = rng.normal(scale=100, size=2)
-        script += f"found.push(MODELS.{name}.observe({x.tolist()}, {c.tolist()}));\n"
-        script += f"found.push(MODELS.{name}.cost({x.tolist()}, {u.tolist()}, {c.tolist()}));\n"
-        script += f"found.push(MODELS.{name}.limits({x.tolist()}, {c.tolist()}));\n"
-        script += f"found.push(MODELS.{name}.goal({x.tolist()}, {c.tolist()}));\n"
-        x, u, c = tuple(x), tuple(u), tuple(c)
-        expected += [task.observe(x, c), [task.cost(x, u, c)], task.limits(x, c), task.goal(x, c)]
-    found = run_in_node(engine + script + "answer(found);", tmp_path)
-    for mine, theirs in zip(found, expected, strict=True):
-        np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("name", "fields"),
-    [
-        ("orbit", {"frame": "radial", "squash": "clip"}),
-        ("stabilize", {"mirrors": True, "odd": True, "linear": False}),
-        ("orbit", {"frame": "radial", "squash": "tanh_in_frame", "centred": True, "activation": "silu"}),
-        ("weave", {"frame": "routed_slalom", "routes": (8,)}),
-    ],
-)
-def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(name, fields, tmp_path, rng):
+def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng):
     torch.manual_seed(0)
-    env = BallbotEnv(name, physics="rk4")
-    if "mirrors" in fields:
-        mirrors = ((env.task.observation_signs(mirror), mirror.action) for mirror in env.task.mirrors)
-        fields = fields | {"mirrors": tuple(mirrors)}
-    network = PolicyNetwork(PolicySpec.of(env.task, hidden=(8,), **fields))
-    torch.nn.init.normal_(network.mlp[-1].weight, std=0.3)
-    path = save_policy(tmp_path / name, network, {})
-    controller = in_double(path, env.task, env.params)
-    script, expected = "const found = [];\n", []
-    for _ in range(5):
-        x, c = env.task.sample(rng, env.params)
-        x = x + rng.normal(scale=0.2, size=8)
-        controller.reset(0.0, x, c)
-        expected.append(controller.act(0.0, x))
-        acts = f"new Policy(DATA.policies.{name}, MODELS.{name}).act(0, {x.tolist()}, {c.tolist()})"
-        script += f"found.push({acts});\n"
-    found = run_in_node(engine_script([str(path)]) + script + "answer(found);", tmp_path)
+    task = make_task("stabilize")
+    mirrors = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
+    kinds = {
+        "stabilize": {"mirrors": mirrors, "odd": True, "linear": False, "squash": "clip"},
+        "orbit": {"frame": "radial", "squash": "tanh_in_frame", "centred": True, "activation": "silu"},
+        "weave": {"frame": "routed_slalom", "routes": (8,)},
+    }
+    script, expected, paths = "const found = [];\n", [], []
+    for name, fields in kinds.items():
+        env = BallbotEnv(name, physics="rk4")
+        network = PolicyNetwork(PolicySpec.of(env.task, hidden=(8,), **fields))
+        torch.nn.init.normal_(network.mlp[-1].weight, std=0.3)
+        paths.append(str(save_policy(tmp_path / name, network, {})))
+        controller = in_double(paths[-1], env.task, env.params)
+        for _ in range(5):
+            x, c = env.task.sample(rng, env.params)
+            x = x + rng.normal(scale=0.2, size=8)
+            controller.reset(0.0, x, c)
+            expected.append(controller.act(0.0, x))
+            acts = f"new Policy(DATA.policies.{name}, MODELS.{name}).act(0, {x.tolist()}, {c.tolist()})"
+            script += f"found.push({acts});\n"
+    found = run_in_node(engine_script(paths) + script + "answer(found);", tmp_path)
     np.testing.assert_allclose(found, expected, atol=1e-4)  # N; a float32 action has steps of 2e-5 N
-
-
-def test_a_push_at_rest_is_that_of_the_push_sweep(params):
-    x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
-    after = casadi.Function("after", [x, p], [dynamics.pushed(params, x, p)])
-    inertia = [[params.total_mass, params.first_moment], [params.first_moment, params.pivot_inertia]]
-    speed, lean_rate = np.linalg.solve(inertia, [90.0, 90.0 * params.com_height])
-    expected = [0, 0, 0, 0, 0.6 * speed, 0.8 * speed, 0.6 * lean_rate, 0.8 * lean_rate]
-    np.testing.assert_allclose(np.array(after(np.zeros(8), [54.0, 72.0])).ravel(), expected, atol=1e-12)
 
 
 def test_a_push_brings_the_energy_of_its_impulse_times_the_mean_speed_of_the_pushed_point(params, rng):
@@ -495,23 +461,6 @@ return found
 
 def test_keys_and_a_drag_hold_the_stick_as_long_as_they_are_held(opened):
     assert opened.execute_script(STEERED) == pytest.approx([1, 1, 0, 0] * 3, abs=1e-6)
-
-
-TILTED = """
-playground.open(1, true); playground.setPlaying(false); playground.draw(1);
-const done = arguments[0];
-const tilt = (beta, gamma) => window.dispatchEvent(new DeviceOrientationEvent("deviceorientation", { beta, gamma }));
-playground.askForTilt().then(() => {
-  const { driver, scene } = playground, along = () => [0, 1].reduce((sum, i) => sum + driver.goal[i] * scene.right[i], 0);
-  const found = [[40, 5], [40, 35], [40, -7.5], [null, 35]].map((held) => { tilt(...held); return along(); });
-  done(found);
-});
-"""
-
-
-def test_a_tilted_device_is_the_stick(opened):
-    found = opened.execute_async_script(TILTED)
-    assert found == pytest.approx([0, 1, -0.5, -0.5], abs=1e-6)  # what is no number changes nothing
 
 
 def test_a_policy_of_ones_own_controls_the_robot_and_a_wrong_file_is_named(opened, exported, tmp_path):

@@ -10,7 +10,7 @@ import torch
 
 from ballbot_gym import Randomization
 from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.randomization import TRACKS, actuate, normals
+from ballbot_gym.randomization import TRACKS, normals
 from ballbot_gym.vector import BallbotVectorEnv
 
 ROBOTS = Randomization(body_mass=(0.8, 1.3), ball_mass=(0.5, 2.0), com_height=(0.9, 1.1), inertia=(0.7, 1.4))
@@ -46,9 +46,6 @@ def assert_same(got, expected):
             np.testing.assert_array_equal(left, right)
 
 
-# --- the ranges ---
-
-
 def test_everything_is_off_by_default(physics, make_env, rng):
     assert not Randomization().active
     actions = rng.uniform(-1, 1, (60, 2))
@@ -68,9 +65,6 @@ def test_draws_fill_their_ranges(rng):
     values, counts = np.unique(drawn[:, 5], return_counts=True)
     assert values.tolist() == [0, 1, 2, 3]
     assert counts.min() > 900
-
-
-# --- robots ---
 
 
 def test_each_episode_has_a_robot_of_its_own_within_the_ranges(physics, make_env, params):
@@ -103,9 +97,6 @@ def test_seed_repeats_a_randomized_episode(physics, make_env, rng):
     assert_same(play(env, actions, seed=2), play(env, actions, seed=2))
 
 
-# --- actuators ---
-
-
 def test_delayed_force_comes_the_drawn_number_of_steps_later(make_env):
     env = make_env(physics="rk4", randomization=Randomization(actuator_delay=(0.04, 0.04)))
     env.reset(seed=0, options={"state": np.zeros(8)})
@@ -123,11 +114,6 @@ def test_lagging_force_approaches_its_command_exponentially(make_env):
     np.testing.assert_allclose(forces, expected, rtol=1e-6)  # the tiny constant in the gain is 2e-8 of the lag
 
 
-def test_actuator_without_lag_or_delay_is_exact():
-    gain, delay = Randomization().draw((0.3,) * 6, 0.02)[4:]
-    assert actuate((1.1, -2.3), (), (5.0, 7.0), gain, delay) == (1.1, -2.3)
-
-
 def test_cost_charges_the_force_applied(make_env, rng):
     env = make_env(physics="rk4", randomization=EVERYTHING)
     _, info = env.reset(seed=0)
@@ -137,9 +123,6 @@ def test_cost_charges_the_force_applied(make_env, rng):
         assert not terminated
         assert not truncated
         assert info["cost"] == pytest.approx(env.task.cost(x, info["force"], c) * 0.02)
-
-
-# --- sensors and pushes ---
 
 
 def test_normal_numbers_are_normal(rng):
@@ -183,9 +166,6 @@ def test_push_moves_the_ball_and_is_not_charged(physics, make_env, params):
     assert info["force"].tolist() == [0, 0]
 
 
-# --- the same in batches ---
-
-
 def batch(count, randomization, **kwargs):
     return BallbotBatch("stabilize", count, dtype=torch.float64, compile=False, randomization=randomization, **kwargs)
 
@@ -223,9 +203,6 @@ def test_gradients_flow_through_randomized_robots_and_actuators():
     (gradient,) = torch.autograd.grad(cost, actions)
     assert torch.isfinite(gradient).all()
     assert (gradient[0] != 0).all()
-
-
-# --- tracks ---
 
 
 @pytest.mark.parametrize("track", TRACKS)
@@ -277,9 +254,6 @@ def test_biased_sensors_are_wrong_by_the_same_all_the_time_and_odometry_drifts(m
     for k, error in enumerate(errors, start=1):
         expected = [*(k * env.task.control_dt * drift), *lean, *drift, *rate]
         np.testing.assert_allclose(error, expected, atol=1e-5)
-
-
-# --- observations for memory ---
 
 
 @pytest.mark.parametrize("task", ["stabilize", "orbit"])

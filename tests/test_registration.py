@@ -15,7 +15,7 @@ import tomllib
 from ballbot_gym import TASKS, Task, certified, named_robot, register_robot, register_task
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
-from ballbot_gym.params import URDF_PATH, UrdfError
+from ballbot_gym.params import URDF_PATH
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -112,7 +112,6 @@ def test_commands_take_a_module_and_a_urdf_and_compute_optima_in_workers(
 
 WRONG = {
     "no class": (lambda: register_task("eight"), TypeError, "takes a class that derives from ballbot_gym.Task"),
-    "no task": (lambda: register_task(dict), TypeError, "takes a class that derives from ballbot_gym.Task"),
     "no methods": (lambda: register_task(type("Empty", (Task,), {})), TypeError, "Empty has no cost, draw_state, goal"),
     "a taken name": (
         lambda: register_task(type("Other", (Stabilize,), {"id": "Other-v0"}), "stabilize"),
@@ -124,20 +123,10 @@ WRONG = {
         ValueError,
         "BallbotStabilize-v0 of Mine is taken",
     ),
-    "an id of Gymnasium": (
-        lambda: register_task(type("Mine", (Stabilize,), {"id": "CartPole-v1"})),
-        ValueError,
-        "CartPole-v1 of Mine is taken in Gymnasium",
-    ),
     "no id": (
         lambda: register_task(type("Mine", (Stabilize,), {"id": "my id"})),
         ValueError,
         "must be an id of Gymnasium",
-    ),
-    "a name with spaces": (
-        lambda: register_task(type("Mine", (Stabilize,), {"id": "Mine-v0"}), "my task"),
-        ValueError,
-        "must be small letters",
     ),
     "no dataclass": (
         lambda: register_task(
@@ -147,15 +136,7 @@ WRONG = {
         r"Mine.speed is no field: decorate Mine with @dataclass\(frozen=True\)",
     ),
     "a taken robot": (lambda: register_robot("rolling", URDF_PATH), ValueError, "'rolling' is taken by another robot"),
-    "a robot's name": (lambda: register_robot("my-robot", URDF_PATH), ValueError, "must be small letters"),
-    "no file": (lambda: register_robot("mine", "none.urdf"), UrdfError, "none.urdf: no such file"),
-    "no path": (lambda: register_robot("mine", 3), TypeError, "urdf must be a path or a BallbotParams, not 3"),
     "fields": (lambda: register_robot("mine", URDF_PATH, {"turn": 3}), TypeError, "fields must be fields by task"),
-    "an unknown module": (
-        lambda: make_task("nowhere.at_all:eight"),
-        ValueError,
-        "no module 'nowhere' is installed or in",
-    ),
     "an unknown name": (lambda: make_task("math:eight"), ValueError, "unknown task 'math:eight'; known: 'stabilize'"),
 }
 
@@ -183,9 +164,6 @@ def test_a_cell_of_a_notebook_may_run_twice():
     again = cell(2.0)
     assert TASKS["sprint"] is again
     assert gymnasium.make("Sprint-v0", physics="rk4").unwrapped.task.sprint_weight == 2.0
-
-
-# --- optima on demand ---
 
 
 @dataclass(frozen=True)

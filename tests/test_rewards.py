@@ -12,7 +12,6 @@ from ballbot_gym import certified
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_gym.tasks.turn import Turn
 
 torch = pytest.importorskip("torch")
 
@@ -187,41 +186,6 @@ def test_reward_threshold_is_the_mean_return_at_ten_percent_regret(task):
     costs = certified.load(task, "paper").costs
     assert task.reward_threshold == pytest.approx(np.mean(task.survival_pay - 1.1 * costs), abs=0.05)
     assert gymnasium.spec(task.id).reward_threshold == task.reward_threshold
-
-
-def turning_less_waiting(gamma, bootstrapped):
-    """(n,) by how much the certified turns, at their mean cost rate, are worth more than standing still.
-
-    Time-outs end the sum, or, bootstrapped, standing still is worth what it would be for ever.
-    """
-    task, evaluation = Turn(), certified.load(Turn(), "paper")
-    steps, all_steps = np.round(evaluation.durations / task.control_dt), task.steps
-    pay = task.survival_reward * task.control_dt
-
-    def summed(n):
-        return n if gamma == 1 else (1 - gamma**n) / (1 - gamma)
-
-    bonus = gamma ** (steps - 1) * pay * (all_steps - steps)
-    turning = (pay - evaluation.costs / steps) * summed(steps) + bonus
-    waiting = (pay - task.time_weight * task.control_dt) * (1 / (1 - gamma) if bootstrapped else summed(all_steps))
-    return turning - waiting
-
-
-@pytest.mark.parametrize(
-    ("gamma", "bootstrapped", "least", "most"),
-    [
-        (0.99, True, 36, 363),
-        (0.995, True, 17, 283),
-        (0.998, True, -366, -211),
-        (0.99, False, 39, 367),
-        (0.995, False, 68, 334),
-        (0.998, False, 60, 216),
-        (1.0, False, 8, 35),
-    ],
-)
-def test_turning_is_worth_as_much_more_than_waiting_as_turn_says(gamma, bootstrapped, least, most):
-    difference = turning_less_waiting(gamma, bootstrapped)
-    assert [difference.min(), difference.max()] == pytest.approx([least, most], abs=0.6)
 
 
 def test_pay_and_arena_are_no_part_of_the_problem(task):

@@ -73,13 +73,6 @@ def test_seeds_and_options_are_used_once():
     assert np.abs(env.reset()).max() > 0
 
 
-def test_options_must_be_alike_for_every_env():
-    env = make(2)
-    env.set_options([{"state": np.zeros(8)}, {}])
-    with pytest.raises(ValueError, match="same keys"):
-        env.reset()
-
-
 def test_ends_of_episodes_report_what_a_vec_monitor_reports():
     env = make(6, duration=0.2)
     with pytest.warns(UserWarning, match="Monitor"):

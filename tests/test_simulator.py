@@ -12,7 +12,6 @@ import pytest
 from ballbot_gym import dynamics
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.engines.bullet import BulletSimulator
-from ballbot_gym.engines.bullet_client import import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import ROBOTS, named_robot
@@ -143,16 +142,6 @@ def test_substeps_in_bullet_are_bitwise_as_many_steps(params):
     fine.close()
 
 
-def test_reset_leaves_no_trace_of_what_was_before(params, physics):
-    simulator = make_simulator(physics, params, 0.02)
-    runs = []
-    for _ in range(2):
-        simulator.reset(START)
-        runs.append([simulator.step((10.0 * k, -FORCE[1])) for k in range(25)])
-    simulator.close()
-    assert runs[0] == runs[1]
-
-
 def test_two_simulators_do_not_disturb_each_other(params, physics):
     alone, beside, other = (make_simulator(physics, params, 0.02) for _ in range(3))
     for simulator in (alone, beside):
@@ -197,9 +186,3 @@ def test_without_pybullet_a_page_is_shown_in_place_of_the_window(monkeypatch, ma
     env.reset(seed=0)
     env.step([0.0, 0.0])
     assert "no window, because PyBullet is not installed: the robot is shown at http://" in capsys.readouterr().err
-
-
-def test_pybullet_without_numpy_names_the_remedy(monkeypatch):
-    monkeypatch.setattr(pybullet, "isNumpyEnabled", lambda: 0)
-    with pytest.raises(ImportError, match=r"built without NumPy.*--force-reinstall"):
-        import_pybullet()

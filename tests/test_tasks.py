@@ -41,9 +41,6 @@ def functions(task):
     }
 
 
-# --- one source for all libraries ---
-
-
 def test_floats_numpy_casadi_and_torch_agree(task, params):
     casadi, torch = pytest.importorskip("casadi"), pytest.importorskip("torch")
     points = random_points(task, params, 50)
@@ -72,9 +69,6 @@ def test_everything_is_differentiable_even_at_the_origin_and_in_an_obstacle(task
         centre[:2] = split_constants(c[0])[1][0, :2]
     for x in (np.zeros(8), centre):
         assert np.isfinite(np.array(jacobian(x, np.zeros(2), c[0]))).all()
-
-
-# --- cost, margins, goal ---
 
 
 def test_cost_is_never_negative(task, params):
@@ -158,9 +152,6 @@ def test_steady_orbit_is_orbits_goal_and_nearly_free(params):
         assert not Orbit().is_goal(tuple(states[0]), (1.5, -speed))
 
 
-# --- episodes ---
-
-
 def test_sampled_starts_are_safe(task, params):
     x, c = draw(task, params, 500)
     unsafe = [i for i in range(500) if not task.is_safe(tuple(x[i]), tuple(c[i]))]
@@ -242,9 +233,6 @@ def test_orbit_speeds_lean_from_10_to_45_degrees_in_both_directions(params):
     assert not x[:, 2:].any()
 
 
-# --- what experts need ---
-
-
 @pytest.mark.parametrize("duration", [8.0, 2.0])
 def test_guess_paths_start_at_the_ball_and_fill_the_episode(task, params, duration):
     task = dataclasses.replace(task, duration=duration)
@@ -319,9 +307,6 @@ def test_steady_orbit_obeys_the_dynamics_of_the_robot_but_for_the_axial_inertia(
     assert error[:, 2:].max() < 0.045 * scale[:, 2:].max()
 
 
-# --- Weave's slaloms ---
-
-
 def distances(path, obstacles):
     """(obstacles,) nearest distance from a path (n, 2) to each centre."""
     return np.array([np.hypot(*(path - o[:2]).T).min() for o in obstacles])
@@ -360,9 +345,6 @@ def test_guessed_paths_try_every_choice_of_sides_and_one_clears_all_obstacles(pa
         assert sides_passed(left, constants) == (1,) * len(obstacles)
 
 
-# --- fields and documents ---
-
-
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
 def test_field_that_is_not_positive_is_named(task, value):
     for field in dataclasses.fields(task):
@@ -375,37 +357,6 @@ def test_task_is_made_by_name_with_its_fields():
     assert make_task(Stabilize(duration=4.0)) == Stabilize(duration=4.0)
 
 
-def table_rows(doc):
-    """Cells of every row of the docstring's tables."""
-    lines = [line.strip() for line in doc.splitlines()]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-
-
-def tabulated(task):
-    """{observation number: divisor} as the docstring says; "8 + 3i" stands for one number for each i = 0 … last."""
-    last = re.search(r"i = 0 … (\d+)", task.__doc__)
-    numbers = {}
-    for cells in table_rows(task.__doc__):
-        for term in cells[0].split(",") if re.fullmatch(r"[\d, +i]+", cells[0]) else []:
-            base, _, slope = term.partition("+")
-            for i in range(int(last.group(1)) + 1 if slope else 1):
-                numbers[int(base) + i * int(slope.strip(" i") or 0)] = float(cells[2])
-    return numbers
-
-
-def test_docstring_tabulates_every_observation_with_its_scale(task):
-    assert tabulated(type(task)) == dict(enumerate(task.observation_scale))
-    assert f"float32 ({len(task.observation_scale)},)" in task.__doc__
-
-
-def test_docstring_names_every_argument(task):
-    missing = [field.name for field in dataclasses.fields(task) if field.name not in task.__doc__]
-    assert missing == []
-
-
-# --- one way ---
-
-
 def test_one_way_margins_are_no_wider_than_the_margins(task, rng, params):
     """And the same where a task leaves one way alone."""
     for _ in range(20):
@@ -416,24 +367,3 @@ def test_one_way_margins_are_no_wider_than_the_margins(task, rng, params):
         assert (one_way <= margins + 1e-12).all()
         if not task.id.startswith("BallbotWeave"):
             np.testing.assert_array_equal(one_way, margins)
-
-
-def test_weaves_one_way_is_past_the_nearer_side_of_every_obstacle(rng, params):
-    torch = pytest.importorskip("torch")
-    task = TASKS["weave"]()
-    for _ in range(10):
-        _, c = task.sample(rng, params)
-        for i in range(5):
-            ox, oy, _ = c[2 + 3 * i : 5 + 3 * i]
-            side = -1.0 if oy > c[1] else 1.0
-            for off in (0.01, 0.3, 1.0, 3.0):  # beside the obstacle, on the farther side and on the nearer one
-                y = torch.tensor(oy - side * off, requires_grad=True)
-                x = (torch.tensor(ox), y, *(torch.zeros(6, dtype=torch.float64)))
-                margin = task.one_way_margins(x, tuple(map(torch.tensor, c)))[1 + i]
-                margin.backward()
-                assert margin < 0
-                assert side * y.grad > 0  # it leads to the nearer side
-                near = np.array([ox, oy + side * off, 0, 0, 0, 0, 0, 0])
-                assert task.one_way_margins(near, c)[1 + i] == task.margins(near, c)[1 + i]
-            far_behind = np.array([ox + 3.0, oy - side * 1.0, 0, 0, 0, 0, 0, 0])
-            assert task.one_way_margins(far_behind, c)[1 + i] > 0

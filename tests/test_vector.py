@@ -11,12 +11,10 @@ pytest.importorskip("torch")
 
 import torch
 
-from ballbot_gym import BallbotParams, counter_rng, dynamics
 from ballbot_gym import batch as batch_module
+from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import REWARD_PARTS
-from ballbot_gym.params import default_params
-from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
@@ -53,35 +51,6 @@ def assert_same_info(got, expected, tolerance):
         np.testing.assert_allclose(got[key], expected[key], rtol=tolerance, atol=tolerance, err_msg=key)
 
 
-# --- whole episodes ---
-
-
-def test_episodes_run_at_once_are_those_that_single_envs_run(task, make_env, rng):
-    """Starts are such that some episodes end early; the policy is a linear function of the observation."""
-    short = type(task)(duration=1.0)
-    starts = [short.sample(rng, default_params()) for _ in range(6)]
-    x, c = (np.array(part) for part in zip(*starts, strict=True))
-    x[0, 2], x[0, 6] = 1.3, 4.0  # falls
-    weights = torch.tensor(rng.normal(0, 0.3, (2, len(short.observation_scale))), dtype=torch.float64)
-
-    def policy(observation):
-        return torch.tanh(observation.double() @ weights.T)
-
-    batch = BallbotBatch(short, len(x), dtype=torch.float64, compile=False)
-    run = run_episodes(batch, policy, x, c, record=True)
-    assert run.failure[0]
-    env = make_env(short, physics="rk4")
-    for i in range(len(x)):
-        controller = ActionController(short, env.params, lambda seen, begins: policy(torch.as_tensor(seen)).numpy())
-        alone = rollout(env, controller, options={"state": x[i], "constants": c[i]})
-        ended_early = len(alone.trajectory.u) < short.steps
-        assert (run.success[i], run.failure[i], run.steps[i]) == (alone.success, alone.failure, len(alone.trajectory.u))
-        assert run.terminated[i] == (alone.failure or (ended_early and alone.success))
-        # the env rounds observations to float32, and the robot multiplies that rounding by e^7.8 in a second
-        assert run.cost[i].item() == pytest.approx(alone.cost, rel=1e-3)
-        np.testing.assert_allclose(run.states[: run.steps[i], :, i], alone.trajectory.x[1:], atol=1e-2)
-
-
 def test_episodes_are_not_recorded_and_carry_no_gradient_unless_asked():
     task = TASKS["stabilize"](duration=0.1)
     weights = torch.zeros(8, 2, requires_grad=True)
@@ -92,9 +61,6 @@ def test_episodes_are_not_recorded_and_carry_no_gradient_unless_asked():
     assert not run.cost.requires_grad
     assert run.success.all()
     assert run.steps.tolist() == [5, 5]
-
-
-# --- the same environment as BallbotEnv(physics="rk4") ---
 
 
 def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task, make_vec, make_env, rng):
@@ -128,25 +94,6 @@ def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task,
     assert ends >= 8
 
 
-def test_one_step_in_float32_is_within_its_rounding(task, make_env, rng):
-    """From equal states, 2 · 4 evaluations of the accelerations leave some 1e-6 of relative error."""
-    name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
-    batch = BallbotBatch(name, 64, compile=False)
-    batch.reset(seed=2)
-    env = make_env(name, physics="rk4")
-    for _ in range(3):
-        x, c = batch.state.x.T.double().numpy(), batch.state.c.T.double().numpy()
-        actions = rng.uniform(-1, 1, (64, 2)).astype(np.float32)
-        result = batch.step(torch.from_numpy(actions))
-        for i in range(64):
-            env.reset(options={"state": x[i], "constants": c[i]})
-            observation, reward, terminated, _, info = env.step(actions[i])
-            np.testing.assert_allclose(result.final_x[:, i], info["state"], rtol=5e-6, atol=5e-6)
-            np.testing.assert_allclose(result.final_observation[i], observation, rtol=5e-6, atol=5e-6)
-            assert result.reward[i].item() == pytest.approx(reward, rel=5e-6, abs=2e-5)  # pay less cost may be near 0
-            assert result.terminated[i] == terminated
-
-
 def test_reaching_turns_goal_ends_the_episode_as_a_success_without_further_cost(make_vec):
     vec = make_vec(2, "turn")
     gate = np.array([0.98, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
@@ -159,18 +106,6 @@ def test_reaching_turns_goal_ends_the_episode_as_a_success_without_further_cost(
     cost = vec.task.cost(tuple(gate), (0.0, 0.0), (3.0,)) * 0.02
     assert infos["final_info"]["cost"][0] == pytest.approx(cost)
     assert rewards[0] == pytest.approx(vec.task.survival_pay - cost)
-
-
-def test_resting_at_the_origin_to_the_end_is_a_success(make_vec):
-    vec = make_vec(2, duration=0.1)
-    vec.reset(seed=0, options={"state": np.stack([np.zeros(8), np.full(8, 0.3)])})
-    for _ in range(5):
-        *_, truncations, infos = vec.step(np.zeros((2, 2)))
-    assert truncations.all()
-    assert infos["final_info"]["success"].tolist() == [True, False]
-
-
-# --- Gymnasium's rules ---
 
 
 def test_make_vec_gives_the_batched_env_with_the_spaces_of_the_single_one(task):
@@ -266,42 +201,6 @@ def test_steps_before_reset_and_after_close_and_bad_actions_are_refused(make_vec
             use()
 
 
-def test_what_a_step_returned_is_never_written_to_again(make_vec, rng):
-    vec = make_vec(8, dtype=torch.float32, duration=0.1)
-    returned = [vec.reset(seed=0)[0]]
-    copies = [returned[0].copy()]
-    for _ in range(12):
-        observations, rewards, *_, infos = vec.step(rng.uniform(-1, 1, (8, 2)))
-        returned += [observations, rewards, infos["state"]]
-        copies += [a.copy() for a in returned[-3:]]
-    for a, b in zip(returned, copies, strict=True):
-        np.testing.assert_array_equal(a, b)
-    with pytest.raises(ValueError, match="read-only"):
-        infos["state"][0] = 0
-
-
-def test_attributes_are_given_per_env(make_vec):
-    vec = make_vec(3)
-    vec.reset(seed=5)
-    assert vec.np_random_seed == vec.get_attr("np_random_seed") == (5, 6, 7)
-    assert vec.call("task") == (vec.task,) * 3
-    assert vec.get_attr("limit_names") == (("tilt", "arena"),) * 3
-    assert all(isinstance(params, BallbotParams) for params in vec.get_attr("episode_params"))
-    with pytest.raises(AttributeError):
-        vec.set_attr("task", None)
-
-
-def test_what_envs_are_made_of_cannot_be_set(make_vec):
-    vec = make_vec(3)
-    of_vec = ("render_mode", "autoreset_mode", "action_space", "single_observation_space")
-    for face, names in ((vec, of_vec), (vec.batch, ("dtype",))):
-        for name in ("task", "params", "randomization", "num_envs", *names):
-            with pytest.raises(AttributeError, match=f"'{name}' cannot be set"):
-                setattr(face, name, getattr(face, name))
-    with pytest.raises(AttributeError, match="'params' cannot be set"):
-        gymnasium.make_vec("BallbotTurn-v0", 2, "sync", physics="rk4").set_attr("params", vec.params)
-
-
 def test_every_env_is_drawn(make_vec):
     vec = make_vec(2, "weave", render_mode="rgb_array")
     vec.reset(seed=0)
@@ -309,9 +208,6 @@ def test_every_env_is_drawn(make_vec):
     assert len(images) == 2
     assert images[0].shape[2] == 3
     assert (images[0] != images[1]).any()
-
-
-# --- reproducibility ---
 
 
 def play(batch, actions, first=0):
@@ -356,9 +252,6 @@ def test_hashed_numbers_are_uniform_and_uncorrelated():
     both = torch.corrcoef(torch.cat([z, later, z[:, torch.roll(seed, 1)]]))
     assert (both - torch.eye(24)).abs().max() < 5 / math.sqrt(n)
     assert len(counter_rng._mix(torch.arange(2**16)).unique()) == 2**16
-
-
-# --- gradients ---
 
 
 def rollout_cost(batch, x0, gain, forces):
@@ -429,9 +322,6 @@ def test_gradient_ends_with_the_episode():
     assert (torch.autograd.grad(beyond, action, allow_unused=True)[0] == 0).all()
 
 
-# --- compiled ---
-
-
 ONE_STEP = {"duration": 0.1, "control_dt": 0.01}  # one RK4 step: two in a row compile twice as long
 needs_compiler = pytest.mark.skipif(not batch_module._has_compiler(torch.device("cpu")), reason="no C++ compiler")
 
@@ -454,16 +344,6 @@ def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wh
     for name in last._fields:
         a, b = getattr(last, name), getattr(last_eager, name)
         assert (a.dtype, a.shape) == (b.dtype, b.shape), name
-
-
-@pytest.mark.slow  # it compiles twice
-@needs_compiler
-def test_compiled_batch_of_5_envs_which_fill_no_register_has_the_bits_of_a_larger_one():
-    actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    with torch.no_grad():
-        many = play(BallbotBatch("stabilize", 37, compile=True, **ONE_STEP), actions, range(37))
-        few = play(BallbotBatch("stabilize", 5, compile=True, **ONE_STEP), actions[:, 7:12], range(7, 12))
-    assert all(torch.equal(a, b[:, 7:12]) for a, b in zip(few, many, strict=True))
 
 
 def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monkeypatch, caplog):
