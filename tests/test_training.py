@@ -39,7 +39,7 @@ def test_shac_goes_on_from_its_state_as_if_never_stopped(name):
 def test_shac_starts_at_lqr_and_lowers_the_cost():
     """From LQR's start a few iterations of small envs already save cost on the certified episodes."""
     task, params = TASKS["stabilize"](), default_params()
-    config = replace(LEARNERS["shac"].settings("stabilize"), iterations=15, num_envs=64, horizon=25, hidden=(32,))
+    config = replace(LEARNERS["shac"].settings("stabilize"), iterations=10, num_envs=32, horizon=20, hidden=(32,))
     learner = shac.Shac(task, params, config)
     before = training.score(learner.network, task)
     assert before.success > 0.5  # LQR within the limits of tanh
