@@ -128,24 +128,6 @@ def test_without_pay_the_reward_is_minus_the_cost_and_a_failure_has_its_price(na
     assert run(made, 1)[0].reward.max() < 1 - curricula.FAILURE_PRICE
 
 
-def test_a_share_of_the_episodes_repeats_starts_that_went_wrong(constants):
-    constants(ON_OPTIMA=0.0, RAMPS={})
-    made = backwards(num_envs=400)
-    torch.manual_seed(0)
-    first = made.state.c.clone()
-    run(made, made.task.steps)  # nobody gets to the gate in so short a time
-    again = made._again
-    assert 0.3 < float(again.double().mean()) < 0.5
-    assert set(made.state.c[0, again].tolist()) <= set(first[0].tolist())
-    assert not set(made.state.c[0, ~again].tolist()) & set(first[0].tolist())
-    assert torch.equal(made.state.x[5], made.state.c[0])  # each moves with the speed of the episode that it repeats
-    assert not made.state.steps.any()
-    result = made.step(torch.zeros(400, 2))
-    torch.testing.assert_close(result.observation, made.observe(made.state))
-    run(made, 40 * made.task.steps)
-    assert [hard.shape for hard in made._hard] == [(10, curricula._KEPT_STARTS), (10, 0)]
-
-
 def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     task = make_task("turn", duration=8.0)
     starts = curricula.optimal_starts(task, default_params(), 1, 100)

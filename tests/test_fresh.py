@@ -75,15 +75,6 @@ def test_measures_are_what_their_names_say(params):
     assert measured["widest obstacle, m"] == 0.4
 
 
-def test_the_tilt_rate_is_the_derivative_of_the_tilt(params):
-    x, dt = np.array([0.0, 0.0, 0.4, -0.3, 0.0, 0.0, 0.7, 0.9]), 1e-6
-    later = x.copy()
-    later[2:4] += dt * x[6:]
-    now, then = (Stabilize().measures(state, np.zeros(0), params) for state in (x, later))
-    change = math.radians(then["tilt, degrees"] - now["tilt, degrees"]) / dt
-    assert now["tilt rate, rad/s"] == pytest.approx(change, rel=1e-4)
-
-
 def test_a_fresh_episode_costs_what_it_costs_in_the_environment(turns, make_env):
     env = make_env("turn", physics="rk4")
     policy = load_policy(shipped_policies(Turn())["dagger"])

@@ -53,16 +53,6 @@ def test_mirrored_slaloms_are_passed_on_mirrored_sides_and_repeated_obstacles_on
         assert (sides_given[len(obstacles) - 1 :] == sides_given[len(obstacles) - 1]).all()
 
 
-def test_the_side_that_is_not_chosen_is_closed(slaloms):
-    _, c = slaloms
-    x = np.zeros((40, 8))
-    x[:, 0], x[:, 1] = c[:, 2], c[:, 3] + 3.0  # far on the left of the first obstacle
-    left = TASK.one_way_margins(x, c, (1.0,) * 5)[1]
-    right = TASK.one_way_margins(x, c, (-1.0,) * 5)[1]
-    assert (left > 0).all()
-    assert (right < 0).all()
-
-
 @pytest.mark.slow
 def test_routes_learn_to_cost_less_than_the_nearer_sides():
     torch.manual_seed(0)

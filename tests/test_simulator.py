@@ -129,19 +129,6 @@ def test_rk4_simulator_is_the_closed_form_step(params):
     assert simulator.step(FORCE) == dynamics.step(params, START, FORCE, 0.02, 2)
 
 
-def test_substeps_in_bullet_are_bitwise_as_many_steps(params):
-    coarse, fine = BulletSimulator(params, 0.02, 0.001), BulletSimulator(params, 0.001, 0.001)
-    for simulator in (coarse, fine):
-        simulator.reset(START)
-    for force in (FORCE, (-350.0, 350.0), (0.0, 10.0)):
-        after = coarse.step(force)
-        for _ in range(20):
-            finely_after = fine.step(force)
-        assert after == finely_after
-    coarse.close()
-    fine.close()
-
-
 def test_two_simulators_do_not_disturb_each_other(params, physics):
     alone, beside, other = (make_simulator(physics, params, 0.02) for _ in range(3))
     for simulator in (alone, beside):

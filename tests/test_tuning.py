@@ -151,14 +151,6 @@ def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, c
     assert (tmp_path / "ppo.yml").exists()
 
 
-def test_a_search_belongs_to_a_robot(fakes, tmp_path, capsys):
-    tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path, robot="kugle")
-    assert "--robot kugle" in capsys.readouterr().out
-    assert not (tmp_path / "ppo.yml").exists()  # rl-zoo3 knows the ids alone
-    with pytest.raises(ValueError, match="robot"):
-        tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path)
-
-
 def test_real_trainings_have_an_outcome_per_seed():
     tiny = {"num_envs": 4, "num_steps": 4, "hidden": (4,), "batch_size": 8}
     search = Search("ppo", "stabilize", (0, 1), 32, 1, "rolling")
