@@ -110,7 +110,3 @@ def test_damaged_maps_are_named_and_no_error(content, tmp_path):
     fractions, why = basins.recovered_fractions(tmp_path)
     assert fractions == {}
     assert f"{tmp_path / 'basins.json'} is damaged" in why
-
-
-def test_the_states_to_run_are_counted_by_controller(bounds):
-    assert basins.states_to_run(bounds, ["lqr", "nmpc"], 5, "rk4") == {"lqr": 18, "nmpc": 18}

@@ -57,17 +57,6 @@ def test_names_neither_rewrite_the_screen_nor_turn_it_around(monkeypatch):
     assert ":smile:" in text
 
 
-def test_nothing_is_printed_after_the_end(monkeypatch):
-    printed = Console(file=io.StringIO(), width=100)
-    monkeypatch.setattr(console, "console", printed)
-    monkeypatch.setattr(console, "LINE_SECONDS", 0.05)
-    with console.progress_bars({"turn": 4}):
-        pass
-    before = printed.file.getvalue()
-    time.sleep(0.2)
-    assert printed.file.getvalue() == before
-
-
 @pytest.mark.parametrize(
     ("start", "workers", "end", "busy"),
     [(0.1, 4, 4.5, False), (3.0, 4, 4.0, True), (0.0, 1, 6.0, True), (math.nan, 4, math.nan, False)],

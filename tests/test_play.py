@@ -11,22 +11,27 @@ import numpy as np
 import pytest
 import torch
 
-from ballbot_baselines import CONTROLLERS, find_optimum
+from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified, dynamics
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.play import views
+from ballbot_train.play import crew, views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.play.tunable import Tunable, weight_names
-from ballbot_train.play.world import PLANT, randomization
-from ballbot_train.policy_files import BEST, PolicyError
+from ballbot_train.policy_files import BEST
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
+
+
+@pytest.fixture
+def no_optimum(monkeypatch):
+    """The optimum of the episode is not searched, which would compile a problem that no other test solves."""
+    monkeypatch.setattr(crew, "_optimum_costs", lambda task, *problem: np.zeros(task.steps + 1))
 
 
 @pytest.fixture
@@ -50,9 +55,6 @@ def go(playground, seconds):
         assert playground.step()
 
 
-# --- the episode ---
-
-
 @pytest.mark.parametrize("episode", [STANDING, FALLING])
 def test_an_episode_without_pushes_costs_what_the_env_says(play, episode):
     playground = play(episode=episode)
@@ -73,17 +75,6 @@ def test_the_optimum_costs_what_is_certified(play):
     early = playground.optimum_cost_so_far
     go(playground, 1.0)
     assert 0 < early < playground.optimum_cost_so_far < playground.optimum_cost
-
-
-def test_a_push_makes_the_robot_lean(play):
-    playground = play()
-    go(playground, 7.0)
-    before = playground.main.samples[-1].tilt
-    playground.push(30.0, 0.0)
-    go(playground, 0.2)
-    assert before < math.radians(0.5)
-    assert max(sample.tilt for sample in list(playground.main.samples)[-10:]) > math.radians(5)
-    assert views.drawing(playground).robots[-1].push is not None
 
 
 def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shipped_policy(play):
@@ -122,17 +113,6 @@ def test_ghosts_get_the_same_start_and_the_same_pushes(play):
     assert playground.main.x != ghost.x
 
 
-def test_a_ghost_that_is_added_begins_where_the_robot_is(play):
-    playground = play()
-    go(playground, 0.5)
-    here = playground.main.x
-    playground.set_ghosts(["you"])
-    assert playground.crew.runners[1].x == here
-    playground.settle()
-    go(playground, 0.1)
-    assert playground.crew.ghosts == ("you",)
-
-
 def test_controllers_change_without_a_jump(play):
     playground = play()
     go(playground, 0.5)
@@ -148,16 +128,6 @@ def test_controllers_change_without_a_jump(play):
     steps = np.abs(np.diff([state[:2] for state in states], axis=0)).max()
     assert steps < 0.02 * 8  # m: a control step at less than 8 m/s
     assert len(playground.trajectory().u) > 25  # one episode all along
-
-
-def test_after_an_episode_the_robot_goes_on_where_it_is(play):
-    playground = play()
-    go(playground, 7.9)
-    before = np.array(playground.main.x)
-    go(playground, 0.2)
-    assert len(playground.scores) == 1
-    assert playground.seconds < 0.2
-    assert np.abs(np.array(playground.main.x) - before)[:2].max() < 0.05
 
 
 def test_after_a_fall_the_same_episode_begins_again(play):
@@ -176,14 +146,6 @@ def test_after_a_fall_the_same_episode_begins_again(play):
     assert playground.episode == FALLING
 
 
-def test_next_begins_the_next_certified_episode(play):
-    playground = play(episode=FALLING)
-    playground.at_end = "next"
-    for _ in range(110):
-        playground.step()
-    assert playground.episode == FALLING + 1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
@@ -194,9 +156,6 @@ def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
     assert playground.crew.notice == ""
     assert all(score.failure == "" for score in playground.scores)
     assert views.drawing(playground).paths[-1].name in ("plan", "robot")
-
-
-# --- what the user changes ---
 
 
 def test_lqr_reacts_to_a_weight(play):
@@ -211,15 +170,6 @@ def test_lqr_reacts_to_a_weight(play):
     np.testing.assert_allclose(playground.main.controller.act(0.0, np.ones(8)), before)
 
 
-def test_the_cost_so_far_is_counted_with_the_new_weights(play):
-    playground = play()
-    go(playground, 0.5)
-    before = playground.main.cost
-    for name in weight_names(playground.world.base):
-        playground.set_weight(name, 2 * getattr(playground.world.base, name))
-    assert playground.main.cost == pytest.approx(2 * before)
-
-
 def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     playground = play()
     gain = playground.main.controller.act(0.0, np.ones(8))
@@ -229,16 +179,6 @@ def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     np.testing.assert_array_equal(playground.main.controller.act(0.0, np.ones(8)), gain)
     go(playground, 0.02)
     assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
-
-
-def test_every_hidden_change_can_go_to_both_ends_while_the_robot_moves(play):
-    playground = play(episode=STANDING)
-    for stress, span in PLANT.items():
-        for severity in (span.low, span.high, 0.0):
-            playground.set_plant(stress, severity)
-            go(playground, 0.04)
-    assert playground.crew.notice == ""
-    assert randomization(playground.plant).active is False
 
 
 def test_a_human_drives_the_robot_that_balances_itself(play):
@@ -268,7 +208,7 @@ def test_a_stick_reaches_no_farther_than_one():
 
 
 @pytest.mark.parametrize(("physics", "seed"), [("rk4", 0), ("bullet", 1)])
-def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
+def test_an_episode_of_another_robot_is_that_of_the_env(play, no_optimum, seed, physics):
     if physics == "bullet":
         pytest.importorskip("pybullet")
     playground = play(robot="rolling", episode=None, seed=seed, physics=physics)
@@ -282,7 +222,7 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
     assert (score.failure != "") == expected.failure
 
 
-def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, interpreted):
+def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, no_optimum):
     playground = play(controller="lqr", ghosts=["you", "shac"])
     playground.set_robot("kugle")
     playground.settle()
@@ -293,9 +233,6 @@ def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, interpret
     playground.settle()
     assert playground.step()
     assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
-
-
-# --- bad input ---
 
 
 def test_no_push_harms(play):
@@ -356,14 +293,6 @@ def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_m
     assert saved_model not in playground.controllers
 
 
-def test_a_file_that_was_used_once_is_offered_from_then_on(play, saved_model):
-    playground = play(ghosts=[saved_model])
-    playground.set_ghosts([])
-    assert saved_model in playground.controllers
-    with pytest.raises(PolicyError, match="gone"):
-        play(policies=["gone.pt"])
-
-
 def test_a_controller_that_fails_gives_no_force_and_is_named(play):
     playground = play()
 
@@ -392,9 +321,6 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
     assert "LQR does instead" in playground.crew.notice
 
 
-# --- what is kept ---
-
-
 def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
     playground = play(ghosts=["you"])
     go(playground, 0.5)
@@ -405,19 +331,6 @@ def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
     command = views.optimize_command(playground).split()
     assert command[:4] == ["ballbot", "optimize", "stabilize", "--state"]
     assert [float(value) for value in command[4:]] == pytest.approx(playground.main.x, rel=1e-8)
-
-
-def test_the_history_that_is_plotted_stays_short(play):
-    playground = play(ghosts=["you"])
-    go(playground, 9.0)
-    history = views.history(playground, 200)
-    assert len(history.seconds) == 200
-    assert (np.diff(history.seconds) > 0).all()
-    assert all(np.isfinite(line).all() and line.shape == (200, 4) for line in history.lines.values())
-    assert len(playground.main.trace) == 400
-
-
-# --- weights as constants ---
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -434,20 +347,6 @@ def test_a_tunable_task_costs_what_the_task_with_these_weights_costs(task, param
     assert tunable.margins(x, full) == pytest.approx(base.margins(x, c))
     np.testing.assert_array_equal(tunable.observe(x, full), base.observe(x, c))
     assert tunable.steps == base.steps
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
-def test_the_optimum_of_a_tunable_task_is_that_of_the_task(task, params, rng):
-    base = TASKS[task]()
-    tunable = Tunable.of(base)
-    x, c = base.sample(rng, params)
-    assert find_optimum(tunable, params, x, tunable.constants(c, {})).cost == pytest.approx(
-        find_optimum(base, params, x, c).cost, rel=1e-6
-    )
-
-
-# --- time ---
 
 
 class Watch:
@@ -484,19 +383,6 @@ def test_a_short_hold_up_is_caught_up_and_a_long_one_is_given_up():
     assert sum(clock.take() for _ in range(50)) == 1
     assert clock.timing.real_time_factor < 0.05
     assert LATE == 0.02
-
-
-def test_speed_stretches_time_and_a_pause_owes_no_steps():
-    watch = Watch()
-    clock = Clock(0.02, speed=0.5, now=watch)
-    clock.take()
-    watch.now += 0.03
-    assert not clock.take()
-    assert clock.wait() == pytest.approx(0.01)
-    clock.stop()
-    watch.now += 100.0
-    assert clock.take()
-    assert not clock.take()
 
 
 def test_while_a_slider_moves_only_its_last_value_is_worked_on(play, monkeypatch):
@@ -538,12 +424,6 @@ def test_a_job_of_another_process_does_not_hold_up_the_end():
     job = background.submit(lambda: background.compute(time.sleep, 60.0))
     background.close()
     assert job.done()
-
-
-def test_a_job_that_raises_gives_its_error():
-    background = Background()
-    assert isinstance(background.submit(lambda: 1 / 0).exception(5), ZeroDivisionError)
-    background.close()
 
 
 def test_every_episode_of_a_track_has_a_robot_of_its_own(play):

@@ -5,12 +5,9 @@ from dataclasses import replace
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from PIL import Image
 
-from ballbot_baselines import trajopt
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
@@ -77,12 +74,6 @@ def test_a_film_moves_and_ends_when_the_longest_take_does(two_takes):
     assert changed[:, 320:].any()
 
 
-def test_a_film_is_drawn_the_same_whatever_came_before(two_takes):
-    forwards = list(film_frames(two_takes, [0.1, 0.5, 0.9], width=320))
-    backwards = list(film_frames(two_takes, [0.9, 0.5, 0.1], width=320))
-    np.testing.assert_array_equal(forwards, backwards[::-1])
-
-
 @pytest.mark.parametrize("ending", ["mp4", "gif"])
 def test_a_film_is_read_back_with_its_frames_and_duration(two_takes, tmp_path, ending):
     path = write_film(two_takes, tmp_path / f"film.{ending}", seconds=1.0, fps=10, width=320)
@@ -93,30 +84,6 @@ def test_a_film_is_read_back_with_its_frames_and_duration(two_takes, tmp_path, e
         assert frames[0].shape[:2] == (180, 320)
         if ending == "mp4":
             assert reader.get_meta_data()["fps"] == 10
-
-
-@pytest.mark.parametrize("ending", ["gif", "webp"])
-def test_a_film_that_loops_pauses_at_its_end(two_takes, tmp_path, ending):
-    path = write_film(two_takes, tmp_path / f"film.{ending}", seconds=0.3, fps=10, width=320)
-    with Image.open(path) as film:
-        durations = []
-        for frame in range(film.n_frames):
-            film.seek(frame)
-            film.load()
-            durations.append(film.info["duration"])
-    assert durations == [100, 100, 100, 1600]
-
-
-def test_the_film_says_who_fell_only_after_the_fall(two_takes):
-    fallen = Take("falls", lean(1.4, seconds=0.5), "#c0392b", "fails at 0.50 s", failed=True)
-    replay = Replay("", (fallen, *two_takes.takes[:1]))
-    standing = Replay("", (replace(fallen, failed=False, note=""), *two_takes.takes[:1]))
-    before, after = film_frames(replay, [0.4, 0.6], width=640)
-    before_standing, after_standing = film_frames(standing, [0.4, 0.6], width=640)
-    np.testing.assert_array_equal(before, before_standing)
-    changed = (after != after_standing).any(axis=2)
-    assert changed[:, :320].any()
-    assert not changed[:, 320:].any()
 
 
 def test_a_film_that_is_interrupted_leaves_nothing(two_takes, tmp_path):
@@ -169,29 +136,6 @@ def test_ghosts_from_the_start_are_drawn_beside_every_take_but_their_own():
     changed = (next(with_ghost) != next(without)).any(axis=2)
     assert changed[:110, 160:].any()
     assert not changed[:110, :160].any()
-
-
-def test_where_the_expert_is_too_late_the_replay_says_so(monkeypatch):
-    shown, asked = certified_replay("stabilize", ["lqr", "trajopt"], FALLING, physics="rk4"), []
-    plan = trajopt.plan_to_track
-
-    def find_none_at_first(*arguments, **keywords):
-        """Under LQR there is none, which takes long to find out."""
-        asked.append(arguments)
-        if len(asked) == 1:
-            raise PlanError("no feasible episode")
-        return plan(*arguments, **keywords)
-
-    monkeypatch.setattr(trajopt, "plan_to_track", find_none_at_first)
-    late, early = with_ghosts(shown, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4").takes
-    assert late.ghosts == ()
-    assert late.note.endswith("trajopt finds no way on from 0.36 s")
-    assert len(early.ghosts) == 1
-
-    asked.clear()
-    alone = Replay("", shown.takes[:1])
-    with pytest.raises(PlanError, match=r"finds no way on from 0\.36 s under LQR"):
-        with_ghosts(alone, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4")
 
 
 def test_files_called_the_same_are_told_apart_by_their_folders(tmp_path):
