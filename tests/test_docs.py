@@ -251,12 +251,6 @@ def test_the_layout_in_contributing_lists_exactly_the_files_that_exist():
     assert sorted(str(path.relative_to(ROOT)) for path in existing - found) == [], "exist, but are not listed"
 
 
-def test_every_line_of_the_layout_says_what_the_file_is():
-    _, _, text = (ROOT / "CONTRIBUTING.md").read_text().partition("## Layout")
-    lines = re.search(r"```\n(.*?)```", text, flags=re.DOTALL)[1].splitlines()
-    assert [line for line in lines if len(line.split()) < 2 and not line.endswith("/")] == []
-
-
 def test_version_is_the_same_everywhere():
     version = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), flags=re.MULTILINE)[1]
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()

@@ -368,7 +368,3 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
     must.reset(seed=0)
     with pytest.raises(RuntimeError, match="no such compiler"):
         must.step(torch.zeros(4, 2))
-
-
-def test_small_batches_are_not_compiled_by_themselves():
-    assert not BallbotBatch("stabilize", 16).compiled
