@@ -53,7 +53,7 @@ def test_missing_library_names_its_extra(code, library, extra):
 
 EXTRAS = (
     *("casadi", "scipy", "matplotlib", "torch", "stable_baselines3", "minari", "tyro", "rich", "filelock"),
-    *("tensorboard", "safetensors", "jinja2", "plotly", "imageio", "h5py"),
+    *("tensorboard", "safetensors", "jinja2", "imageio", "h5py"),
 )
 """What the extras bring."""
 

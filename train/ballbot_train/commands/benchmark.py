@@ -47,7 +47,7 @@ def benchmark(
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of the bootstrap intervals, and of whatever an episode draws.
         runs: folder where other commands left their results: the recovered share of `basins` joins the leaderboard, and
-            basins, robustness, transfer, training and the paper's figures join the report.
+            basins, robustness, transfer and the paper's figures join the report.
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.
@@ -75,12 +75,12 @@ def benchmark(
         for row in leaderboard(done, seed)
     ]
     write_leaderboard(rows, done, facts, out)
-    figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
+    regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
     table = [cells(row, busy) for row in rows]
     files.write(out / "leaderboard.md", markdown(HEADER, table) + (f"\n{BUSY_NOTE}\n" if busy else ""))
     sections = leaderboard_sections(
-        HEADER, table, done, chosen, pictures, physics, runs, BUSY_NOTE if busy else "", robot
+        HEADER, table, done, chosen, regrets, pictures, physics, runs, BUSY_NOTE if busy else "", robot
     )
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     page = write_report(title, sections, facts, out / "report.html")
