@@ -189,18 +189,9 @@ def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, .
     write_leaderboard(leaderboard(made), made, {"commit": "a"}, folder)
 
     def read() -> None:
-        for path in (folder / "leaderboard.json", folder / "episodes.csv"):
-            leaderboard(read_results(path)[1] or made)
+        leaderboard(read_results(folder)[1] or made)
 
-    return [folder / "leaderboard.json", folder / "episodes.csv"], read, (ValueError,)
-
-
-def _basins(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    from ballbot_train.evaluation.basins import recovered_fractions
-
-    path = folder / "basins.json"
-    path.write_text(json.dumps({"rows": [{"task": "stabilize", "controller": "lqr", "recovered": 0.5}] * 3}))
-    return [path], lambda: recovered_fractions(folder), ()
+    return [folder / "leaderboard.json"], read, (ValueError,)
 
 
 def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
@@ -264,7 +255,6 @@ READERS = {
     "saved model of Stable-Baselines3": _sb3_model,
     "saved model of rsl_rl": _rsl_model,
     "results": _results,
-    "basins": _basins,
     "marker": _marker,
     "job entries": _entries,
     "demonstrations": _demos,

@@ -4,7 +4,6 @@ Every case is a call, and what its message must contain. A call gets an empty fo
 typed after `ballbot`.
 """
 
-import csv
 import io
 import itertools
 import json
@@ -465,14 +464,15 @@ POLICIES = [
 ]
 
 
-def results(edit=lambda text: text, name="episodes.csv"):
-    """Reads a benchmark's file after an edit of its text."""
+def results(edit=lambda text: text):
+    """Reads a benchmark's leaderboard.json after an edit of its text."""
 
     def read(folder):
         made = [result(episode=i) for i in range(10)]
         write_leaderboard(leaderboard(made), made, {"commit": "a"}, folder)
-        (folder / name).write_text(edit((folder / name).read_text()))
-        return read_results(folder / name)
+        path = folder / "leaderboard.json"
+        path.write_text(edit(path.read_text()))
+        return read_results(path)
 
     return read
 
@@ -485,21 +485,16 @@ def entry(**changes):
         document["episodes"][0] |= changes
         return json.dumps(document)
 
-    return results(edit, "leaderboard.json")
+    return results(edit)
 
 
 RESULTS = [
     (lambda f: read_results(f), "leaderboard.json: no such file"),
-    (lambda f: read_results(f / "none.csv"), "holds no episodes of a benchmark"),
-    (results(lambda text: text[:-5]), "its last line is cut off"),
-    (results(lambda text: text.replace("12.0", "12.x", 1)), "holds no episodes of a benchmark"),
-    (results(lambda text: text.replace("True", "yes", 1)), "holds no episodes of a benchmark"),
-    (results(lambda text: text.replace("optimum", "best")), "holds no episodes of a benchmark"),
-    (results(lambda text: text.replace("12.0", "nan", 1)), "has the cost nan"),
-    (results(lambda text: "a" * (csv.field_size_limit() + 1) + "\n1\n"), "holds no episodes of a benchmark"),
-    (results(lambda text: text[:-9], "leaderboard.json"), "holds no JSON"),
-    (results(lambda text: "[" * 100_000, "leaderboard.json"), "nested too deeply"),
-    (results(lambda text: '{"about": {}}', "leaderboard.json"), "holds no episodes of a benchmark"),
+    (lambda f: read_results(f / "none.json"), "holds no episodes of a benchmark"),
+    (results(lambda text: text[:-9]), "holds no JSON"),
+    (results(lambda text: "[" * 100_000), "nested too deeply"),
+    (results(lambda text: '{"about": {}}'), "holds no episodes of a benchmark"),
+    (entry(cost=None), "has the cost nan"),
     (entry(optimum=0), "the optimum 0"),
     (entry(optimum=None), "the optimum nan"),
     (entry(cost="12"), "cost of an episode is '12'"),
@@ -741,7 +736,7 @@ TYPED = [
     ("certify --ray ray://head:10001", "is the address of a Ray client, which is not supported"),
     ("certify --install --shards set", "give --install without --shards"),
     ("certify --episodes 1 --shards nowhere://set", "nowhere://set/stabilize cannot be read"),
-    ("train ppo --ray auto", "--ray does the runs of --seeds"),
+    ("train ppo --seeds 0:2 --workers 0", "workers must be 1 to 1024, not 0"),
     ("train dagger --demos nowhere://set", "nowhere://set cannot be read"),
     ("robustness --stresses", "give at least one stress"),
     ("robustness --stresses push push", "stress push is given more than once"),

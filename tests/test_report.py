@@ -125,7 +125,7 @@ def test_the_report_of_a_robot_shows_nothing_of_another(tmp_path):
     (tmp_path / "basins" / "basins.png").write_bytes(b"a picture")
     (tmp_path / "basins" / "basins.json").write_text('{"about": {"robot": "rolling"}}')
     picture = tmp_path / "basins" / "basins.png"
-    arguments = (HEADER, ROWS, results, {"stabilize": ["lqr"]}, picture, [], "rk4", tmp_path, "")
+    arguments = (HEADER, ROWS, results, {"stabilize": ["lqr"]}, picture, [], "rk4", tmp_path)
     shown = {
         robot: [section.title for section in leaderboard_sections(*arguments, robot) if section is not None]
         for robot in ("paper", "rolling")

@@ -1,6 +1,5 @@
 """What evaluation measures: episodes' results, rows of the leaderboard, and the files that hold them."""
 
-import csv
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -70,8 +69,6 @@ class Row(Displayed):
     """Mean of |F|, N."""
     plan_ms_median: float
     step_us_median: float
-    recovered: float = math.nan
-    """Share of the physically recoverable states from which it recovers, where `ballbot basins` measured it."""
 
     def facts(self) -> dict[str, str]:
         return {
@@ -181,7 +178,7 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
     """What a benchmark's facts and episodes were.
 
     Args:
-        path: its folder, its leaderboard.json or its episodes.csv, which holds no facts.
+        path: its folder or its leaderboard.json.
 
     Raises:
         ValueError: it is none of these, or damaged.
@@ -189,16 +186,11 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
     path = Path(path)
     path = path / "leaderboard.json" if path.is_dir() else path
     try:
-        if path.suffix == ".csv":
-            text = files.read(path).decode()
-            if not text.endswith("\n"):
-                raise ValueError("its last line is cut off")
-            return {}, [_checked(_from_csv(entry)) for entry in csv.DictReader(text.splitlines())]
         document = files.read_json(path)
         return dict(document["about"]), [_checked(_from_json(entry)) for entry in document["episodes"]]
     except files.FileError as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, csv.Error) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error!r}") from error
 
 
@@ -221,13 +213,6 @@ def _from_json(entry: Mapping[str, Any]) -> Result:
             raise TypeError(f"{field.name} of an episode is {value!r:.200}")
         values[field.name] = kind(value)  # a whole number that no float holds is an OverflowError
     return Result(**values)
-
-
-def _from_csv(entry: Mapping[str, str]) -> Result:
-    truths = {"True": True, "False": False}
-    read: dict[Any, Any] = {str: files.csv_text, int: int, float: float, bool: truths.__getitem__}
-    kinds = {field.name: read[field.type] for field in fields(Result)}
-    return Result(**{key: kinds[key](value) for key, value in entry.items()})
 
 
 def write_csv(path: Path, entries: Sequence[Any]) -> Path:
@@ -263,14 +248,9 @@ HEADER = [
     "peak tilt",
     "settle",
     "mean force",
-    "recovered",
     "plan",
     "per step",
 ]
-
-
-BUSY_NOTE = "~ The machine was busy, so plan and per step are longer than they need be."
-"""What stands below a table of `cells` of a busy machine."""
 
 
 def shown(value: float, form: str, unit: str = "") -> str:
@@ -278,11 +258,8 @@ def shown(value: float, form: str, unit: str = "") -> str:
     return format(value, form) + unit if math.isfinite(value) else "–"
 
 
-def cells(row: Row, busy: bool = False) -> list[str]:
-    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash.
-
-    Times of a busy machine have a ~ in front.
-    """
+def cells(row: Row) -> list[str]:
+    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash."""
     ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
     return [
         row.task,
@@ -294,9 +271,6 @@ def cells(row: Row, busy: bool = False) -> list[str]:
         shown(row.peak_tilt_median, ".1f", "°"),
         shown(row.settle_time_median, ".2f", " s"),
         shown(row.effort_mean, ".0f", " N"),
-        shown(row.recovered, ".0%"),
-        *(
-            "~" * (busy and math.isfinite(value)) + shown(value, ".0f", unit)
-            for value, unit in ((row.plan_ms_median, " ms"), (row.step_us_median, " µs"))
-        ),
+        shown(row.plan_ms_median, ".0f", " ms"),
+        shown(row.step_us_median, ".0f", " µs"),
     ]

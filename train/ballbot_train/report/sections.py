@@ -22,7 +22,6 @@ def leaderboard_sections(
     pictures: Sequence[Path],
     physics: str,
     runs: Path,
-    note: str = "",
     robot: str = PAPER,
 ) -> list[Section | None]:
     """The page of `ballbot benchmark`.
@@ -36,7 +35,6 @@ def leaderboard_sections(
         pictures: of certified episodes.
         physics: "bullet", "mujoco" or "rk4".
         runs: folder in which other commands have left theirs: basins, robustness, transfer and paper.
-        note: about the leaderboard.
         robot: by name; what other commands have left of other robots is left out.
     """
     replays = [replay_of(task, names, results, physics, robot) for task, names in controllers.items()]
@@ -45,7 +43,7 @@ def leaderboard_sections(
             "Leaderboard",
             header,
             table,
-            f"Regret is cost / optimum − 1 over the episodes that did not fail. Press a column's head to sort by it. {note}",
+            "Regret is cost / optimum − 1 over the episodes that did not fail. Press a column's head to sort by it.",
         ),
         replay_section(
             "Watch an episode",
