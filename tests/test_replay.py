@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ballbot_baselines import trajopt
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
-from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory, TrajectoryError
 from ballbot_train.commands.replay import replay
@@ -22,7 +20,6 @@ from ballbot_train.report.replay import (
     certified_replay,
     file_replay,
     with_companions,
-    with_ghosts,
 )
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
@@ -137,28 +134,12 @@ def test_the_same_episode_starts_alike_under_every_controller():
     assert len(shown.markers) == 2  # the gate's posts
 
 
-def test_where_lqr_falls_the_ghost_goes_on_from_its_state_to_the_goal():
-    shown = certified_replay("stabilize", ["lqr"], FALLING)
-    (take,) = shown.takes
-    assert take.note == "fails at 0.40 s"
-    (take,) = with_ghosts(shown, "stabilize", FALLING, at=0.1, expert="trajopt", physics="bullet").takes
-    (ghost,) = take.ghosts
-    np.testing.assert_array_equal(ghost.trajectory.x[0], take.trajectory.state(0.1))
-    np.testing.assert_array_equal(ghost.state(0.1), ghost.trajectory.x[0])
-    assert ghost.state(0.08) is None
-    assert take.note.endswith("ghost from 0.10 s: at the goal")
-    assert np.hypot(*ghost.trajectory.x[-1, :2]) < 0.1
-    assert Replay("", (take,)).duration == pytest.approx(8.1)  # the ghost is watched to its end
-    seen, hidden = film_frames(shown, [0.4], width=320), film_frames(Replay("", (take,), shown.markers), [0.4], 320)
-    assert (next(seen) != next(hidden)).any()
-
-
 def test_ghosts_from_the_start_are_drawn_beside_every_take_but_their_own():
     shown = certified_replay("stabilize", ["lqr", "ppo"], FALLING, physics="rk4")
     lqr, ppo = with_companions(shown, Replay("", shown.takes[:1])).takes
     assert lqr.ghosts == ()
     (ghost,) = ppo.ghosts
-    assert (ghost.label, ghost.color, ghost.start) == ("LQR", lqr.color, 0.0)
+    assert (ghost.label, ghost.color) == ("LQR", lqr.color)
     together = replace(shown, takes=(lqr, ppo))
     beside, alone = together.drawing(ppo, 0.2), together.drawing(lqr, 0.2)
     assert [robot.alpha < 1 for robot in beside.robots] == [True, False]
@@ -169,29 +150,6 @@ def test_ghosts_from_the_start_are_drawn_beside_every_take_but_their_own():
     changed = (next(with_ghost) != next(without)).any(axis=2)
     assert changed[:110, 160:].any()
     assert not changed[:110, :160].any()
-
-
-def test_where_the_expert_is_too_late_the_replay_says_so(monkeypatch):
-    shown, asked = certified_replay("stabilize", ["lqr", "trajopt"], FALLING, physics="rk4"), []
-    plan = trajopt.plan_to_track
-
-    def find_none_at_first(*arguments, **keywords):
-        """Under LQR there is none, which takes long to find out."""
-        asked.append(arguments)
-        if len(asked) == 1:
-            raise PlanError("no feasible episode")
-        return plan(*arguments, **keywords)
-
-    monkeypatch.setattr(trajopt, "plan_to_track", find_none_at_first)
-    late, early = with_ghosts(shown, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4").takes
-    assert late.ghosts == ()
-    assert late.note.endswith("trajopt finds no way on from 0.36 s")
-    assert len(early.ghosts) == 1
-
-    asked.clear()
-    alone = Replay("", shown.takes[:1])
-    with pytest.raises(PlanError, match=r"finds no way on from 0\.36 s under LQR"):
-        with_ghosts(alone, "stabilize", FALLING, at=0.36, expert="trajopt", physics="rk4")
 
 
 def test_files_called_the_same_are_told_apart_by_their_folders(tmp_path):
