@@ -3,15 +3,13 @@
 import math
 import os
 import signal
-import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from ballbot_baselines import CONTROLLERS, find_optimum
+from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified, dynamics
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
@@ -22,7 +20,6 @@ from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
-from ballbot_train.play.tunable import Tunable, weight_names
 from ballbot_train.play.world import PLANT, randomization
 from ballbot_train.policy_files import BEST, PolicyError
 
@@ -199,27 +196,6 @@ def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
 # --- what the user changes ---
 
 
-def test_lqr_reacts_to_a_weight(play):
-    playground = play()
-    before = playground.main.controller.act(0.0, np.ones(8))
-    playground.set_weight("effort_weight", 5e-3)
-    playground.settle()
-    after = playground.main.controller.act(0.0, np.ones(8))
-    assert np.abs(after).max() < 0.9 * np.abs(before).max()
-    playground.set_weight("effort_weight", playground.world.base.effort_weight)
-    playground.settle()
-    np.testing.assert_allclose(playground.main.controller.act(0.0, np.ones(8)), before)
-
-
-def test_the_cost_so_far_is_counted_with_the_new_weights(play):
-    playground = play()
-    go(playground, 0.5)
-    before = playground.main.cost
-    for name in weight_names(playground.world.base):
-        playground.set_weight(name, 2 * getattr(playground.world.base, name))
-    assert playground.main.cost == pytest.approx(2 * before)
-
-
 def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     playground = play()
     gain = playground.main.controller.act(0.0, np.ones(8))
@@ -316,9 +292,6 @@ WRONG = [
     (lambda p: p.set_controller("nobody"), "unknown controller 'nobody'"),
     (lambda p: p.set_controller("nowhere/policy.json"), "unknown controller"),
     (lambda p: p.set_ghosts(["nobody"]), "unknown controller 'nobody'"),
-    (lambda p: p.set_weight("nothing", 1.0), "unknown weight nothing"),
-    (lambda p: p.set_weight("effort_weight", math.nan), "effort_weight must be"),
-    (lambda p: p.set_weight("effort_weight", -1.0), "effort_weight must be"),
     (lambda p: p.set_plant("mass", math.nan), "mass must be -50 to 100"),
     (lambda p: p.set_plant("mass", 1e9), "mass must be -50 to 100"),
     (lambda p: p.set_plant("weather", 1.0), "unknown change weather"),
@@ -395,16 +368,11 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
 # --- what is kept ---
 
 
-def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
+def test_what_happened_can_be_saved(play, tmp_path):
     playground = play(ghosts=["you"])
     go(playground, 0.5)
     path = playground.trajectory().save(tmp_path / "played.npz")
     np.testing.assert_array_equal(Trajectory.load(path).x[-1], playground.main.x)
-    replay = views.replay(playground)
-    assert [take.label for take in replay.takes] == ["LQR", "you"]
-    command = views.optimize_command(playground).split()
-    assert command[:4] == ["ballbot", "optimize", "stabilize", "--state"]
-    assert [float(value) for value in command[4:]] == pytest.approx(playground.main.x, rel=1e-8)
 
 
 def test_the_history_that_is_plotted_stays_short(play):
@@ -415,36 +383,6 @@ def test_the_history_that_is_plotted_stays_short(play):
     assert (np.diff(history.seconds) > 0).all()
     assert all(np.isfinite(line).all() and line.shape == (200, 4) for line in history.lines.values())
     assert len(playground.main.trace) == 400
-
-
-# --- weights as constants ---
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_a_tunable_task_costs_what_the_task_with_these_weights_costs(task, params, rng):
-    base = TASKS[task]()
-    name = weight_names(base)[0]
-    heavier = replace(base, **{name: 3 * getattr(base, name)})
-    tunable = Tunable.of(base)
-    x, c = base.sample(rng, params)
-    u = rng.uniform(-100, 100, 2)
-    full = tunable.constants(c, {name: getattr(heavier, name)})
-    assert tunable.cost(x, u, full) == pytest.approx(heavier.cost(x, u, c))
-    assert tunable.cost(tuple(x), tuple(u), tuple(full)) == pytest.approx(heavier.cost(x, u, c))
-    assert tunable.margins(x, full) == pytest.approx(base.margins(x, c))
-    np.testing.assert_array_equal(tunable.observe(x, full), base.observe(x, c))
-    assert tunable.steps == base.steps
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
-def test_the_optimum_of_a_tunable_task_is_that_of_the_task(task, params, rng):
-    base = TASKS[task]()
-    tunable = Tunable.of(base)
-    x, c = base.sample(rng, params)
-    assert find_optimum(tunable, params, x, tunable.constants(c, {})).cost == pytest.approx(
-        find_optimum(base, params, x, c).cost, rel=1e-6
-    )
 
 
 # --- time ---
@@ -497,24 +435,6 @@ def test_speed_stretches_time_and_a_pause_owes_no_steps():
     watch.now += 100.0
     assert clock.take()
     assert not clock.take()
-
-
-def test_while_a_slider_moves_only_its_last_value_is_worked_on(play, monkeypatch):
-    playground, hold, made = play(), threading.Event(), []
-
-    def slow(task, params):
-        made.append(task)
-        assert hold.wait(10)
-        return lqr(task, params)
-
-    lqr = CONTROLLERS["lqr"]
-    monkeypatch.setitem(CONTROLLERS, "lqr", slow)
-    for k in range(1, 10):
-        playground.set_weight("effort_weight", k * playground.world.base.effort_weight)
-    hold.set()
-    playground.settle()
-    assert len(made) <= 2  # the first, which was begun, and the last
-    assert playground.world.weights["effort_weight"] == pytest.approx(9 * playground.world.base.effort_weight)
 
 
 def test_another_process_computes_and_is_started_anew_after_it_was_killed():

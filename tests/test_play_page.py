@@ -45,7 +45,6 @@ class Opened:
         self.page.stop()
         self.thread.join(10)
         assert not self.thread.is_alive()
-        self.page.close()
         self.viewer.close()
         self.playground.close()
 
@@ -90,7 +89,6 @@ def quiet(capfd):
 def test_controls_change_the_playground(opened, visitor):
     visitor.change("Masses, %", 50.0)
     visitor.change("Speed", 2.0)
-    visitor.change("effort × 10^", 1.0)
     visitor.change("Controller", "you")
     visitor.change("At the end", "again")
     visitor.change("Certified episode", 7)
@@ -98,8 +96,6 @@ def test_controls_change_the_playground(opened, visitor):
     wait_for(lambda: playground.episode == 7)
     assert playground.plant["mass"] == 50.0
     assert opened.page.clock.speed == 2.0
-    weight = playground.world.base.effort_weight
-    assert playground.world.weights["effort_weight"] == pytest.approx(10 * weight)
     assert playground.main.wanted == "you"
     assert playground.at_end == "again"
     visitor.change("All as the controllers believe")
@@ -124,9 +120,8 @@ def test_what_a_file_is_called_is_shown_as_it_is(opened, visitor):
     wait_for(lambda: "&#60;img src=x onerror=alert(1)&#62;[a]&#40;b).json" in visitor.text())
 
 
-def test_another_task_brings_its_own_controllers_and_weights(opened, visitor):
+def test_another_task_brings_its_own_controllers(opened, visitor):
     visitor.change("Task", "orbit")
-    wait_for(lambda: visitor.controls.get("radius × 10^", {}).get("value") == 0.0)
     wait_for(lambda: "DAgger" in visitor.controls["Controller"]["options"])
 
 
@@ -225,15 +220,6 @@ def test_only_so_much_can_be_saved(opened, visitor, tmp_path, monkeypatch, name,
     assert len(list(tmp_path.iterdir())) == most
 
 
-def test_a_film_of_what_happened_is_drawn(tmp_path):
-    playground = Playground(controller="lqr", physics="rk4", episode=STANDING)
-    playground.settle()
-    for _ in range(6):
-        playground.step()
-    assert saving.film(views.replay(playground), tmp_path / "film.webp").stat().st_size > 1000
-    playground.close()
-
-
 # --- what a browser sends ---
 
 
@@ -247,8 +233,6 @@ NONSENSE = [
     ("Speed", 1e18),
     ("Masses, %", math.inf),
     ("Masses, %", -1e300),
-    ("effort × 10^", 1e9),
-    ("effort × 10^", math.nan),
     ("Task", "dance"),
     ("Task", 3),
     ("Controller", "../../etc/passwd"),
@@ -397,7 +381,7 @@ def test_who_leaves_while_something_is_saved_or_dragged_harms_nothing(quiet, ope
     with Visitor(opened.viewer.port) as other:
         other.change("Take the controls")
         other.drag("start", 0.5)
-        for label in ("Trajectory file", "Push", "Start for ballbot optimize"):
+        for label in ("Trajectory file", "Push"):
             other.change(label)
         other.connection.close()
     wait_for(lambda: opened.page.driver is None)
@@ -413,10 +397,8 @@ def test_the_server_and_its_processes_end_when_they_are_told_to(tmp_path):
         port = int(re.search(r":(\d+)", server.stdout.readline()).group(1))
         with Visitor(port) as visitor:
             wait_for(lambda: "LQR, " in visitor.text().replace("\\", ""), 60)
-            visitor.change("Film (WebP)")
-            wait_for(lambda: "drawing" in visitor.text(), 30)
             mine = children(server.pid)
-            assert len(mine) >= 2  # that plans, and that draws
+            assert mine  # that plans
         server.send_signal(signal.SIGTERM)
         assert server.wait(20) == 0
         wait_for(lambda: not any(map(runs, mine)))

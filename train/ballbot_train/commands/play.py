@@ -61,6 +61,5 @@ def play(
     except KeyboardInterrupt:
         console.print("ended")
     finally:
-        page.close()
         viewer.close()
         playground.close()

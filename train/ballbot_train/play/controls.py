@@ -12,11 +12,9 @@ from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play import views
 from ballbot_train.play.driving import DRIVERS
 from ballbot_train.play.plots import MOST_GHOSTS
 from ballbot_train.play.simulation import AT_END, LARGEST_PUSH
-from ballbot_train.play.tunable import weight_names
 from ballbot_train.play.world import PLANT
 from ballbot_train.report import labels
 
@@ -26,8 +24,6 @@ if TYPE_CHECKING:
 SPEEDS = (0.1, 2.0)
 """Least and greatest simulated seconds per second."""
 
-_EXPONENTS = (-1.5, 1.5)  # of 10, by which a weight's slider multiplies the task's own
-_FILMS = {"Film (WebP)": ".webp", "Film (MP4)": ".mp4"}
 _FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip) or rsl_rl (.pt), where the simulation runs"
 
 
@@ -66,7 +62,6 @@ class Controls:
             self._build_push()
         with tabs.add_tab("Change"):
             self._build_plant()
-            self._weight_folder = self._gui.add_folder("Weights of the cost")
         with tabs.add_tab("Drive"):
             page.steering.build()
             self._scores = self._gui.add_markdown("")
@@ -165,10 +160,6 @@ class Controls:
         saver = self._page.saver
         self._gui.add_markdown(f"Files are written to `{saver.out}`, and this page downloads them.")
         self._button("Trajectory file", saver.save_trajectory)
-        for label, ending in _FILMS.items():
-            self._button(label, lambda client, ending=ending: saver.save_film(client, ending))
-        self._button("Start for ballbot optimize", lambda _: self._show_optimize())
-        self._optimize_text = self._gui.add_markdown("", visible=False)
 
     def _build_task(self) -> None:
         """Controls that differ from task to task."""
@@ -187,17 +178,6 @@ class Controls:
                             lambda name=name: name in playground.crew.ghosts,
                         )
                     )
-        with self._weight_folder:
-            for name in weight_names(playground.world.base):
-                label, own = name.removesuffix("_weight").replace("_", " "), getattr(playground.world.base, name)
-                hint = f"{name}: 0 is the task's own, {own:g}"
-                self._task_controls.append(
-                    self._bind(
-                        gui.add_slider(f"{label} × 10^", *_EXPONENTS, 0.05, 0.0, hint=hint),
-                        lambda value, name=name, own=own: playground.set_weight(name, own * 10**value),
-                        lambda name=name, own=own: self._exponent(name, own),
-                    )
-                )
         self._episode.max = max(0, playground.world.episodes - 1)
         self._page.clock.dt = playground.world.task.control_dt
         self._page.viewer.aim()
@@ -236,9 +216,6 @@ class Controls:
             raise ValueError(f"at most {MOST_GHOSTS} ghosts")
         self._playground.set_ghosts([*others, name] if wanted else others)
 
-    def _exponent(self, name: str, own: float) -> float:
-        return round(20 * math.log10(self._playground.world.weights.get(name, own) / own)) / 20
-
     def _start_certified(self, episode: int) -> None:
         self._playground.start_certified(episode)
         self._episode_typed = episode
@@ -262,10 +239,6 @@ class Controls:
     def _reset_plant(self) -> None:
         for stress in PLANT:
             self._playground.set_plant(stress, 0.0)
-
-    def _show_optimize(self) -> None:
-        self._optimize_text.content = f"```\n{views.optimize_command(self._playground)}\n```"
-        self._optimize_text.visible = True
 
 
 class Steering:

@@ -106,11 +106,6 @@ class PlayPage:
         """Has the loop do something between two steps; from any thread."""
         self._requests.put(action)
 
-    def close(self) -> None:
-        """Ends `run`, and gives up a film that is not finished."""
-        self.stop()
-        self.saver.close()
-
     def _collect_garbage(self) -> None:
         """Does it when the robot begins to move. A collection of everything that was imported would be a step too late."""
         gc.unfreeze()
@@ -140,7 +135,7 @@ class PlayPage:
         with contextlib.suppress(queue.Empty):
             asked = [self._requests.get(timeout=patience)] if patience > 0 else []
         asked += [self._requests.get() for _ in range(self._requests.qsize())]
-        for action in [*asked, *[self._controls.refresh] * (len(asked) > 0), self.saver.poll]:
+        for action in [*asked, *[self._controls.refresh] * (len(asked) > 0)]:
             try:
                 action()
             except Exception as error:

@@ -245,11 +245,6 @@ class Playground:
         self.world.check_controllers(*ghosts)
         self.crew.set_ghosts(ghosts)
 
-    def set_weight(self, name: str, value: float) -> None:
-        """Changes a weight of the cost; LQR, trajectory optimization and NMPC reckon with it as soon as they can."""
-        self.world.set_weight(name, value)
-        self.crew.weigh_again(self.world.constants(self.start[1]))
-
     def set_plant(self, stress: str, value: float) -> None:
         """Changes what the controllers do not know, for every robot. The value is a severity within its `Span`."""
         self.plant[stress] = severity(stress, value)
@@ -266,11 +261,11 @@ class Playground:
 
     def start_random(self) -> None:
         """Begins an episode with a random start."""
-        self._begin(self.world.base.sample(self._rng, self.world.params), None)
+        self._begin(self.world.task.sample(self._rng, self.world.params), None)
 
     def start_at_rest(self) -> None:
         """Begins an episode that stands at the origin until it is pushed, which happens by itself."""
-        self._begin((np.zeros(8), self.world.base.sample(self._rng, self.world.params)[1]), None, True)
+        self._begin((np.zeros(8), self.world.task.sample(self._rng, self.world.params)[1]), None, True)
 
     # --- inside ---
 
@@ -301,7 +296,7 @@ class Playground:
             self._randomization = drawn_robot(self._track, self._rng, self.world.task.control_dt)
             self.crew.set_plant(self._randomization)
         self._first_push_at = -1 if not at_rest else round(_FIRST_PUSH_AFTER / self.world.task.control_dt)
-        self.crew.begin(tuple(map(float, start[0])), self.world.constants(start[1]))
+        self.crew.begin(tuple(map(float, start[0])), tuple(map(float, start[1])))
 
     def _after_step(self) -> None:
         task, main = self.world.task, self.main
