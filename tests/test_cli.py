@@ -188,10 +188,8 @@ def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, me
     assert (ended, message in printed) == (status, True), printed
 
 
-def test_damaged_files_of_other_commands_are_skipped_and_paths_are_printed_as_they_are(tmp_path, typed):
+def test_paths_are_printed_as_they_are(tmp_path, typed):
     runs = tmp_path / "runs"
-    (runs / "basins").mkdir(parents=True)
-    (runs / "basins" / "basins.json").write_text("{")
     arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
     ended, printed = typed(*arguments, "--workers", 1, "--out", "runs/[red]x[/b]:smile:")
     assert ended == 0, printed

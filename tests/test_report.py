@@ -17,14 +17,13 @@ from ballbot_train.report import figures
 from ballbot_train.report.film import write_film
 from ballbot_train.report.page import (
     Section,
-    folder_section,
     pictures_section,
     replay_section,
     table_section,
     write_report,
 )
 from ballbot_train.report.replay import Replay, Take
-from ballbot_train.report.sections import leaderboard_sections, replay_of
+from ballbot_train.report.sections import replay_of
 
 HEADER = ["task", "controller", "regret", "falls"]
 ROWS = [
@@ -57,8 +56,8 @@ def page(tmp_path_factory):
     sections = [
         table_section("Leaderboard", HEADER, ROWS),
         replay_section("Watch", replays),
-        folder_section("Pictures", picture.parent),
-        folder_section("Nothing", folder / "nowhere"),
+        pictures_section("Pictures", [picture]),
+        pictures_section("Nothing", []),
     ]
     return write_report("A <title>", sections, {"commit": "abc"}, folder / "report.html")
 
@@ -117,21 +116,10 @@ def test_names_are_text_in_figures(tmp_path):
     write_film(Replay(name, (Take(name, leaning(0.1, 0.1), "red", name),)), tmp_path / "a.gif", 0.1, width=64)
 
 
-def test_the_report_of_a_robot_shows_nothing_of_another(tmp_path):
+def test_the_report_of_a_robot_shows_its_episodes():
     results = [result(episode=0), result(episode=1)]
     replays = {robot: replay_of("stabilize", ["lqr"], results, "rk4", robot) for robot in ("paper", "rolling")}
     assert {robot: replay.params for robot, replay in replays.items()} == {r: named_robot(r) for r in replays}
-    (tmp_path / "basins").mkdir()
-    (tmp_path / "basins" / "basins.png").write_bytes(b"a picture")
-    (tmp_path / "basins" / "basins.json").write_text('{"about": {"robot": "rolling"}}')
-    picture = tmp_path / "basins" / "basins.png"
-    arguments = (HEADER, ROWS, results, {"stabilize": ["lqr"]}, picture, [], "rk4", tmp_path)
-    shown = {
-        robot: [section.title for section in leaderboard_sections(*arguments, robot) if section is not None]
-        for robot in ("paper", "rolling")
-    }
-    assert "Basins of attraction" in shown["rolling"]
-    assert "Basins of attraction" not in shown["paper"]
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,6 @@ def benchmark(
     quick: bool = False,
     physics: Physics | None = None,
     seed: int = 0,
-    runs: Path = Path("runs"),
     out: Path = Path("runs/benchmark"),
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
@@ -43,8 +42,6 @@ def benchmark(
         quick: only 8 episodes of each task.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of the bootstrap intervals, and of whatever an episode draws.
-        runs: folder where other commands left their results: the figures of basins, robustness, transfer and the paper join
-            the report.
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.
@@ -67,7 +64,7 @@ def benchmark(
     pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
     table = [cells(row) for row in rows]
     files.write(out / "leaderboard.md", markdown(HEADER, table))
-    sections = leaderboard_sections(HEADER, table, done, chosen, regrets, pictures, physics, runs, robot)
+    sections = leaderboard_sections(HEADER, table, done, chosen, regrets, pictures, physics, robot)
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     page = write_report(title, sections, facts, out / "report.html")
     jobs.release(out)

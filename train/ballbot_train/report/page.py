@@ -75,11 +75,6 @@ def pictures_section(title: str, pictures: Iterable[Path], lead: str = "") -> Se
     return Section(title, _render("pictures.html.j2", pictures=shown), lead) if shown else None
 
 
-def folder_section(title: str, folder: Path, lead: str = "") -> Section | None:
-    """The PNGs in a folder that another command has written; None if there are none."""
-    return pictures_section(title, sorted(folder.glob("*.png")), lead)
-
-
 def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Section | None:
     """Episodes in 3D, one scene for each take, with play, pause and scrubbing; None if there are no takes."""
     replays = [replay for replay in replays if replay.takes]

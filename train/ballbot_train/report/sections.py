@@ -1,14 +1,13 @@
-"""What the leaderboard's page holds besides its table, each part where its data exist."""
+"""The parts of the leaderboard's page."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from markupsafe import Markup
 
-from ballbot_gym import files
 from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation.results import Result
-from ballbot_train.report.page import Section, folder_section, pictures_section, replay_section, table_section
+from ballbot_train.report.page import Section, pictures_section, replay_section, table_section
 from ballbot_train.report.playground import playground_page
 from ballbot_train.report.replay import Replay, certified_replay
 
@@ -21,7 +20,6 @@ def leaderboard_sections(
     regrets: Path,
     pictures: Sequence[Path],
     physics: str,
-    runs: Path,
     robot: str = PAPER,
 ) -> list[Section | None]:
     """The page of `ballbot benchmark`.
@@ -34,8 +32,7 @@ def leaderboard_sections(
         regrets: picture of the regrets of all episodes.
         pictures: of certified episodes.
         physics: "bullet", "mujoco" or "rk4".
-        runs: folder in which other commands have left theirs: basins, robustness, transfer and paper.
-        robot: by name; what other commands have left of other robots is left out.
+        robot: by name.
     """
     replays = [replay_of(task, names, results, physics, robot) for task, names in controllers.items()]
     return [
@@ -57,30 +54,8 @@ def leaderboard_sections(
             [regrets],
             "The higher and the farther left, the better. A curve ends at the share of episodes that succeed.",
         ),
-        pictures_section(
-            "Basins of attraction",
-            [path for path in (runs / "basins" / "basins.png",) if path.exists() and _is_of(path, robot)],
-            "From where each controller recovers, within what the robot allows.",
-        ),
-        folder_section("Robustness", runs / "robustness" / "figures", "The same episodes under growing disturbances.")
-        if _is_of(runs / "robustness" / "robustness.json", robot)
-        else None,
-        pictures_section(
-            "From one robot to another",
-            [path for path in (runs / "transfer" / "transfer.png",) if path.exists()],
-            "Controllers that plan for one robot, or learnt on it, on another and on its floors.",
-        ),
         pictures_section("One certified episode of each task", pictures),
-        folder_section("The paper's figures", runs / "paper", "High lean angle trajectory optimization, reproduced."),
     ]
-
-
-def _is_of(path: Path, robot: str) -> bool:
-    """Whether the results that a command left as PATH.json are of a robot, as far as they say."""
-    try:
-        return files.read_json(path.with_suffix(".json"))["about"].get("robot", PAPER) == robot
-    except (ValueError, KeyError, TypeError, AttributeError):  # missing or damaged: they do not say
-        return robot == PAPER
 
 
 def replay_of(
