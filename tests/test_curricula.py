@@ -31,7 +31,7 @@ def backwards(starts=None, **options):
 
 def of_its_own(made):
     """The batch, whose curriculum has come to the task itself."""
-    made._goal_factor, made._ramp["max_speed"] = 1.0, made._own.max_speed
+    made._goal_factor, made._ramp["max_speed"] = 1.0, made.own_task.max_speed
     made._set_difficulty()
     return made
 

@@ -187,7 +187,7 @@ def test_schedules_wait_until_the_task_is_its_own(monkeypatch):
     assert shares == pytest.approx([0, 0.125, 0.25, 0.25])
     assert rates == pytest.approx([1e-3, 1e-3 * (1 - 0.9 / 8), 1e-3 * (1 - 0.9 / 4), 1e-3 * (1 - 0.9 / 4)])
     batch = learner._env.batch
-    batch._goal_factor, batch._ramp["max_speed"], batch._has_settled = 1.0, batch._own.max_speed, True
+    batch._goal_factor, batch._ramp["max_speed"], batch._has_settled = 1.0, batch.own_task.max_speed, True
     resumed = turn()
     resumed.load_state_dict(learner.state_dict())
     shares, rates = gone(resumed)
@@ -509,7 +509,8 @@ def test_sac_in_a_frame_goes_on_from_a_state_as_if_never_stopped():
 
 
 def test_training_envs_never_end_together():
-    env = TrainingEnv(make_task("stabilize", max_tilt=1.5), default_params(), 5, 0.4, 0.1)
+    batch = CurriculumBatch(make_task("stabilize", max_tilt=1.5, duration=0.4), 5, default_params())
+    env = TrainingEnv(batch, 0.1)
     env.seed(0)  # no robot falls with this seed
     env.reset()
     ends = [env.step(np.zeros((5, 2)))[2].sum() for _ in range(20)]
