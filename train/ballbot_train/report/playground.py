@@ -1,5 +1,5 @@
 """The playground without Python: one HTML page in which a learned policy and LQR balance beside the optimum, and the reader
-pushes them, drives an episode, or drops a policy of their own.
+pushes them, or drives an episode.
 
 Everything is in the page: the closed-form model, the tasks' costs, limits and observations, LQR's gains and the policies'
 weights. The model and the tasks are printed as JavaScript from the lines that Python runs; see `javascript`.
@@ -134,16 +134,12 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         "policies": _policies(policies),
         "you": {"label": "you", "color": labels.YOU},
         "best": {"label": "optimum", "color": labels.OPTIMUM},
-        "tasks": {
-            name: {"id": task.id, "observations": len(task.observation_scale)}
-            for name, task in ((name, make_task(name)) for name in BEST)
-        },
         "scenarios": [_scenario_data(episode, params) for scenario in SCENARIOS for episode in _episodes(scenario)],
     }
     # Within a script, "<" could end it.
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     specs = {name: policy["frame"] for name, policy in data["policies"].items()}
-    return "\n".join([_model_script(params, specs), f"const DATA = {text};", _asset("engine.js"), _asset("onnx.js")])
+    return "\n".join([_model_script(params, specs), f"const DATA = {text};", _asset("engine.js")])
 
 
 def _episodes(scenario: Scenario) -> list[Scenario]:

@@ -1,4 +1,4 @@
-// The playground's page: scenarios, pushes and driving, policies of the reader's own, pictures and readouts.
+// The playground's page: scenarios, pushes and driving, pictures and readouts.
 "use strict";
 
 const find = (selector) => document.querySelector(selector);
@@ -23,7 +23,6 @@ class Playground {
     [this.playing, this.last] = [true, null];
     [this.distance, this.zoom] = [NEAR, 1];
     this.wake();
-    this.own = {}; // policies of the reader's own, by task
     for (const title of new Set(DATA.scenarios.map((scenario) => scenario.title))) {
       const chip = document.createElement("button");
       chip.type = "button";
@@ -107,13 +106,12 @@ class Playground {
     find(".hint").hidden = false;
     this.driver = driven ? new Driver() : null;
     this.held = new Set(); // keys
-    const mine = this.own[task];
-    this.robots = robotsOf(this.scenario, mine?.policy, this.driver);
+    this.robots = robotsOf(this.scenario, this.driver);
     this.best = this.scenario.best && new Optimum(this.scenario);
     const { label, color } = DATA.policies[task];
-    const learned = { label: mine?.label ?? `${label} policy`, color: mine ? DATA.you.color : color, alpha: 1 };
+    const learned = { label: `${label} policy`, color, alpha: 1 };
     const ghost = DATA.ghost_opacity + 0.15;
-    this.looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, color, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
+    this.looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
     if (this.best) this.looks.push({ ...DATA.best, alpha: DATA.ghost_opacity });
     this.due = this.scenario.push; // the push that comes by itself
     this.restart(this.scenario.state);
@@ -422,15 +420,6 @@ class Playground {
     view.onblur = () => {
       if (this.held.size) this.steerByKeys(this.held.clear());
     };
-    find(".file").onchange = (event) => {
-      this.take(event.target.files[0]);
-      event.target.value = ""; // so that the same file can be chosen again
-    };
-    window.addEventListener("dragover", (event) => event.preventDefault());
-    window.addEventListener("drop", (event) => {
-      event.preventDefault();
-      this.take(event.dataTransfer.files[0]);
-    });
   }
 
   letGo() {
@@ -479,25 +468,6 @@ class Playground {
     };
     window.addEventListener("deviceorientation", this.tilted);
     this.say("Hold the device as is comfortable: this is the stick's centre. Tilt it to lean.");
-  }
-
-  /** Takes a policy from an ONNX file, in the task that it is made for. */
-  async take(file) {
-    if (!file) return;
-    try {
-      if (file.size > LARGEST_FILE) throw new Error(`it is larger than ${LARGEST_FILE / 2 ** 20} MiB`);
-      const policy = new OnnxPolicy(new Uint8Array(await file.arrayBuffer()));
-      const fitting = Object.keys(DATA.tasks).filter((task) => DATA.tasks[task].observations === policy.observations);
-      const named = fitting.find((task) => DATA.tasks[task].id === policy.task);
-      const task = named ?? fitting.find((name) => name === this.scenario.task) ?? fitting[0];
-      if (!task) throw new Error(`it observes ${policy.observations} numbers, and the tasks give ${Object.entries(DATA.tasks).map(([name, { observations }]) => `${observations} (${name})`).join(", ")}`);
-      policy.model = MODELS[task];
-      this.own[task] = { policy, label: file.name.slice(0, 24) };
-      this.open(task === this.scenario.task ? this.index : DATA.scenarios.findIndex((scenario) => scenario.task === task), this.driver !== null);
-      this.say(`${file.name.slice(0, 60)} controls the robot in ${task}.`);
-    } catch (error) {
-      this.say(`${file.name.slice(0, 60)} cannot be used: ${error.message}.`);
-    }
   }
 
   /** The robot near a pixel of the canvas, or null. */
