@@ -673,7 +673,6 @@ EVALUATION = [
     (lambda f: evaluate(None), "None is no policy: give a Controller"),
     (lambda f: evaluate("pid"), "unknown controller 'pid'"),
     (lambda f: evaluate("mine.zip"), "mine.zip: no such file"),
-    (lambda f: evaluate(f / "mine.pt"), "mine.pt: no such file"),
     (lambda f: evaluate("mine.json"), "mine.json is not a policy"),
     (lambda f: evaluate(lambda o: np.zeros(3), episodes=1, physics="rk4"), "action must have shape (2,)"),
     (lambda f: evaluate(lambda o: None, episodes=1, physics="rk4"), "action must"),

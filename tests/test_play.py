@@ -5,9 +5,10 @@ import os
 import signal
 import time
 
+import gymnasium
 import numpy as np
 import pytest
-import torch
+from stable_baselines3 import PPO
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified, dynamics
@@ -310,10 +311,10 @@ def test_wrong_input_is_refused_and_the_robot_goes_on(play):
 
 @pytest.fixture
 def saved_model(tmp_path):
-    """A checkpoint as rsl_rl writes it, of an actor that commands nothing."""
-    path = tmp_path / "mine.pt"
-    torch.save({"actor_state_dict": {"mlp.0.weight": torch.zeros(2, 8), "mlp.0.bias": torch.zeros(2)}}, path)
-    path.with_suffix(".json").write_text('{"activation": "elu"}')
+    """A model as Stable-Baselines3 writes it."""
+    path = tmp_path / "mine.zip"
+    env = gymnasium.make("BallbotStabilize-v0", physics="rk4")
+    PPO("MlpPolicy", env, n_steps=2, batch_size=2, device="cpu").save(path)
     return str(path)
 
 
@@ -334,7 +335,7 @@ def test_a_file_that_was_used_once_is_offered_from_then_on(play, saved_model):
     playground.set_ghosts([])
     assert saved_model in playground.controllers
     with pytest.raises(PolicyError, match="gone"):
-        play(policies=["gone.pt"])
+        play(policies=["gone.zip"])
 
 
 def test_a_controller_that_fails_gives_no_force_and_is_named(play):

@@ -54,7 +54,7 @@ def evaluate(
     """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
 
     Args:
-        policy: a policy file, a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt), or the name of a policy that comes
+        policy: a policy file, a model saved by Stable-Baselines3 (.zip), or the name of a policy that comes
             with the package; with --episodes also an expert. Statistics of VecNormalize are read from
             MODEL.vecnormalize.npz beside the model, which `ballbot_train.save_vecnormalize` writes.
         task: name of its task; default the one that its file names or whose observations fit, or else stabilize.

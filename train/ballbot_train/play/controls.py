@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SPEEDS = (0.1, 2.0)
 """Least and greatest simulated seconds per second."""
 
-_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip) or rsl_rl (.pt), where the simulation runs"
+_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip), where the simulation runs"
 
 
 _IMPULSE_PER_METRE = 1 / PUSH_SCALE  # N·s of a push by dragging the robot, so that the arrow ends where the drag does

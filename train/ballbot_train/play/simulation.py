@@ -88,7 +88,7 @@ class Playground:
         Args:
             task: name of a task.
             controller: of the main robot: an expert, a policy that comes with the package, the path of a policy file or of a
-                model that Stable-Baselines3 or rsl_rl saved, or one of `DRIVERS`; default, `World.best`.
+                model that Stable-Baselines3 saved, or one of `DRIVERS`; default, `World.best`.
             ghosts: controllers of the ghosts.
             physics: "bullet", "mujoco" or "rk4"; default, as for environments.
             episode: index of a certified episode; "rest" for standing at the origin; None for a random start.

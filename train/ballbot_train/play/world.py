@@ -99,7 +99,7 @@ class World:
             if name not in self.controllers and not (readable and Path(name).is_file()):
                 raise ValueError(
                     f"unknown controller {name!r}; {self.task.id} has {', '.join(self.controllers)}, or give a policy's "
-                    ".json, or a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt)"
+                    ".json, or a model saved by Stable-Baselines3 (.zip)"
                 )
 
     def certified_start(self, episode: int) -> tuple[np.ndarray, np.ndarray]:
