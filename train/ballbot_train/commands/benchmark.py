@@ -12,7 +12,7 @@ from ballbot_train.console import Physics, RobotName, console, markdown, physics
 from ballbot_train.evaluation import robustness, tracks
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
-from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
@@ -96,7 +96,7 @@ def _benchmark_tracks(
     with progress_bars(robustness.episodes_to_run(chosen, wanted, episodes)) as bars:
         results = robustness.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
     rows = tracks.rows_of(results, robot, seed)
-    tracks.write(rows, results, facts, out)
+    write_results("tracks", rows, results, facts, out)
     table = [tracks.cells(row) for row in rows]
     files.write(out / "tracks.md", markdown(tracks.HEADER, table))
     jobs.release(out)

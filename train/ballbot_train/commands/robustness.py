@@ -20,6 +20,7 @@ from ballbot_train.console import (
 )
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 
@@ -60,8 +61,9 @@ def robustness(
     wanted = stressed.conditions(stresses)
     with progress_bars(stressed.episodes_to_run(chosen, wanted, episodes)) as bars:
         results = stressed.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
-    rows = stressed.rows_of(results, seed)
-    stressed.write(rows, results, facts, out)
+    rows = rows_of(results, stressed.StressRow, "stress", "level", seed=seed)
+    labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
+    write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:
         figures.save(figures.robustness_figure(rows, task), out / "figures" / f"robustness-{task}.png")
     table = [

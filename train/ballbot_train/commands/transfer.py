@@ -21,6 +21,7 @@ from ballbot_train.console import (
 from ballbot_train.evaluation import optima
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import checked_episodes, policy_digests
+from ballbot_train.evaluation.results import rows_of
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 from ballbot_train.report import figures
@@ -84,7 +85,7 @@ def transfer(
             totals[task] += len(names) * len(floors) * len(engines) * matrix.episodes_of(task, robot, episodes)
     with progress_bars(totals) as bars:
         results = matrix.run(chosen, robot, floors, episodes, engines, out, workers, bars.advance, seed)
-    rows = matrix.rows_of(results, seed)
+    rows = rows_of(results, matrix.TransferRow, "made_for", "robot", "friction", "physics", seed=seed)
     matrix.write(rows, results, facts, out)
     table = [matrix.cells(row) for row in rows]
     files.write(out / "transfer.md", markdown(matrix.HEADER, table))

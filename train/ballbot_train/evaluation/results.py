@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -159,19 +159,44 @@ def summarize(results: Sequence[Result], seed: int = 0) -> Row:
     )
 
 
+RowKind = TypeVar("RowKind", bound=Row)
+
+
+def rows_of(results: Sequence[Result], kind: type[RowKind], *keys: str, seed: int = 0) -> list[RowKind]:
+    """One row for each task, controller and values of other fields, in the order of the results.
+
+    Args:
+        results: episodes.
+        kind: of the rows, which have the same fields.
+        keys: names of those fields.
+        seed: of the bootstrap.
+    """
+    groups: dict[tuple[Any, ...], list[Result]] = {}
+    for result in results:
+        groups.setdefault(tuple(getattr(result, key) for key in ("task", "controller", *keys)), []).append(result)
+    return [
+        kind(**asdict(summarize(group, seed)), **dict(zip(keys, values, strict=True)))
+        for (_, _, *values), group in groups.items()
+    ]
+
+
 def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
     """One row per task and controller, in the order of the results; seed is of the bootstrap."""
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for result in results:
-        groups.setdefault((result.task, result.controller), []).append(result)
-    return [summarize(group, seed) for group in groups.values()]
+    return rows_of(results, Row, seed=seed)
+
+
+def write_results(
+    name: str, rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path, **more: Any
+) -> None:
+    """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", the rows, and more."""
+    for table, entries in ((name, rows), ("episodes", results)):
+        files.write_csv(out / f"{table}.csv", [asdict(entry) for entry in entries])
+    files.write(out / f"{name}.json", to_json({"about": facts, **more, "rows": rows}))
 
 
 def write_leaderboard(rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path) -> None:
-    """Writes leaderboard.csv, episodes.csv and leaderboard.json, which holds the facts as "about", rows and episodes."""
-    write_csv(out / "leaderboard.csv", rows)
-    write_csv(out / "episodes.csv", results)
-    files.write(out / "leaderboard.json", to_json({"about": facts, "rows": rows, "episodes": results}))
+    """Writes leaderboard.csv, episodes.csv and leaderboard.json, which `read_results` reads."""
+    write_results("leaderboard", rows, results, facts, out, episodes=results)
 
 
 def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
@@ -213,11 +238,6 @@ def _from_json(entry: Mapping[str, Any]) -> Result:
             raise TypeError(f"{field.name} of an episode is {value!r:.200}")
         values[field.name] = kind(value)  # a whole number that no float holds is an OverflowError
     return Result(**values)
-
-
-def write_csv(path: Path, entries: Sequence[Any]) -> Path:
-    """Writes dataclass instances of one kind as CSV."""
-    return files.write_csv(path, [asdict(entry) for entry in entries])
 
 
 def to_json(document: Mapping[str, Any]) -> str:
