@@ -52,27 +52,27 @@ def write_report(title: str, sections: Iterable[Section | None], facts: Mapping[
     """
     shown = [section for section in sections if section is not None]
     names = dict.fromkeys(name for section in shown for name in section.scripts)
-    page = _render(
+    page = render(
         "page.html.j2",
         title=title,
         sections=shown,
         facts=facts,
-        style=_asset("style.css"),
-        scripts=[_asset(name) for name in names],
+        style=asset("style.css"),
+        scripts=[asset(name) for name in names],
     )
     return files.write(path, page)
 
 
 def table_section(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], lead: str = "") -> Section:
     """A table that the reader can sort by any column, and filter by the words of its first column."""
-    table = _render("table.html.j2", header=header, rows=rows, word_columns=_WORD_COLUMNS)
+    table = render("table.html.j2", header=header, rows=rows, word_columns=_WORD_COLUMNS)
     return Section(title, table, lead, ("table.js",))
 
 
 def pictures_section(title: str, pictures: Iterable[Path], lead: str = "") -> Section | None:
     """Embedded PNGs one under another, captioned with their names; None if there are none."""
     shown = [{"name": path.stem, "base64": base64.b64encode(files.read(path)).decode()} for path in pictures]
-    return Section(title, _render("pictures.html.j2", pictures=shown), lead) if shown else None
+    return Section(title, render("pictures.html.j2", pictures=shown), lead) if shown else None
 
 
 def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Section | None:
@@ -85,19 +85,19 @@ def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Sec
 
 def replay_page(replay: Replay) -> str:
     """The same as a page of its own."""
-    page = _render(
+    page = render(
         "frame.html.j2",
         title=replay.title,
         body=_replays([replay]),
-        style=_asset("style.css"),
-        scripts=[_asset(name) for name in _REPLAY_SCRIPTS],
+        style=asset("style.css"),
+        scripts=[asset(name) for name in _REPLAY_SCRIPTS],
     )
     return str(page)
 
 
 def _replays(replays: Sequence[Replay]) -> Markup:
     data = scene_data(replays[0].params) | {"episodes": [_replay_data(replay) for replay in replays]}
-    return _render("replay.html.j2", data=data)
+    return render("replay.html.j2", data=data)
 
 
 def scene_data(params: BallbotParams) -> dict[str, object]:
@@ -124,11 +124,12 @@ def _templates() -> jinja2.Environment:
     return environment
 
 
-def _render(template: str, **values: object) -> Markup:
+def render(template: str, **values: object) -> Markup:
+    """A template of `assets/` with these values."""
     return Markup(_templates().get_template(template).render(values))
 
 
-def _asset(name: str) -> Markup:
+def asset(name: str) -> Markup:
     """The text of one of this package's own scripts or styles."""
     return Markup((_ASSETS / name).read_text(encoding="utf-8"))
 
