@@ -452,23 +452,6 @@ def test_keys_and_a_drag_hold_the_stick_as_long_as_they_are_held(opened):
     assert opened.execute_script(STEERED) == pytest.approx([1, 1, 0, 0] * 3, abs=1e-6)
 
 
-TILTED = """
-playground.open(1, true); playground.setPlaying(false); playground.draw(1);
-const done = arguments[0];
-const tilt = (beta, gamma) => window.dispatchEvent(new DeviceOrientationEvent("deviceorientation", { beta, gamma }));
-playground.askForTilt().then(() => {
-  const { driver, scene } = playground, along = () => [0, 1].reduce((sum, i) => sum + driver.goal[i] * scene.right[i], 0);
-  const found = [[40, 5], [40, 35], [40, -7.5], [null, 35]].map((held) => { tilt(...held); return along(); });
-  done(found);
-});
-"""
-
-
-def test_a_tilted_device_is_the_stick(opened):
-    found = opened.execute_async_script(TILTED)
-    assert found == pytest.approx([0, 1, -0.5, -0.5], abs=1e-6)  # what is no number changes nothing
-
-
 def wait_for(browser, condition, seconds=20):
     end = time.monotonic() + seconds
     while not condition():

@@ -9,7 +9,6 @@ const STRONGEST = 250; // N·s
 const NEAR = 3.6; // m: the camera's distance from robots that are together
 const GRAB = 60; // px: how far from a robot's axis a drag still pushes it
 const THUMB = 70; // px of a drag that holds the stick fully out
-const TILTED = 25; // degrees of a device that do the same
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], a: [-1, 0], d: [1, 0], w: [0, 1], s: [0, -1] };
 
 class Playground {
@@ -34,7 +33,6 @@ class Playground {
     find(".reset").onclick = () => this.open(this.index, this.driver !== null);
     find(".episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
     find(".drive").onclick = () => this.open(this.index, this.driver === null);
-    find(".tilt").onclick = () => this.askForTilt();
     find(".share").onclick = () => this.share();
     find(".theme").onclick = () => this.setTheme(!this.dark);
     const night = matchMedia("(prefers-color-scheme: dark)");
@@ -101,7 +99,6 @@ class Playground {
     find(".share").hidden = find(".link").hidden = true;
     find(".drive").setAttribute("aria-pressed", driven);
     find(".pushes").hidden = find(".strength").hidden = driven;
-    find(".tilt").hidden = !driven || typeof DeviceOrientationEvent === "undefined";
     find(".hint").textContent = driven ? "Drag anywhere: that is your stick." : "Drag a robot to push it. Drag the floor to look around.";
     find(".hint").hidden = false;
     this.driver = driven ? new Driver() : null;
@@ -447,27 +444,6 @@ class Playground {
   steerByKeys() {
     const sum = [...this.held].map((key) => ARROWS[key]).reduce((total, along) => Vector.plus(total, along), [0, 0]);
     this.steer(...sum);
-  }
-
-  /** Lets the device be the stick. iOS asks the reader first, and only where a press asks for it. */
-  async askForTilt() {
-    try {
-      const answer = await (DeviceOrientationEvent.requestPermission?.() ?? "granted");
-      if (answer !== "granted") throw new Error("the browser was told not to");
-    } catch (error) {
-      return this.say(`This device does not tell how it is tilted: ${error.message}.`);
-    }
-    let level = null; // how it was held first
-    window.removeEventListener("deviceorientation", this.tilted); // of an earlier press
-    this.tilted = ({ beta, gamma }) => {
-      if (!Number.isFinite(beta) || !Number.isFinite(gamma) || this.drag) return;
-      const turn = ((screen.orientation?.angle ?? 0) * Math.PI) / 180; // of the screen in the device
-      level ??= [gamma, beta];
-      const [x, y] = [(gamma - level[0]) / TILTED, (level[1] - beta) / TILTED];
-      this.steer(x * Math.cos(turn) - y * Math.sin(turn), x * Math.sin(turn) + y * Math.cos(turn));
-    };
-    window.addEventListener("deviceorientation", this.tilted);
-    this.say("Hold the device as is comfortable: this is the stick's centre. Tilt it to lean.");
   }
 
   /** The robot near a pixel of the canvas, or null. */
