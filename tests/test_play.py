@@ -19,7 +19,6 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play import views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
-from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.play.world import PLANT, randomization
 from ballbot_train.policy_files import BEST, PolicyError
@@ -102,7 +101,7 @@ def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shippe
 def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
     if physics == "bullet":
         pytest.importorskip("pybullet")
-    playground = play(episode="rest", controller="you (force)", physics=physics)
+    playground = play(episode="rest", controller="lqr", physics=physics)
     playground.push(60.0, 30.0)
     go(playground, 0.02)
     expected = dynamics.step(params, dynamics.pushed(params, (0.0,) * 8, (60.0, 30.0)), (0.0, 0.0), 0.02)
@@ -110,7 +109,7 @@ def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
 
 
 def test_ghosts_get_the_same_start_and_the_same_pushes(play):
-    playground = play(controller="you", ghosts=["lqr"])
+    playground = play(controller="shac", ghosts=["lqr"])
     alone = play(controller="lqr")
     for each in (playground, alone):
         each.push(3.0, -2.0)
@@ -124,18 +123,18 @@ def test_a_ghost_that_is_added_begins_where_the_robot_is(play):
     playground = play()
     go(playground, 0.5)
     here = playground.main.x
-    playground.set_ghosts(["you"])
+    playground.set_ghosts(["shac"])
     assert playground.crew.runners[1].x == here
     playground.settle()
     go(playground, 0.1)
-    assert playground.crew.ghosts == ("you",)
+    assert playground.crew.ghosts == ("shac",)
 
 
 def test_controllers_change_without_a_jump(play):
     playground = play()
     go(playground, 0.5)
     states = [playground.main.x]
-    for name in ("you", "lqr"):
+    for name in ("shac", "lqr"):
         playground.set_controller(name)
         assert playground.step()  # under the old one
         states.append(playground.main.x)
@@ -218,30 +217,13 @@ def test_every_hidden_change_can_go_to_both_ends_while_the_robot_moves(play):
     assert randomization(playground.plant).active is False
 
 
-def test_a_human_drives_the_robot_that_balances_itself(play):
-    playground = play(controller="you")
-    go(playground, 2.0)
-    playground.stick.move(1.0, 0.0)
-    go(playground, 3.0)
-    assert playground.main.x[4] == pytest.approx(DRIVE_SPEED, rel=0.05)
-    assert abs(playground.main.x[5]) < 0.1
-
-
-def test_the_score_of_a_human_is_a_regret(play):
-    playground = play(controller="you (force)", episode=0)
+def test_the_score_of_a_robot_that_falls_is_a_regret(play):
+    playground = play(episode=FALLING)
     while not playground.scores:
         playground.step()
     (score,) = playground.scores
     assert score.failure == "tilt"
     assert score.regret == pytest.approx(score.cost / playground.optimum_cost - 1)
-
-
-def test_a_stick_reaches_no_farther_than_one():
-    stick = Stick()
-    stick.move(30.0, 40.0)
-    assert stick.value == pytest.approx((0.6, 0.8))
-    stick.move(math.nan, 1.0)
-    assert stick.value == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(("physics", "seed"), [("rk4", 0), ("bullet", 1)])
@@ -260,16 +242,20 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
 
 
 def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, interpreted):
-    playground = play(controller="lqr", ghosts=["you", "shac"])
+    playground = play(controller="lqr", ghosts=["shac"])
     playground.set_robot("kugle")
     playground.settle()
     assert playground.step()
-    assert (playground.world.robot, playground.main.wanted, playground.crew.ghosts) == ("kugle", "lqr", ("you",))
+    assert (playground.world.robot, playground.main.wanted, playground.crew.ghosts) == ("kugle", "lqr", ())
     assert playground.world.params.total_mass == pytest.approx(1.478 + 16.154)
     playground.set_task("orbit")
     playground.settle()
     assert playground.step()
-    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
+    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == (
+        "orbit",
+        "lqr",
+        (),
+    )
 
 
 # --- bad input ---
@@ -370,14 +356,14 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
 
 
 def test_what_happened_can_be_saved(play, tmp_path):
-    playground = play(ghosts=["you"])
+    playground = play(ghosts=["shac"])
     go(playground, 0.5)
     path = playground.trajectory().save(tmp_path / "played.npz")
     np.testing.assert_array_equal(Trajectory.load(path).x[-1], playground.main.x)
 
 
 def test_the_history_that_is_plotted_stays_short(play):
-    playground = play(ghosts=["you"])
+    playground = play(ghosts=["shac"])
     go(playground, 9.0)
     history = views.history(playground, 200)
     assert len(history.seconds) == 200

@@ -15,7 +15,6 @@ from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.controllers import is_expert, is_file, make_controller
 from ballbot_train.play.background import Background
-from ballbot_train.play.driving import DRIVERS, DriveController, Stick
 from ballbot_train.play.runner import Runner
 from ballbot_train.play.world import World
 from ballbot_train.report import labels
@@ -27,7 +26,7 @@ _FROM_ELSEWHERE = ("lqr", "trajopt")  # controllers that are data, so that they 
 class Crew:
     """Runners and who controls them. A robot waits for its first controller, and goes on while another one is made."""
 
-    def __init__(self, physics: str, stick: Stick, other_process: bool):
+    def __init__(self, physics: str, other_process: bool):
         """Starts the background, which has another process plan if it is told so."""
         self.runners: list[Runner] = []
         """The main robot, then the ghosts."""
@@ -35,7 +34,7 @@ class Crew:
         """Control steps since the playground was opened."""
         self.notice = ""
         """What went wrong last, in words."""
-        self._physics, self._stick, self.background = physics, stick, Background(other_process)
+        self._physics, self.background = physics, Background(other_process)
         self._randomization = Randomization()
         self._optimum: Future | None = None
 
@@ -157,7 +156,7 @@ class Crew:
         """Asks for the controller that a robot wants, from now on or for an episode that begins some steps ahead."""
         name, step, compute = runner.wanted, self.steps + ahead, self.background.compute
         x = np.array(runner.expected(self.steps, ahead) if ahead else runner.x)
-        made = partial(_make, name, self.world.task, self.world.params, x, np.array(self._c), self._stick, compute)
+        made = partial(_make, name, self.world.task, self.world.params, x, np.array(self._c), compute)
         future = self.background.submit(lambda: (name, step, made()))
         _cancel(runner.following)
         if ahead:
@@ -225,15 +224,12 @@ def _make(
     params: BallbotParams,
     x: np.ndarray,
     c: np.ndarray,
-    stick: Stick,
     compute: Callable[..., Any],
 ) -> Controller:
     """The controller of a name, at the start of an episode in state x (8,) with constants c (nc,).
 
     What takes long is called by `compute`, that may have another process do it.
     """
-    if name in DRIVERS:
-        return DriveController(task, params, stick, DRIVERS[name])
     if name in _FROM_ELSEWHERE:
         return compute(_expert, name, task, params, x, c)
     controller = make_controller(name, task, params)

@@ -8,7 +8,6 @@ import numpy as np
 
 from ballbot_gym import dynamics
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
-from ballbot_train.play.driving import DRIVERS
 from ballbot_train.play.runner import Runner, Sample, failure_word
 from ballbot_train.play.simulation import Playground
 from ballbot_train.report import labels
@@ -49,7 +48,7 @@ def drawing(playground: Playground) -> Drawing:
 
 def color(runner: Runner, i: int) -> str:
     """The colour of the `i`-th robot."""
-    return labels.YOU if runner.name in DRIVERS else labels.color(Path(runner.name).stem, i)
+    return labels.color(Path(runner.name).stem, i)
 
 
 def colors(playground: Playground) -> dict[str, str]:

@@ -17,7 +17,6 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
 from ballbot_train.evaluation.controllers import is_expert, is_made_for, is_saved_model, made_for, names
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.driving import DRIVERS
 from ballbot_train.policy_files import BEST, PolicyError, shipped_policies
 
 
@@ -89,7 +88,6 @@ class World:
             "nmpc-offset-free",
             *(name for name in known if name not in experts),
             *own,
-            *DRIVERS,
         ]
 
     def check_controllers(self, *wanted: str) -> None:
