@@ -34,7 +34,7 @@ FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 Part = tuple[str, Sequence[Any]]
 """A pointer's name in C, and the symbols that are read from its rows, or the expressions that are written to them."""
 
-_C = {
+OPERATIONS = {
     casadi.OP_ASSIGN: "{0}",
     casadi.OP_ADD: "{0} + {1}",
     casadi.OP_SUB: "{0} - {1}",
@@ -60,7 +60,7 @@ _C = {
     casadi.OP_EQ: "{0} == {1} ? (real)1 : (real)0",
     casadi.OP_NE: "{0} != {1} ? (real)1 : (real)0",
 }
-"""Operations of CasADi as C."""
+"""Operations of CasADi as C, with the functions of real.h."""
 
 _LOGIC = {
     casadi.OP_NOT: "1 - {0}",
@@ -225,8 +225,8 @@ def block(name: str, inputs: Sequence[Part], outputs: Sequence[Part]) -> str:
             value = read[given[0]][0]
         elif operation == casadi.OP_CONST:
             value = _literal(function.instruction_constant(k))
-        elif operation in _C:
-            value = _C[operation].format(*(f"w{i}" for i in given))
+        elif operation in OPERATIONS:
+            value = OPERATIONS[operation].format(*(f"w{i}" for i in given))
         elif operation in _LOGIC:
             value = _LOGIC[operation].format(*(_truth(i, truths) for i in given))
         elif operation == casadi.OP_IF_ELSE_ZERO:

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 from ballbot_gym import Randomization, counter_rng  # noqa: E402
 from ballbot_gym.env import REWARD_PARTS  # noqa: E402
 from ballbot_gym.tasks import TASKS  # noqa: E402
-from ballbot_gym.vector import LOOP_BELOW, BallbotBatch, BallbotLoop, BallbotVectorEnv  # noqa: E402
+from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
 
 INFO = (
     *REWARD_PARTS,
@@ -27,9 +27,15 @@ INFO = (
 ROBOTS = Randomization(body_mass=(0.8, 1.2), actuator_delay=(0.0, 0.06), position_noise=0.01, push_impulse=(0.0, 3.0))
 
 
-@pytest.mark.parametrize(("name", "limit"), [("turn", None), ("weave", 7)])
+@pytest.mark.parametrize(
+    ("name", "limit", "mode"),
+    [
+        ("turn", None, AutoresetMode.NEXT_STEP),
+        ("turn", None, AutoresetMode.DISABLED),
+        ("weave", 7, AutoresetMode.SAME_STEP),
+    ],
+)
 @pytest.mark.parametrize("engine", ["native", "loop", "torch"])
-@pytest.mark.parametrize("mode", AutoresetMode)
 def test_ends_rewards_and_infos_are_those_of_gymnasiums_sync(name, mode, engine, limit):
     """The sync envs draw other episodes, so that both are started alike at each restart of ours.
 
@@ -154,24 +160,3 @@ def test_numbers_of_one_env_are_those_of_the_batch():
             single = counter_rng.key(int(seeds[i]), int(episodes[i]), step)
             assert single == keys[i]
             assert counter_rng.floats(single, 9) == tuple(rows[i].tolist())
-
-
-def test_where_there_is_no_machine_code_small_batches_loop_and_large_ones_do_not():
-    assert isinstance(BallbotVectorEnv(1, compile=False).batch, BallbotLoop)
-    assert isinstance(BallbotVectorEnv(1, randomization=ROBOTS).batch, BallbotLoop)
-    assert isinstance(BallbotVectorEnv(LOOP_BELOW - 1, compile=False).batch, BallbotLoop)
-    assert isinstance(BallbotVectorEnv(LOOP_BELOW, compile=False).batch, BallbotBatch)
-    assert isinstance(BallbotVectorEnv(2, compile=True).batch, BallbotBatch)
-
-
-def test_gymnasiums_normalizing_wrappers_take_next_step_and_disabled():
-    from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward
-
-    envs = NormalizeReward(
-        NormalizeObservation(gymnasium.make_vec("BallbotTurn-v0", num_envs=3, autoreset_mode="NextStep"))
-    )
-    envs.reset(seed=0)
-    for _ in range(30):
-        observation, reward, *_ = envs.step(envs.action_space.sample())
-    assert np.isfinite(observation).all()
-    assert np.isfinite(reward).all()

@@ -26,7 +26,7 @@ from ballbot_gym import BallbotEnv, certified, files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.env import make_task
 from ballbot_gym.params import URDF_PATH, BallbotParams, default_params
-from ballbot_gym.randomization import Disturbance, Randomization
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS as TASK_NAMES
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.vector import BallbotVectorEnv
@@ -42,8 +42,6 @@ from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy
 
 REFUSALS = (ValueError, TypeError, gymnasium.error.Error)
 """What a wrong call may raise."""
-
-MESSAGES = 200  # characters of a value that a message may repeat, and more
 
 
 def env(**keywords):
@@ -78,62 +76,36 @@ def randomization(**fields):
 
 ENVS = [
     (lambda f: env(task="dance"), "unknown task 'dance'; known: 'stabilize'"),
-    (lambda f: env(task=None), "unknown task None; known"),
-    (lambda f: env(task=["stabilize"]), "unknown task ['stabilize']; known"),
     (lambda f: env(physics="dart"), "unknown physics 'dart'; known: 'bullet', 'mujoco', 'rk4'"),
-    (lambda f: env(physics=["rk4"]), "unknown physics ['rk4']; known"),
     (lambda f: env(render_mode="ascii"), "unknown render_mode 'ascii'; known"),
     (lambda f: env(frameskip=4), "got an unexpected keyword argument 'frameskip'; it has"),
-    (lambda f: env(params={"body_mass": 12.0}), "params must be a BallbotParams, for instance dataclasses.replace("),
-    (lambda f: env(params="ballbot.urdf"), "params must be a BallbotParams"),
     (lambda f: env(randomization={"lean_noise": 0.1}), "randomization must be a Randomization, for instance"),
-    (lambda f: env(physics_dt=0.0), "physics_dt = 0.0 s must be a whole fraction of control_dt = 0.02 s"),
     (lambda f: env(physics_dt=0.003), "physics_dt = 0.003 s must be a whole fraction"),
-    (lambda f: env(physics_dt=math.nan), "physics_dt = nan s must be a whole fraction"),
     (lambda f: env(physics_dt=1e-30), "at least 1/10000 of it"),
     (lambda f: env(physics_dt="0.001"), "physics_dt must be a number of seconds, not '0.001'"),
     (lambda f: env(task=make_task("turn"), duration=4.0), "fields ['duration'] cannot be given together with a Task"),
     (lambda f: started(seed=-1), "-1"),
-    (lambda f: started(seed="7"), "Seed must be a python integer"),
-    (lambda f: started(options=[1]), "options must be a dict with 'state' and 'constants', not [1]"),
     (lambda f: started(options={"sate": np.zeros(8)}), "unknown reset options ['sate']; known: 'state', 'constants'"),
     (lambda f: started(options={"state": np.zeros(7)}), "state must be 8 finite numbers"),
-    (lambda f: started(options={"state": [[0.0] * 8]}), "state must be 8 finite numbers"),
-    (lambda f: started(options={"state": [0, 0, 1.5, 0, 0, 0, 0, 0]}), "tilt 85.9° of at most 80.0°"),
-    (lambda f: started(options={"constants": [0.0] * 99}), "constants must be"),
     (constants("stabilize", colour=1.0), "has no constants ['colour']; its episodes have none"),
     (lambda f: started(options={"state": [1e200] + [0.0] * 7}), "state must be numbers within ±1e+06"),
-    (lambda f: started(options={"state": [0, 0, 2.0, 0, 0, 0, 0, 0]}), "it violates the limit of tilt"),
-    (lambda f: started("turn", options={"constants": [[3.0]]}), "constants must be 1 finite numbers"),
     (constants("turn", sped=3.0), "has no constants ['sped']; it has ['speed']"),
     (constants("turn", speed=30.0), "speed must be in (0, 12] m/s, not 30"),
-    (constants("turn", speed="fast"), "constants must be 1 finite numbers"),
     (constants("orbit", radius=0.1), "radius must exceed"),
     (constants("orbit", speed=0.0), "speed must not be 0"),
-    (constants("orbit", radius=1e200), "constants must be numbers within ±1e+06"),
     (constants("weave", obstacle0_radius=-1.0), "obstacle0_radius must be positive"),
     (constants("weave", obstacle0_x=7.0, obstacle0_y=0.0, goal_x=7.0), "the goal lies in obstacle 0"),
     (constants("weave", obstacle0_x=0.0, obstacle0_y=0.0, obstacle0_radius=0.5), "start state is out of range"),
-    (constants("weave", goal_x=1e300), "constants must be numbers within ±1e+06"),
     (lambda f: env().step([0.0, 0.0]), "step() before reset()"),
     (lambda f: stepped([0.0]), "action must have shape (2,), not (1,)"),
-    (lambda f: started(options={"sate": 1, 2: 3}), "unknown reset options ['sate', 2]; known"),
-    (constants("turn", sped=10**5000), "has no constants ['sped']"),
-    (lambda f: started("turn", options={"constants": {1: 2.0, "sped": 3.0}}), "has no constants ['sped', 1]"),
-    (lambda f: env(physics_dt=10**400), "must be a whole fraction of control_dt"),
     (lambda f: evaluate(lambda o: [1j, 0.0], episodes=1, physics="rk4"), "action must be real numbers, not [1j, 0.0]"),
 ]
 
 NO_REAL_NUMBERS = {
     "complex": lambda zeros: [complex(zero) for zero in zeros],
     "complex array": lambda zeros: np.array(zeros, complex),
-    "complex number": lambda zeros: [1j, *zeros[1:]],
-    "truth values": lambda zeros: [False for _ in zeros],
     "truth array": lambda zeros: np.zeros(len(zeros), bool),
     "words": lambda zeros: ["0" for _ in zeros],
-    "word array": lambda zeros: np.array(["0" for _ in zeros]),
-    "objects": lambda zeros: np.array(zeros, object),
-    "nothing": lambda zeros: [None for _ in zeros],
     "dates": lambda zeros: np.array(["2020" for _ in zeros], "M8[Y]"),
     "masked": lambda zeros: np.ma.masked_array(zeros, [True, *zeros[1:]]),
     "ragged": lambda zeros: [[0.0], *zeros[1:]],
@@ -174,38 +146,19 @@ def test_single_and_vector_envs_clip_the_same_actions(huge):
 
 TASKS = [
     (task("stabilize", duration="8"), "Stabilize: duration must be a number, not '8'"),
-    (task("stabilize", duration=True), "Stabilize: duration must be a number, not True"),
-    (task("stabilize", rest_weight=np.float32(math.inf)), "rest_weight must be positive and finite, not inf"),
-    (task("stabilize", rest_weight=10**400), "rest_weight must be positive and finite"),
-    (task("stabilize", duration=np.float32(math.nan)), "duration must be positive and finite, not nan"),
     (task("stabilize", duration=1e9), "must be 1 to 1,000,000 control steps"),
-    (task("stabilize", duration=1e-9), "must be 1 to 1,000,000 control steps"),
     (task("stabilize", duration=1.01), "is not a whole number of control steps"),
-    (task("stabilize", control_dt=1e-12), "must be 1 to 1,000,000 control steps"),
     (task("stabilize", control_dt=0), "control_dt must be positive and finite, not 0"),
     (task("stabilize", max_tilt=math.pi / 2), "max_tilt must be below 90°"),
-    (task("stabilize", max_tilt=-0.1), "max_tilt must be positive and finite"),
-    (task("stabilize", effort_weight=-1.0), "effort_weight must be positive and finite"),
     (task("turn", max_speed=200.0), "max_speed 200 must be in order, and at most 12 m/s"),
-    (task("turn", min_speed=9.0, max_speed=3.0), "min_speed 9 and max_speed 3 must be in order"),
     (task("orbit", min_radius=5.0), "min_radius 5 exceeds max_radius 3 m"),
-    (task("orbit", min_steady_tilt=1.0), "min_steady_tilt 1 and max_steady_tilt"),
-    (task("orbit", max_steady_tilt=1.6), "must be in order, and below 90°"),
 ]
 
 ROBOTS = [
-    (params(body_mass=10**400), "body_mass must be positive and finite"),
-    (params(body_mass=np.float32(math.inf)), "body_mass must be positive and finite, not inf"),
-    (lambda f: env(robot={"body_mass": 12.0}), "params must be a BallbotParams"),
     (params(body_mass=math.nan), "body_mass must be positive and finite, not nan"),
-    (params(ball_mass=-1.0), "ball_mass must be positive and finite, not -1.0"),
-    (params(gravity=math.nan), "gravity must be positive and finite, not nan"),
     (params(inertia="1"), "inertia must be a number, not '1'"),
-    (params(body_mass=True), "body_mass must be a number, not True"),
-    (lambda f: BallbotParams.from_urdf(gravity=-9.81), "gravity must be positive and finite"),
     (lambda f: BallbotParams.from_urdf(f / "none.urdf"), "none.urdf: no such file"),
     (lambda f: BallbotParams.from_urdf(f), "is no regular file; give the path of a URDF"),
-    (lambda f: BallbotParams.from_urdf("/dev/zero"), "/dev/zero is no regular file"),
     (lambda f: BallbotParams.from_urdf("a\0b"), "give the path of a URDF"),
 ]
 
@@ -249,39 +202,22 @@ def body(old, new):
 
 
 URDFS = [
-    (written("", BallbotParams.from_urdf), "not well-formed XML"),
-    (written("<robot", BallbotParams.from_urdf), "not well-formed XML"),
-    (written(b"\xff\xfe\x00", BallbotParams.from_urdf), "not well-formed XML"),
     (written('<?xml version="1.0" encoding="klingon"?><robot/>', BallbotParams.from_urdf), "not well-formed XML"),
-    (written('<?xml version="1.0" encoding="utf-7"?><robot/>', BallbotParams.from_urdf), "file: "),
     (written("<robot>" + "<link>" * 100_000 + "</link>" * 100_000 + "</robot>", BallbotParams.from_urdf), "missing"),
     (written("<robot/>", BallbotParams.from_urdf), "joint 'x' is missing"),
     (urdf('<link name="body">', '<link name="ball">'), "link 'ball' is there 2 times"),
     (body("mass value=", 'mass value="inf" was='), "value = 'inf' is not a number"),
     (body("ixx=", 'ixx="1e999" was='), "ixx = '1e999' is not a number"),
-    (body("xyz=", 'xyz="0 0 nan" was='), "xyz = '0 0 nan' is not three numbers"),
-    (urdf("effort=", 'effort="nan" was='), "effort = 'nan' is not a number"),
 ]
 
 RANDOMIZATIONS = [
-    (randomization(body_mass=(1, 10**400)), "body_mass must be a finite range (low, high)"),
     (randomization(body_mass=(1.2, 0.8)), "body_mass must be a finite range (low, high)"),
     (randomization(body_mass=(0.0, 1.0)), "body_mass must be positive factors"),
     (randomization(body_mass=(1.0, 1e300)), "body_mass must be at most 1000"),
-    (randomization(body_mass="12"), "body_mass must be a finite range (low, high), not '12'"),
-    (randomization(body_mass=(True, True)), "body_mass must be a finite range"),
     (randomization(lean_noise=-0.1), "lean_noise must be finite and at least 0"),
-    (randomization(lean_noise="0.1"), "lean_noise must be a number, not '0.1'"),
-    (randomization(lean_noise=1e300), "lean_noise must be finite and at least 0, and at most 1e+06"),
-    (randomization(lean_noise=(0.0, 0.1)), "lean_noise must be a number, not (0.0, 0.1)"),
     (randomization(push_interval=0.0), "push_interval must be positive"),
     (randomization(actuator_lag=(-0.1, 0.1)), "actuator_lag must be at least 0"),
     (lambda f: env(randomization=Randomization(actuator_delay=(0.0, 0.03))), "must be whole control steps of 0.02 s"),
-    (lambda f: env(randomization=Randomization(actuator_delay=(0.0, 1e5))), "must be at most 1000 control steps"),
-    (
-        lambda f: Disturbance(Randomization(actuator_delay=(0, 1e6)), default_params(), 1e-9),
-        "at most 1000 control steps",
-    ),
 ]
 
 
@@ -343,23 +279,17 @@ TRAJECTORIES = [
     (lambda f: Trajectory.load("/dev/zero"), "is no regular file"),
     (written(b"", Trajectory.load), "is no .npz file, or a damaged one"),
     (written(b"garbage" * 99, Trajectory.load), "is no .npz file, or a damaged one"),
-    (written(npz(**STILL)[:-30], Trajectory.load), "is no .npz file, or a damaged one"),
     (written(npz(t=np.arange(3.0)), Trajectory.load), "it has no array x, u"),
-    (written(archive({"t.npy": b"short"}), Trajectory.load), "is no .npz file, or a damaged one"),
     (written(archive({"t.npy": npy(HUGE)}), Trajectory.load), "does not fit 0 bytes"),
     (written(archive({"t.npy": npy(DEEP)}), Trajectory.load), "a damaged one"),
-    (written(archive({"t.npy": npy("{")}), Trajectory.load), "a damaged one"),
     (written(archive({"t.npy": npy(HUGE.replace("<f8", "|O"))}), Trajectory.load), "is no array of numbers"),
-    (written(archive({"t.npy": npy(HUGE.replace("1000000000", "-1"))}), Trajectory.load), "does not fit"),
     (written(archive({"t.npy": npz(**STILL)[:100], "t": b""}), Trajectory.load), "two arrays of one name"),
     (written(bomb(), Trajectory.load), "unpacks to 2384 MiB; at most 256 MiB are read"),
     (written(encrypted(), Trajectory.load), "t.npy is encrypted; write it without a password"),
     (written(odd_method(12), Trajectory.load), "t.npy is compressed by method 12; use numpy.savez"),
     (trajectory(x=np.zeros((3, 8)) * 1j), "x must be real numbers"),
-    (trajectory(t=np.array(["a", "b", "c"])), "t must be real numbers"),
     (lambda f: Trajectory([0, 1], "rest", np.zeros((1, 2))), "x must be real numbers"),
     (lambda f: Trajectory([0, 1e9], np.zeros((2, 8)), np.zeros((1, 2))).resampled(0.02), "more than 1,000,000 times"),
-    (lambda f: files.read(URDF_PATH, 10), "is larger than 0 MiB, the most that is read"),
 ]
 
 
@@ -375,23 +305,15 @@ def evaluation_set(**changes):
 
 
 SETS = [
-    (lambda f: certified.load("dance", "paper"), "unknown task 'dance'; known"),
     (
         lambda f: certified.load("turn", "paper", f / "none.npz"),
         'compute all of it with "ballbot certify --tasks turn"',
     ),
     (lambda f: certified.load(make_task("turn", duration=4.0), "paper"), "was computed for Turn("),
-    (lambda f: certified.load("stabilize", "paper", certified.path_of(make_task("turn"))), "was computed for Turn("),
-    (lambda f: certified.load("turn", "paper", f), "is no evaluation set"),
-    (written(b"garbage", lambda path: certified.load("turn", "paper", path)), "is no evaluation set"),
     (written(bomb(), lambda path: certified.load("turn", "paper", path)), "unpacks to 2384 MiB"),
     (evaluation_set(costs=None), "it has no array costs"),
     (evaluation_set(states=np.zeros((200, 7))), "states has the shape (200, 7)"),
-    (evaluation_set(costs=np.full(200, math.nan)), "costs must be finite numbers"),
-    (evaluation_set(costs=np.zeros(200)), "costs must be positive"),
     (evaluation_set(lengths=np.array([10**9])), "lengths must be 0 to 400 control steps"),
-    (evaluation_set(lengths=np.array([1.5])), "lengths must be whole numbers"),
-    (evaluation_set(u=np.zeros((3, 2))), "u has the shape (3, 2)"),
 ]
 
 
@@ -429,38 +351,19 @@ POLICIES = [
     (lambda f: load_policy(f / "none.json"), "none.json is not a policy"),
     (policy(text="{"), "holds no JSON"),
     (policy(text="[" * 100_000), "it is nested too deeply"),
-    (policy(text="[]"), "is not a policy"),
-    (policy(text="{}"), "it has no 'spec'"),
     (policy(text='{"spec": 3}'), "its spec is no object"),
-    (policy(task=MISSING), "it has no 'task'"),
-    (policy(task=3), "its spec names no task"),
-    (policy(hidden=MISSING), "has no 'hidden'"),
     (policy(squash="sigmoid"), "squash must be one of tanh, clip, tanh_in_frame, not 'sigmoid'"),
     (policy(activation="exec"), "activation must be one of tanh, relu, silu, not 'exec'"),
     (policy(linear="false"), "linear must be true or false, not 'false'"),
-    (policy(odd=1), "odd must be true or false, not 1"),
     (policy(odd=True, activation="relu"), "odd needs the activation tanh"),
-    (policy(centred=True), "centred needs a frame with a steady motion, not None"),
-    (policy(centred=True, frame="gate"), "centred needs a frame with a steady motion, not 'gate'"),
-    (policy(hidden="128"), "hidden must be a list of whole numbers, not '128'"),
-    (policy(hidden=[-1]), "hidden must be whole numbers"),
     (policy(hidden=[10**12]), "hidden must be whole numbers from 0 to 1000000"),
     (policy(hidden=[10**6] * 9), "the weights do not fit their description"),
-    (policy(hidden=[4] * 10_000), "at most 64 layers"),
-    (policy(observations="8"), "observations must be whole numbers"),
     (policy(observations=9), "takes 9 observations"),
     (policy(observation_version=0), "reads observation version 0"),
-    (policy(surprise=1), "surprise"),
     (policy(raw=b"\x80\x04pickled"), "mine.safetensors is not a policy"),
-    (policy(raw=struct.pack("<Q", 2**63)), "mine.safetensors is not a policy"),
-    (policy(raw=header(b"[" * 100_000)), "mine.safetensors is not a policy"),
     (policy(raw=header({"w": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 4]}}, bytes(4))), "not a policy"),
-    (policy(raw=header({"w": {"dtype": "F32", "shape": [1], "data_offsets": [0, 2**42]}}, bytes(4))), "not a policy"),
     (policy(weights=lambda w: {"mlp.0.weight": w["mlp.0.weight"] * math.nan}), "mlp.0.weight holds NaN or infinity"),
     (policy(weights=lambda w: {"mlp.0.bias": torch.full((4,), 3e38)}), "mlp.0.bias holds numbers beyond ±1e+06"),
-    (policy(weights=lambda w: {"mlp.0.bias": torch.zeros(4, dtype=torch.int32)}), "mlp.0.bias holds torch.int32"),
-    (policy(weights=lambda w: {"more": torch.zeros(1)}), "more has the shape (1,), and should have None"),
-    (lambda f: save_policy(f / "mine", PolicyNetwork(PolicySpec("t", 8, hidden=(-4,))), {}), "hidden must be whole"),
 ]
 
 
@@ -496,10 +399,6 @@ RESULTS = [
     (results(lambda text: '{"about": {}}'), "holds no episodes of a benchmark"),
     (entry(cost=None), "has the cost nan"),
     (entry(optimum=0), "the optimum 0"),
-    (entry(optimum=None), "the optimum nan"),
-    (entry(cost="12"), "cost of an episode is '12'"),
-    (entry(episode=True), "episode of an episode is True"),
-    (entry(surprise=1), "surprise"),
 ]
 
 
@@ -521,22 +420,14 @@ DESCRIBED = {"demos": {}, "task": repr(make_task("stabilize")), "observation_ver
 DEMOS = [
     (dataset(), 'is no dataset of "ballbot demos"'),
     (dataset("[" * 100_000), "nested too deeply"),
-    (dataset("[]"), "not made by ballbot demos"),
     (dataset('{"demos": 3}'), "not made by ballbot demos"),
-    (dataset('{"demos": {}}'), "holds demonstrations of None"),
-    (dataset(json.dumps(DESCRIBED | {"observation_version": 0})), "holds observations of version 0"),
     (dataset(json.dumps(DESCRIBED)), 'is damaged; make it anew with "ballbot demos"'),
     (lambda f: DemoConfig(episodes=0), "episodes must be 1 to 1000000, not 0"),
-    (lambda f: DemoConfig(seed=-1), "seed must be 0 to"),
     (lambda f: DemoConfig(noise=math.nan), "noise must be finite and at least 0"),
-    (lambda f: DemoConfig(task="dance"), "unknown task 'dance'"),
     (lambda f: DemoConfig(expert="me"), "unknown expert me; known: lqr"),
     (lambda f: write_demos(DemoConfig(), f / "name", 1, lambda n: None), "is named NAME-vNUMBER"),
     (lambda f: write_demos(DemoConfig(), f / "mine-v0", 0, lambda n: None), "workers must be at least 1"),
     (lambda f: Backoff(margin=-0.1), "Backoff: margin must be at least 0"),
-    (lambda f: Backoff(goal=1.0), "Backoff: goal must be at least 0 and below 1"),
-    (lambda f: Backoff(force=math.nan), "Backoff: force must be at least 0 and below 1"),
-    (lambda f: Backoff(force="0.1"), "Backoff: force must be a number"),
 ]
 
 
@@ -575,42 +466,24 @@ FINITE = "must be finite numbers within ±1e+06"
 
 BATCHES = [
     (batch(x=lambda x: x * math.nan), f"x {FINITE}"),
-    (batch(x=lambda x: x + 1e7), f"x {FINITE}"),
-    (batch(x=lambda x: x[:7]), "x must be a tensor of shape (8, 3), not one of shape (7, 3)"),
-    (batch(x=lambda x: x.numpy()), "x must be a tensor of shape (8, 3), not array("),
     (batch(x=lambda x: x + 1.5), "start states of envs [0, 1, 2] violate limits of BallbotTurn-v0"),
-    (batch(c=lambda c: c * math.nan), f"c {FINITE}"),
     (batch(c=lambda c: c + 23), "speed must be in (0, 12] m/s, not 23"),
-    (batch(c=lambda c: c.repeat(2, 1)), "c must be a tensor of shape (1, 3), not one of shape (2, 3)"),
     (batch(mask=lambda _: [True] * 3), "mask must be a tensor of 3 bools, not [True, True, True]"),
-    (batch(mask=lambda _: torch.ones(3)), "mask must be a tensor of 3 bools, not one of shape (3,), torch.float32"),
-    (batch(mask=lambda _: torch.ones(2, dtype=torch.bool)), "mask must be a tensor of 3 bools"),
     (batch(seed=lambda _: "abc"), "seed must be a whole number, or one or None for each env, not 'abc'"),
-    (batch(seed=lambda _: [1.5, 2, 3]), "seeds must be whole numbers, not 1.5"),
-    (batch(seed=lambda _: [True, 2, 3]), "seeds must be whole numbers, not True"),
     (batch(seed=lambda _: [1, 2]), "seed has 2 entries for 3 envs"),
     (batch(seed=lambda _: 2**63), "seeds must be in [0, 2^63)"),
-    (batch(seed=lambda _: 10**5000), "seeds must be in [0, 2^63), not something of type int"),
-    (batch(seed=lambda _: True), "seed must be a whole number, or one or None for each env, not True"),
     (batch(seed=lambda _: itertools.count()), "seed has more than 3 entries for 3 envs"),
-    (batch(x=lambda x: x + 0j), "x must be real numbers, not one of shape (8, 3), torch.complex64"),
     (batched([[1.0, 0.0]] * 3), "actions must be a tensor of shape (3, 2), not [[1.0, 0.0]"),
     (batched(torch.zeros(2, 3)), "actions must be a tensor of shape (3, 2), not one of shape (2, 3)"),
-    (batched(torch.zeros(3, 2) + 0j), "actions must be real numbers, not one of shape (3, 2), torch.complex64"),
-    (batched(torch.zeros(3, 2) > 0), "actions must be real numbers, not one of shape (3, 2), torch.bool"),
     (lambda f: BallbotBatch("turn", 10**9), "num_envs must be at most 1048576, not 1000000000"),
     (lambda f: gymnasium.make_vec("BallbotTurn-v0", num_envs=10**9), "num_envs must be at most 1048576"),
     (lambda f: BallbotVectorEnv(2, "turn").reset(options=[1]), "options must be a dict with 'reset_mask' and 'state'"),
-    (lambda f: BallbotVectorEnv(0), "num_envs"),
     (lambda f: BallbotVectorEnv(2, compile="yes"), "compile"),
-    (lambda f: BallbotVectorEnv(2, render_mode="human"), "render_mode"),
     (lambda f: BallbotVectorEnv(2, physics="bullet"), 'num_envs=2, vectorization_mode="sync", physics="bullet"'),
     (lambda f: BallbotVectorEnv(2, autoreset_mode="never"), "unknown autoreset_mode 'never'; known: 'NextStep'"),
     (lambda f: BallbotVectorEnv(2, engine="numpy"), "unknown engine 'numpy'; known: 'auto', 'native', 'torch', 'loop'"),
     (lambda f: BallbotVectorEnv(2, max_episode_steps=0), "max_episode_steps must be a positive whole number"),
-    (lambda f: BallbotVectorEnv(2, frameskip=4), "got an unexpected keyword argument 'frameskip'"),
     (vector(num_envs=2, reset_mask=np.ma.masked_array([True, False], [True, False])), "must be a NumPy array of bool"),
-    (vector(num_envs=3, stat=1), "unknown reset options"),
     (lambda f: BallbotVectorEnv(2, dtype="float16"), "dtype must be torch.float32 or torch.float64, not float16"),
     *(
         case
@@ -619,16 +492,12 @@ BATCHES = [
             (vector(num_envs=envs, state=[1e200] + [0.0] * 7), "state must be numbers within ±1e+06, not [1e+200"),
             (vector(num_envs=envs, state=[math.nan] * 8), "state must be finite numbers that broadcast to"),
             (vector(num_envs=envs, state=np.zeros((2, 8))), "state must be finite numbers that broadcast to"),
-            (vector(num_envs=envs, state="x"), "state must be finite numbers that broadcast to"),
             (vector(num_envs=envs, constants={"speed": 1e200}), "constant 'speed' must be numbers within ±1e+06"),
-            (vector(num_envs=envs, constants={"speed": math.nan}), "constant 'speed' must be finite numbers"),
             (vector(num_envs=envs, constants=[[3.0]] * 2), "constants must be finite numbers that broadcast to"),
             (vector(num_envs=envs, reset_mask=[True]), "must be a NumPy array of bool"),
             (vector(num_envs=envs, reset_mask=np.ones(envs, int)), "must be a NumPy array of bool"),
-            (vector(num_envs=envs, reset_mask=np.array([True])), "shape"),
             (vector(num_envs=envs, reset_mask=np.zeros(envs, bool)), "True somewhere"),
             (vector("abc", envs), "seed must be a whole number"),
-            (vector([1.5] * envs, envs), "seeds must be whole numbers, not 1.5"),
             (vector(-1, envs), "seeds must be in [0, 2^63), not -1"),
         )
     ),
@@ -636,19 +505,14 @@ BATCHES = [
 
 LEARNING = [
     (settings("shac", iterations=-5), "iterations must be 1 to 1000000000, not -5"),
-    (settings("shac", num_envs=0), "num_envs must be 1 to"),
     (settings("shac", num_envs=10**12), "num_envs must be 1 to 1048576"),
     (settings("shac", learning_rate=math.nan), "learning_rate must be finite and positive, not nan"),
-    (settings("shac", learning_rate=0.0), "learning_rate must be finite and positive"),
     (settings("shac", horizon=10**9), "horizon must be 0 to 100000"),
     (settings("shac", horizon=10**4, num_envs=10**5), "1000000000 env steps per iteration, and at most 100000000"),
     (settings("ppo", std=0.0), "std must be finite and positive, not 0.0"),
     (settings("ppo", gamma=1.5), "gamma must be 0 to 1, not 1.5"),
-    (settings("ppo", gae_lambda=math.nan), "gae_lambda must be 0 to 1, not nan"),
     (settings("ppo", imitation_weight=math.inf), "imitation_weight must be finite"),
     (settings("dagger", hidden=(0,)), "hidden must be 1 to"),
-    (settings("dagger", batch_size=0), "batch_size must be 1 to"),
-    (settings("dagger", gathering_iterations=-1), "gathering_iterations must be 0 to"),
 ]
 
 
@@ -658,32 +522,21 @@ def nothing(observation):
 
 EVALUATION = [
     (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, or a list of indices, not 0"),
-    (lambda f: evaluate(nothing, episodes=201), "episodes must be 1 to 200"),
-    (lambda f: evaluate(nothing, episodes=[]), "episodes is empty; give at least one index"),
     (lambda f: evaluate(nothing, episodes=[0, 0]), "names an episode twice; give each once"),
     (lambda f: evaluate(nothing, episodes=[200]), "indices of episodes must be 0 to 199, not 200"),
     (lambda f: evaluate(nothing, episodes=[0.5]), "indices of episodes must be whole numbers, not 0.5"),
-    (lambda f: evaluate(nothing, episodes="5"), "episodes must be a number of episodes or a list of indices, not '5'"),
-    (lambda f: evaluate(nothing, episodes=None), "a number of episodes or a list of indices, not None"),
     (lambda f: evaluate(nothing, episodes=itertools.count()), "names more than the 200 episodes"),
-    (lambda f: evaluate(nothing, "dance"), "unknown task 'dance'"),
     (lambda f: training.score(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
-    (lambda f: evaluate(nothing, physics="real"), "unknown physics 'real'"),
     (lambda f: evaluate(nothing, randomization=3), "randomization must be a Randomization"),
     (lambda f: evaluate(None), "None is no policy: give a Controller"),
     (lambda f: evaluate("pid"), "unknown controller 'pid'"),
     (lambda f: evaluate("mine.zip"), "mine.zip: no such file"),
-    (lambda f: evaluate("mine.json"), "mine.json is not a policy"),
     (lambda f: evaluate(lambda o: np.zeros(3), episodes=1, physics="rk4"), "action must have shape (2,)"),
-    (lambda f: evaluate(lambda o: None, episodes=1, physics="rk4"), "action must"),
     (lambda f: evaluate(lambda o: [math.nan, 0], episodes=1, physics="rk4"), "action must be finite"),
     (lambda f: controllers_of([]), "give at least one task"),
-    (lambda f: controllers_of(["turn", "turn"]), "task turn is given more than once"),
     (lambda f: controllers_of(["turn"], ["lqr", "lqr"]), "controller lqr is given more than once"),
-    (lambda f: controllers_of(["turn"], ["[red]x"]), "unknown controller [red]x"),
     (lambda f: jobs.run([], f, 0, print), "workers must be at least 1"),
     (written("{", lambda path: jobs.claim(path.parent, {}), jobs.MARKER), "is damaged"),
-    (written("[" * 100_000, lambda path: jobs.claim(path.parent, {}), jobs.MARKER), "is damaged"),
 ]
 
 GROUPS = {
@@ -719,108 +572,39 @@ def test_wrong_input_is_refused_with_a_message_that_names_it(call, message, tmp_
 
 TYPED = [
     ("benchmark --tasks dance", "unknown task dance; known: stabilize"),
-    ("benchmark --tasks turn turn", "task turn is given more than once"),
     ("benchmark --controllers pid", "unknown controller pid; known: lqr"),
-    ("benchmark --controllers lqr lqr", "controller lqr is given more than once"),
-    ("benchmark --controllers mine.zip", "mine.zip: no such file"),
     ("benchmark --episodes 0", "episodes must be 1 to 200, not 0"),
-    ("benchmark --seed -1", "seed must be at least 0, not -1"),
-    ("benchmark --workers 0", "workers must be at least 1, not 0"),
-    ("benchmark --physics dart", "invalid choice"),
-    ("robustness --stresses wind", "unknown stress wind; known: push"),
-    ("basins --points 4", "points must be odd, and 3 to 501, not 4"),
-    ("certify --episodes 0", "episodes must be at least 1"),
-    ("certify --episodes 100000000000", "episodes must be at most 100000, not 100000000000"),
-    ("certify --tasks", "give at least one task"),
-    ("certify --ray ray://head:10001", "is the address of a Ray client, which is not supported"),
     ("certify --install --shards set", "give --install without --shards"),
     ("certify --episodes 1 --shards nowhere://set", "nowhere://set/stabilize cannot be read"),
     ("train ppo --seeds 0:2 --workers 0", "workers must be 1 to 1024, not 0"),
     ("train dagger --demos nowhere://set", "nowhere://set cannot be read"),
-    ("robustness --stresses", "give at least one stress"),
-    ("robustness --stresses push push", "stress push is given more than once"),
     ("demos --backoff.margin nan", "margin must be at least 0 and below inf, not nan"),
     ("demos --pushes 1e9", "pushes must be at most 50 per second, one in every control step"),
-    ("demos --pushes inf", "pushes must be finite and at least 0, not inf"),
     ("certify --episodes 3 --install", "the package needs sets of 200 episodes"),
     ("paper --only fig9", "unknown problem fig9"),
-    ("optimize dance", "unknown task dance"),
-    ("optimize stabilize --duration 1e9", "must be 1 to 1,000,000 control steps"),
     ("optimize stabilize --duration 1000", "is too long to optimize; give at most 100 s"),
-    ("optimize stabilize --max-tilt 95", "max_tilt must be below 90°"),
-    ("optimize stabilize --force-limit nan", "force_limit must be positive and finite, not nan"),
-    ("optimize stabilize --seed -1", "seed must be at least 0"),
-    ("optimize stabilize --state 0 0 nan 0 0 0 0 0", "state must be 8 finite numbers"),
-    ("optimize turn --constants sped 3", "has no constants ['sped']; it has ['speed']"),
-    ("optimize turn --constants speed 30", "speed must be in (0, 12] m/s"),
     ("compare a b", "no such file"),
-    ("replay dance", "unknown task dance"),
-    ("replay stabilize --episode 500", "episode must be 0 to 199, not 500"),
-    ("replay stabilize --frames 0", "frames must be 1 to 100"),
-    ("replay stabilize --fps 0", "fps must be 1 to 1000"),
-    ("replay stabilize --seconds nan", "seconds must be positive, not nan"),
-    ("replay stabilize --speed 0", "speed must be positive"),
-    ("replay stabilize --width 3", "width must be 64 to 7680 px"),
     ("replay stabilize --controllers lqr --physics rk4 --format gif --speed 1e-9", "frames; give another speed or fps"),
-    ("replay none.npz", "none.npz: no such file"),
-    ("demos --task dance", "unknown task dance"),
-    ("demos --expert me", "unknown expert me"),
-    ("demos --episodes 0", "episodes must be 1 to"),
-    ("demos --seed -1", "seed must be 0 to"),
-    ("demos --noise nan", "noise must be finite"),
-    ("demos --backoff.goal -1", "Backoff: goal must be at least 0"),
     ("demos --out mine", "is named NAME-vNUMBER"),
     ("train dance", "unknown learner dance; known: dagger, ppo"),
-    ("train shac --task dance", "unknown task dance"),
-    ("train shac --threads 0", "threads must be 1 to"),
-    ("train shac --seed -1", "seed must be 0 to"),
-    ("train shac --evaluations 0", "evaluations must be 1 to"),
     ("train shac --demos x", "shac uses no demonstrations"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),
-    ("train shac --start none.json", "none.json is not a policy"),
     ("train dagger --gathering-iterations 0", "gathering_iterations 0 needs demonstrations: give --demos"),
-    ("train dagger --demos none", 'is no dataset of "ballbot demos"'),
-    ("train dagger --backoff.force 2", "Backoff: force must be at least 0 and below 1"),
     ("evaluate shac --bins 0", "bins must be at least 1, not 0"),
-    ("evaluate shac --bins 1000000000", "bins must be at most 10000, not 1000000000"),
-    ("evaluate shac --fresh -5", "fresh must be at least 0, not -5"),
     ("evaluate shac --fresh 0", "nothing to run: give --fresh or --episodes"),
-    ("evaluate shac --fresh 99999999999", "the number of fresh episodes must be 1 to 1,000,000"),
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
-    ("evaluate shac --fresh 10 --seed 99999999999", "seed must be 0 to 4294967295"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
-    ("evaluate shac --fresh 10 --workers 0", "workers must be at least 1, not 0"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),
-    ("evaluate lqr --episodes 201", "episodes must be at most 200"),
     ("evaluate nothere", "unknown controller nothere"),
-    ("evaluate /dev/zero", "unknown controller /dev/zero"),
-    ("benchmark --tasks", "give at least one task"),
     ("benchmark --tasks turn --controllers lqr --physics rk4 --out /dev/null", "/dev/null cannot be a folder"),
-    ("train ppo --std 0", "std must be finite and positive, not 0.0"),
-    ("train ppo --gamma 2", "gamma must be 0 to 1, not 2.0"),
-    ("train ppo --num-envs 100000000", "num_envs must be 1 to 1048576"),
-    ("train ppo --symmetry dance", "invalid choice 'dance'"),
-    ("train ppo --episode-seconds 1e9", "must be 1 to 1,000,000 control steps"),
-    ("train ppo --hidden 1000000000", "hidden must be 1 to 16384"),
-    ("trian", "did you mean train?"),
     ("train ppo --task stabilize --symmetry frame", "has no frame"),
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("benchmark --controllers mine.json", "mine.json is not a policy"),
-    ("train shac --num-envs many", "--num-envs"),
     ("train shac --test-episodes 201", "test_episodes must be 1 to 200, not 201"),
-    ("train shac --validation-episodes 0", "validation_episodes must be 1 to 100000, not 0"),
     ("evaluate dagger --fresh 10", "unknown controller dagger"),  # Stabilize has none
-    ("evaluate nowhere.json --fresh 10", "nowhere.json is not a policy"),
     ("replay stabilize turn", "give one task"),
-    ("replay", "give the name of a task"),
-    ("replay stabilize --controllers", "at least one controller"),
-    ("replay stabilize --controllers nobody", "unknown controller 'nobody'"),
     ("replay none.npz --ghosts lqr", "give the ghosts as files too"),
-    ("replay stabilize --controllers lqr --ghosts nobody --physics rk4", "unknown controller 'nobody'"),
     ("export lqr", "lqr is an expert"),
-    ("export nobody", "unknown policy 'nobody'; BallbotStabilize-v0 has ppo, sac, shac"),
-    ("export sac --task dance", "unknown task dance"),
-    ("export nowhere.json", "no such file"),
 ]
 
 
@@ -841,10 +625,10 @@ def test_what_is_typed_wrong_ends_with_a_message_and_a_status_and_writes_nothing
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", TASK_NAMES)
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_the_settings_tuned_for_every_task_make_sense(learner, name):
-    check_settings(LEARNERS[learner].settings(name))
+def test_the_settings_tuned_for_every_task_make_sense(learner):
+    for name in TASK_NAMES:
+        check_settings(LEARNERS[learner].settings(name))
 
 
 def test_a_pipe_is_not_read(tmp_path):

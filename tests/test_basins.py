@@ -100,7 +100,3 @@ def test_maps_are_written_and_drawn(bounds, tmp_path):
     ]
     assert len((tmp_path / "basins.csv").read_text().splitlines()) == 1 + 2 * 25
     assert figures.save(figures.basin_figure(maps), tmp_path / "basins.png").exists()
-
-
-def test_the_states_to_run_are_counted_by_controller(bounds):
-    assert basins.states_to_run(bounds, ["lqr", "nmpc"], 5, "rk4") == {"lqr": 18, "nmpc": 18}

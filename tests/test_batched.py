@@ -122,13 +122,6 @@ def test_what_falls_is_not_solved(optima, params):
     assert np.isnan(optima.costs[COUNT])
 
 
-def test_starting_at_the_optimum_takes_no_more_iterations(optima, params):
-    i = np.flatnonzero(optima.solved)[:3]
-    again = batched.find_optima(Stabilize(), params, optima.states[i, 0], np.zeros((3, 0)), forces=optima.forces[i])
-    assert (again.iterations <= optima.iterations[i]).all()
-    np.testing.assert_allclose(again.costs, optima.costs[i], rtol=1e-6)
-
-
 @pytest.mark.parametrize("duration", [2.0, 3.4])
 def test_short_episodes_do_not_count_what_comes_after(params, duration):
     task, rng = Stabilize(duration=duration), np.random.default_rng(5)

@@ -5,7 +5,6 @@ from typing import Any, cast
 
 import pytest
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecNormalize
 
 from ballbot_gym.env import make_task
 from ballbot_gym.vector import BallbotVectorEnv
@@ -50,13 +49,6 @@ def test_its_figures_are_those_of_evaluate(shipped):
     assert figures["certified/regret_mean"] == pytest.approx(row.regret_mean, rel=1e-3)
     assert figures["certified/regret_median"] == pytest.approx(row.regret_median, rel=1e-3)
     assert figures["certified/regret_worst"] > row.regret_mean
-
-
-def test_observations_are_normalized_as_in_training(tmp_path):
-    model, callback = ppo(VecNormalize(envs())), RegretCallback("orbit", save_path=tmp_path, validation_episodes=1)
-    model.learn(8 * 16, callback)
-    assert (tmp_path / "best_model.vecnormalize.npz").exists()
-    assert evaluate(tmp_path / "best_model.zip", "orbit", episodes=1, physics="rk4").episodes == 1
 
 
 def test_numbers_below_one_are_refused():

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from ballbot_gym import certified, dynamics
-from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
-from ballbot_gym.rollout import FunctionController, PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 
@@ -128,17 +127,6 @@ def test_entries_survive_json_bit_for_bit():
             np.testing.assert_array_equal(entry[name], getattr(optimum.trajectory, name))
 
 
-def test_entry_of_an_episode_without_an_optimum_says_why(monkeypatch):
-    certification = pytest.importorskip("ballbot_baselines.certification")
-
-    def fail(*args, **options):
-        raise PlanError("no feasible episode")
-
-    monkeypatch.setattr(certification, "find_optimum", fail)
-    found = list(certification.entries("stabilize", [4]))
-    assert found == [{"episode": 4, "error": "no feasible episode"}]
-
-
 def test_set_survives_saving(task, robot, evaluation, tmp_path):
     loaded = certified.load(task, robot, evaluation.save(task, tmp_path / "set.npz", robot))
     np.testing.assert_array_equal(loaded.costs, evaluation.costs)
@@ -146,12 +134,6 @@ def test_set_survives_saving(task, robot, evaluation, tmp_path):
     for a, b in zip(loaded.trajectories, evaluation.trajectories, strict=True):
         np.testing.assert_array_equal(a.x, b.x)
         np.testing.assert_array_equal(a.u, b.u)
-
-
-def test_set_of_other_fields_is_refused(task, robot):
-    other = replace(task, duration=2 * task.duration)
-    with pytest.raises(certified.CertificateError, match=rf"{task.id}.*\.npz was computed for"):
-        certified.load(other, robot)
 
 
 class Nearer(Stabilize):
@@ -191,63 +173,8 @@ def test_a_set_is_of_one_problem_and_one_robot(name):
         certified.load(task, robot)
 
 
-@pytest.mark.parametrize("name", ["half the mass", "a weight"])
-def test_evaluation_asks_for_the_optimum_of_the_very_problem(name, monkeypatch):
-    """One by one, as `evaluate` and training measure certified episodes."""
-    task, robot, _ = OTHERS[name]
-    evaluate = pytest.importorskip("ballbot_train.evaluation.evaluate")
-    asked = []
-
-    def find(*problem, **options):
-        asked.append(problem[:2])
-        raise PlanError("no plan")
-
-    monkeypatch.setattr("ballbot_baselines.certification.find_optimum", find)
-    env = BallbotEnv(task, physics="rk4", robot=robot)
-    with pytest.raises(PlanError, match=r"no optimum of .*\nepisode 0: no plan"):
-        evaluate.evaluate(lambda observation: np.zeros(2), task, 1, "rk4", robot=robot)
-    with pytest.raises(PlanError):
-        evaluate.run_episodes(env, FunctionController(lambda t, x: np.zeros(2)), "idle", "stabilize", [0])
-    assert set(asked) == {(env.task, env.params)}
-
-
-def test_a_set_of_another_cost_is_refused_whatever_it_is_called(monkeypatch):
-    monkeypatch.setitem(TASKS, "stabilize", Dearer)
-    with pytest.raises(certified.CertificateError, match="its optimal trajectories do not move or cost"):
-        certified.load("stabilize", PAPER)
-
-
-def test_pay_and_arena_move_no_optimum():
-    assert len(certified.load(make_task("stabilize", arena_radius=50.0, survival_reward=10.0), default_params())) == 200
-
-
-def test_missing_set_says_how_to_make_one(task, tmp_path):
-    with pytest.raises(certified.CertificateError, match=r"no evaluation set.*ballbot certify"):
-        certified.load(task, "paper", tmp_path / "none.npz")
-
-
 def test_all_sets_together_are_under_7_megabytes():
     assert sum(certified.path_of(make_task(task, robot), robot).stat().st_size for robot, task in SHIPPED) < 7e6
-
-
-def test_a_set_is_improved_by_what_is_cheaper_in_another_alone(task, evaluation):
-    costs = evaluation.costs.copy()
-    costs[1] *= 0.99
-    costs[2] *= 1.01
-    costs[3] *= 1 - 1e-12
-    states = evaluation.states.copy()
-    states[4], costs[4] = 0.0, costs[4] + 1
-    statuses = np.array(["again"] * 200)
-    trajectories = tuple(replace(trajectory, t=trajectory.t + 1) for trajectory in evaluation.trajectories)
-    other = replace(evaluation, costs=costs, states=states, statuses=statuses, trajectories=trajectories)
-    merged = evaluation.improved_by(other)
-    taken = np.flatnonzero(merged.statuses == "again")
-    assert taken.tolist() == [1, 4]  # cheaper; and of another start
-    for name in ("states", "constants", "costs", "durations", "violations"):
-        np.testing.assert_array_equal(getattr(merged, name)[taken], getattr(other, name)[taken])
-        kept = np.setdiff1d(np.arange(200), taken)
-        np.testing.assert_array_equal(getattr(merged, name)[kept], getattr(evaluation, name)[kept])
-    assert [trajectory.t[0] for trajectory in merged.trajectories[:6]] == [0, 1, 0, 0, 1, 0]
 
 
 @pytest.mark.parametrize(

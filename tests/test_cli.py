@@ -3,18 +3,13 @@
 import importlib
 import inspect
 import json
-import os
 import shlex
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import result
 
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
@@ -23,8 +18,6 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
 from ballbot_train.commands.certify import certify
-from ballbot_train.commands.compare import compare
-from ballbot_train.evaluation.results import leaderboard, write_leaderboard
 
 
 def test_benchmark_prints_a_leaderboard_and_writes_table_figures_and_report(tmp_path, typed):
@@ -56,24 +49,7 @@ def test_robustness_writes_tables_and_curves(tmp_path, typed):
     }
 
 
-def test_compare_says_whether_b_is_better(tmp_path, capsys):
-    for name, cost in (("a", 12.0), ("b", 11.0)):
-        results = [result(episode=i, cost=cost) for i in range(20)]
-        write_leaderboard(leaderboard(results), results, {"commit": name}, tmp_path / name)
-    compare(tmp_path / "a", tmp_path / "b", out=tmp_path / "compared.json")
-    assert "better" in capsys.readouterr().out
-    (row,) = json.loads((tmp_path / "compared.json").read_text())["rows"]
-    assert (row["verdict"], row["regret"]) == ("better", pytest.approx(-0.1))
-
-
-def test_a_folder_with_another_unfinished_run_is_refused(tmp_path, typed):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "unfinished.json").write_text('{"episodes": 3}')
-    ended, printed = typed("benchmark", "--tasks", "stabilize", "--episodes", 1, "--out", "out")
-    assert (ended, "unfinished run" in printed) == (1, True), printed
-
-
-def test_paper_writes_plans_and_figures(tmp_path, typed):
+def test_paper_writes_plans_and_figures(tmp_path, typed, interpreted):
     ended, printed = typed("paper", "--only", "stabilize-1", "--out", "figures")
     assert (ended, "106.3652" in printed) == (0, True), printed
     names = {path.name for path in (tmp_path / "figures").iterdir()}
@@ -197,21 +173,6 @@ def test_paths_are_printed_as_they_are(tmp_path, typed):
     assert (runs / "[red]x[/b]:smile:" / "leaderboard.csv").exists()
 
 
-def test_a_second_run_in_the_same_folder_is_refused_while_the_first_works(tmp_path, typed):
-    arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "trajopt", "--workers", "1", "--out", "out")
-    first = subprocess.Popen(
-        [sys.executable, "-m", "ballbot_train.cli", *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not (tmp_path / "out" / "unfinished").exists():
-        time.sleep(0.05)
-    ended, printed = typed(*arguments)
-    first.send_signal(signal.SIGKILL)
-    first.wait()
-    assert (ended, "another run is using out right now" in printed) == (1, True), printed
-    assert not (tmp_path / "out" / "leaderboard.csv").exists()
-
-
 def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     packaged = certified.path_of(make_task("turn")).read_bytes()
@@ -247,56 +208,16 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     assert certified.path_of(make_task("turn")).read_bytes() == packaged
 
 
-@pytest.mark.slow  # of workers that die, test_jobs.py says what is quick to find out
-def test_certify_goes_on_when_a_worker_dies(tmp_path):
-    options = ["--tasks", "turn", "--episodes", "4", "--workers", "1", "--out", "out"]
-    environment = {key: value for key, value in os.environ.items() if key != "BALLBOT_IN_PROCESS"}
-    run = subprocess.Popen(
-        [sys.executable, "-m", "ballbot_train.cli", "certify", *options],
-        cwd=tmp_path,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    optima = Path(os.environ["BALLBOT_OPTIMA"])
-    while run.poll() is None and not any(optima.glob("*/*.npz")):
-        time.sleep(0.02)
-    search = ["pgrep", "-P", str(run.pid), "-f", "spawn_main"]
-    workers = subprocess.run(search, capture_output=True, text=True).stdout.split()
-    assert workers, "the optima are found in a process of their own"
-    os.kill(int(workers[0]), signal.SIGKILL)
-    printed, _ = run.communicate(timeout=120)
-    assert run.returncode == 0, printed
-    made, known = (
-        certified.load("turn", "paper", tmp_path / "out" / "BallbotTurn-v0.npz"),
-        certified.load("turn", "paper"),
-    )
-    np.testing.assert_array_equal(made.states, known.states[:4])
-    np.testing.assert_allclose(made.costs, known.costs[:4], rtol=1e-9)
-
-
-def test_certify_installs_only_when_it_is_told_to(tmp_path, monkeypatch):
-    task = make_task("turn")
-    full = certified.load(task, "paper")
-    monkeypatch.setattr(certified, "EPISODES", 2)
-    monkeypatch.setattr(certified, "path_of", lambda task, *_: tmp_path / "package" / f"{task.id}.npz")
-    certify(("turn",), 2, out=tmp_path / "out", workers=1)
-    assert not (tmp_path / "package").exists()
-    certify(("turn",), 2, install=True, out=tmp_path / "out", workers=1)
-    np.testing.assert_array_equal(certified.load(task, "paper").states, full.states[:2])
-
-
-def test_certify_keeps_installed_optima_that_are_cheaper(tmp_path, monkeypatch, capsys):
+def test_certify_installs_only_when_it_is_told_to_and_keeps_optima_that_are_cheaper(tmp_path, monkeypatch, capsys):
     task, path = make_task("turn"), tmp_path / "package" / "set.npz"
-    first = replace(
-        certified.load(task, "paper"),
-        **{name: getattr(certified.load(task, "paper"), name)[:3] for name in certified._PER_EPISODE},
-    )
+    full = certified.load(task, "paper")
+    first = replace(full, **{name: getattr(full, name)[:3] for name in certified._PER_EPISODE})
     first = replace(first, costs=first.costs * [1.0, 0.9, 1.1], trajectories=first.trajectories[:1])
-    first.save(task, path, "paper")
+    before = first.save(task, path, "paper").read_bytes()
     monkeypatch.setattr(certified, "EPISODES", 3)
     monkeypatch.setattr(certified, "path_of", lambda *_: path)
+    certify(("turn",), 3, out=tmp_path / "out", workers=1)
+    assert path.read_bytes() == before
     certify(("turn",), 3, install=True, out=tmp_path / "out", workers=1)
     assert "turn: 1 of 3 optima are cheaper than those installed" in capsys.readouterr().out
     now = certified.load(task, "paper").costs / first.costs

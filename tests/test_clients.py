@@ -22,6 +22,7 @@ def libraries(title):
     return (set(named) | NEEDS.get(title, set())) - OURS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("title", SECTIONS)
 def test_client_runs_as_documented(title, tmp_path):
     missing = sorted(name for name in libraries(title) if importlib.util.find_spec(name) is None)

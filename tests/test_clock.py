@@ -18,9 +18,7 @@ from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
 from ballbot_gym.step_code import Judge
-from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.transition import outcome
-from ballbot_train.report.playground import engine_script
 
 STEPS = 16
 CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}
@@ -29,14 +27,6 @@ CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}
 @pytest.fixture(params=CLASSES)
 def task(request):
     return getattr(load(request.param), CLASSES[request.param])()
-
-
-def test_at_puts_the_time_behind_the_constants_of_tasks_with_a_clock_alone(task):
-    c = np.arange(float(len(task.constant_names)))
-    assert task.at(tuple(c), 0.5) == (*c, 0.5)
-    np.testing.assert_array_equal(task.at(c, np.array([1.0, 2.0]))[:, -1], [1.0, 2.0])
-    other = BallbotEnv("stabilize", physics="rk4").task
-    assert other.at(c, 0.5) is c
 
 
 def test_env_and_every_kind_of_batch_agree_on_rewards_and_observations(task, params):
@@ -148,8 +138,3 @@ def test_an_optimum_may_start_later_in_the_episode(task, params):
 
 def test_batches_of_optima_leave_a_task_with_a_clock_to_find_optimum(task, params):
     assert not solves(task, params)
-
-
-def test_the_page_beside_a_benchmark_leaves_a_task_with_a_clock_out(task):
-    assert type(task) in TASKS.values()
-    assert task.id not in engine_script()

@@ -54,17 +54,6 @@ def test_names_neither_rewrite_the_screen_nor_turn_it_around(monkeypatch):
     assert ":smile:" in text
 
 
-def test_nothing_is_printed_after_the_end(monkeypatch):
-    printed = Console(file=io.StringIO(), width=100)
-    monkeypatch.setattr(console, "console", printed)
-    monkeypatch.setattr(console, "LINE_SECONDS", 0.05)
-    with console.progress_bars({"turn": 4}):
-        pass
-    before = printed.file.getvalue()
-    time.sleep(0.2)
-    assert printed.file.getvalue() == before
-
-
 IMPORTED = "from ballbot_gym.engines.bullet_client import import_pybullet; import_pybullet(); print('imported')"
 
 

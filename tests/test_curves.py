@@ -40,15 +40,6 @@ def test_the_interquartile_mean_leaves_out_the_best_and_the_worst_of_five():
     assert report.interquartile_mean(values[:2])[0] == pytest.approx(1.5)
 
 
-def test_the_band_holds_the_interquartile_mean_and_is_a_point_for_equal_seeds():
-    values = np.random.default_rng(0).normal(size=(5, 4))
-    low, high = report.bootstrap_band(values)
-    assert (low <= report.interquartile_mean(values)).all()
-    assert (report.interquartile_mean(values) <= high).all()
-    low, high = report.bootstrap_band(np.ones((5, 2)))
-    assert low.tolist() == high.tolist() == [1.0, 1.0]
-
-
 def test_a_curve_is_of_all_seeds_and_ends_where_the_first_of_them_ends(tmp_path):
     a_run(tmp_path / "seed-0", 0, [4.0, 2.0, 0.0])
     a_run(tmp_path / "seed-1", 1, [4.0, 4.0])

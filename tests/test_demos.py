@@ -13,8 +13,7 @@ import minari
 import numpy as np
 import pytest
 
-from ballbot_baselines import CONTROLLERS, trajopt
-from ballbot_baselines.optimum import Backoff
+from ballbot_baselines import trajopt
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.rollout import PlanError
@@ -114,26 +113,6 @@ def test_a_finished_dataset_is_kept_and_another_never_overwrites_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["kept-v0"]
 
 
-class Damper:
-    """A controller that takes no back-off and makes no plan."""
-
-    def __init__(self, task, params):
-        pass
-
-    def reset(self, t, x, c):
-        pass
-
-    def act(self, t, x):
-        return -100 * x[4:6]
-
-
-def test_a_new_controller_can_demonstrate(tmp_path, monkeypatch):
-    monkeypatch.setitem(CONTROLLERS, "damper", Damper)
-    folder = make(tmp_path / "damped-v0", expert="damper")
-    data = minari.MinariDataset(folder / "data")
-    assert {m["expert"] for m in data.storage.get_episode_metadata(data.episode_indices)} == {"damper"}
-
-
 def test_a_policy_that_comes_with_the_package_can_demonstrate(tmp_path):
     task = make_task("orbit")
     folder = make(tmp_path / "orbits-v0", task="orbit", expert="dagger", episodes=1, optima=False)
@@ -146,18 +125,6 @@ def test_a_policy_that_comes_with_the_package_can_demonstrate(tmp_path):
     np.testing.assert_allclose(policy.predict(demos.observations)[0], demos.actions, atol=1e-5)
     with pytest.raises(ValueError, match="unknown expert shac; known: lqr, trajopt, nmpc, dagger, ppo, sac"):
         DemoConfig("orbit", "shac")
-
-
-def test_experts_that_take_a_back_off_get_the_one_of_the_dataset():
-    env = BallbotEnv("stabilize", physics="rk4")
-    x = np.array([1.0, 0, 0, 0, 0, 3, 0, 0])
-    limit = {}
-    for force in (0.0, 0.6):
-        expert = Expert("trajopt", env.task, env.params, Backoff(force=force))
-        expert.reset(0.0, x, np.zeros(0))
-        limit[force] = np.abs(expert._controller.plan.trajectory.u).max() / env.params.force_limit
-    assert limit[0.6] <= 0.4 + 1e-6 < limit[0.0]
-    env.close()
 
 
 def test_its_command_makes_it_anew(dataset, tmp_path, monkeypatch):

@@ -122,9 +122,3 @@ def test_a_row_replays_a_certified_episode_of_a_controller_that_it_finds(monkeyp
 def test_what_cannot_be_shown_says_why(show, message):
     with pytest.raises(ValueError, match=message):
         show()
-
-
-def test_a_single_state_has_a_line_and_a_table():
-    still = Trajectory(np.zeros(1), np.zeros((1, 8)), np.zeros((0, 2)))
-    assert "peak force 0 N" in repr(still)
-    assert "<svg" in still._repr_html_()

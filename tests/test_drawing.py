@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ballbot_gym.drawing import FORCE_SCALE, Drawing, Robot, arrow, body_axis, pose
+from ballbot_gym.drawing import FORCE_SCALE, Robot, arrow, body_axis, pose
 
 LEANING = np.array([0.5, -0.2, 0.3, -0.4, 0, 0, 0, 0])
 
@@ -37,21 +37,3 @@ def test_the_arrow_of_a_force_starts_in_the_ball_and_small_forces_have_none(para
     assert end - start == pytest.approx([100 * FORCE_SCALE, 0, 0])
     assert arrow(params, Robot(LEANING, u=np.array([1.0, 0.0]))) is None
     assert arrow(params, Robot(LEANING)) is None
-
-
-def test_the_camera_is_told_the_middle_of_the_robots_and_how_far_they_are_apart(params):
-    there = LEANING + np.array([1.2, 1.6, 0, 0, 0, 0, 0, 0])
-    drawing = Drawing(params, (Robot(there, name="ghost"), Robot(LEANING)))
-    assert drawing.centre == pytest.approx([1.1, 0.6])
-    assert drawing.spread == pytest.approx(2.0)
-    assert Drawing(params, ()).centre == pytest.approx([0, 0])
-
-
-def test_the_camera_leaves_smoothly_who_falls_far_behind(params):
-    aside = np.array([1.0, 0, 0, 0, 0, 0, 0, 0])
-    drawings = [Drawing(params, (Robot(d * aside), Robot(0 * aside))) for d in np.linspace(0, 8, 161)]
-    assert drawings[-1].spread == 0
-    assert drawings[-1].centre == pytest.approx([0, 0])
-    # per 0.05 m: at most twice as fast as the robot moves away
-    assert np.abs(np.diff([drawing.spread for drawing in drawings])).max() < 0.11
-    assert np.abs(np.diff([drawing.centre[0] for drawing in drawings])).max() < 0.11

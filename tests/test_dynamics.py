@@ -40,17 +40,6 @@ def test_linearization_at_origin_is_the_papers(params):
     np.testing.assert_array_equal(np.round(b, 3), expected_b)
 
 
-def test_linearization_is_that_of_the_numpy_model_too(params):
-    # central differences: truncation h² and rounding 1e-16/h are both about 1e-10 of entries up to 60
-    h = 1e-5
-    x = h * np.eye(8)
-    a = (dynamics.derivative(params, x, np.zeros((8, 2))) - dynamics.derivative(params, -x, np.zeros((8, 2)))) / (2 * h)
-    assert a.T[4, 2] == pytest.approx(-35.07244, abs=5e-6)
-    assert a.T[6, 2] == pytest.approx(60.40254, abs=5e-6)
-    slope = dynamics.derivative(params, np.zeros(8), np.array([1.0, 0.0]))
-    np.testing.assert_allclose(slope, [0, 0, 0, 0, 0.295172, 0, -0.397241, 0], atol=5e-7)
-
-
 def test_upright_at_rest_is_an_equilibrium(params):
     assert dynamics.derivative(params, (0.0,) * 8, (0.0, 0.0)) == (0.0,) * 8
 
@@ -128,20 +117,9 @@ def test_rk4_step_is_as_accurate_as_documented(params):
     assert error[0.02] / error[dynamics.RK4_STEP] == pytest.approx(16, rel=0.2)
 
 
-@pytest.mark.parametrize(("dt", "substeps"), [(0.001, 1), (0.01, 1), (0.02, 2), (0.025, 3), (0.03, 3)])
-def test_control_steps_are_cut_into_as_few_rk4_steps_as_are_short_enough(dt, substeps):
-    assert dynamics.substeps_for(dt) == substeps
-
-
 def test_motion_in_one_plane_stays_in_it(params):
     after = dynamics.step(params, (0.0, 0.3, 0.0, 0.4, 0.0, 1.0, 0.0, -0.5), (0.0, 70.0), 0.3, 30)
     assert [after[i] for i in (0, 2, 4, 6)] == [0.0] * 4
-
-
-def test_tilt_is_the_angle_of_the_bodys_axis():
-    gamma, theta = 0.5, -0.8
-    axis_z = np.array([np.sin(gamma) * np.cos(theta), np.sin(theta), np.cos(gamma) * np.cos(theta)])[2]
-    assert dynamics.cos_tilt((0.0, 0.0, gamma, theta, 0.0, 0.0, 0.0, 0.0)) == pytest.approx(axis_z)
 
 
 def test_tilt_of_floats_arrays_and_tensors_is_the_same_angle(rng):
@@ -160,20 +138,6 @@ def test_tilt_is_zero_where_rounding_makes_a_cosine_exceed_one(monkeypatch):
     assert (dynamics.tilt(above), dynamics.tilt(below)) == (0, math.pi)
     np.testing.assert_array_equal(dynamics.tilt(np.array([above, below])), [0, math.pi])
     np.testing.assert_array_equal(dynamics.tilt(torch.tensor([above, below], dtype=torch.float64)), [0, math.pi])
-
-
-def test_tilt_of_a_state_that_is_not_a_number_is_not_a_number():
-    torch = pytest.importorskip("torch")
-    x = np.full(8, np.nan)
-    assert math.isnan(dynamics.tilt(tuple(x.tolist())))
-    assert math.isnan(dynamics.tilt(x))
-    assert math.isnan(dynamics.tilt(torch.as_tensor(x)))
-
-
-def test_state_and_input_are_named_in_order():
-    assert [name for name, _ in dynamics.STATE] == ["x", "y", "γ", "θ", "ẋ", "ẏ", "γ̇", "θ̇"]
-    assert [unit for _, unit in dynamics.STATE] == ["m", "m", "rad", "rad", "m/s", "m/s", "rad/s", "rad/s"]
-    assert dynamics.INPUT == (("Fx", "N"), ("Fy", "N"))
 
 
 def test_potential_energy_is_of_the_bodys_height():

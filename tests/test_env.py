@@ -20,7 +20,6 @@ from ballbot_gym import BallbotEnv, Randomization
 from ballbot_gym.engines import installed_physics
 from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.params import default_params
-from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
@@ -60,16 +59,6 @@ def digest(task, physics):
     return sha.hexdigest()
 
 
-# --- Gymnasium's rules ---
-
-
-def test_every_task_is_registered_under_its_id(task, physics):
-    env = gymnasium.make(task.id, physics=physics)
-    assert isinstance(env.unwrapped.task, type(task))
-    assert env.spec.id == task.id
-    env.close()
-
-
 OWN = replace(default_params(), body_mass=12.0)
 VARIED = Randomization(body_mass=(0.8, 1.2), lean_noise=0.01)
 
@@ -107,11 +96,6 @@ def test_the_spec_of_an_env_makes_the_same_env_again(keywords, through):
         vector.close()
 
 
-def test_of_a_range_as_a_list_the_same_randomization_is_made():
-    assert Randomization(body_mass=[1, 1]) == Randomization()
-    assert not Randomization(body_mass=[1.0, 1.0]).active
-
-
 def test_a_reward_threshold_is_of_the_papers_robot_alone():
     for keywords, threshold in (
         ({}, Stabilize.reward_threshold),
@@ -124,7 +108,7 @@ def test_a_reward_threshold_is_of_the_papers_robot_alone():
 @pytest.mark.parametrize(
     ("mode", "limit", "steps"),
     [
-        *((mode, 7, 7) for mode in (None, "sync", "async", "vector_entry_point")),
+        *((mode, 7, 7) for mode in (None, "sync", "vector_entry_point")),
         *((mode, limit, 20) for mode in (None, "vector_entry_point") for limit in (1000, -1, None)),
     ],
 )
@@ -156,16 +140,13 @@ def test_gymnasium_checker_has_no_complaint(task, physics):
         env.close()
 
 
-def test_stable_baselines3_checker_has_no_complaint(task, physics):
+def test_stable_baselines3_checker_has_no_complaint(task):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make(task.id, physics=physics)
+        env = gymnasium.make(task.id, physics="rk4")
         checker.check_env(env.unwrapped, warn=True, skip_render_check=True)
         env.close()
-
-
-# --- return and cost ---
 
 
 def test_return_and_cost_recomputed_from_states_and_forces_add_up_to_the_survival_pay(task, physics, make_env, rng):
@@ -188,23 +169,6 @@ def test_return_and_cost_recomputed_from_states_and_forces_add_up_to_the_surviva
         assert total + cost == pytest.approx(task.survival_pay, rel=1e-12)  # the order of additions differs
 
 
-def test_success_is_told_under_the_name_that_stable_baselines3_looks_for(make_env):
-    env = make_env(physics="rk4", duration=0.1)
-    _, info = env.reset(options={"state": UPRIGHT})
-    infos = [info, *(step[-1] for step in play(env, [[0.0, 0.0]] * 5))]
-    assert [info["is_success"] for info in infos] == [info["success"] for info in infos] == [False] * 5 + [True]
-
-
-def test_reset_costs_nothing_and_reports_the_start(task, physics, make_env):
-    env = make_env(task, physics=physics)
-    observation, info = env.reset(seed=1)
-    assert info["cost"] == 0
-    assert not any(info[name] for name in ("success", "failure", "clipped"))
-    np.testing.assert_array_equal(info["force"], [0, 0])
-    expected = task.observe(info["state"], info["constants"])
-    np.testing.assert_array_equal(observation, np.float32(expected))
-
-
 def test_observation_is_the_tasks_of_the_state_reported(task, physics, make_env):
     env = make_env(task, physics=physics)
     env.reset(seed=1)
@@ -212,9 +176,6 @@ def test_observation_is_the_tasks_of_the_state_reported(task, physics, make_env)
         observation, *_, info = env.step([0.02 * k, -0.1])
         np.testing.assert_array_equal(observation, np.float32(task.observe(info["state"], info["constants"])))
         assert info["tilt"] == pytest.approx(math.acos(math.cos(info["state"][2]) * math.cos(info["state"][3])))
-
-
-# --- reproducibility ---
 
 
 def test_same_seed_is_bit_identical_across_processes():
@@ -229,18 +190,6 @@ def test_every_physics_draws_the_same_episodes(task, physics, make_env):
     (_, a), (_, b) = (make_env(task, physics=name).reset(seed=4) for name in (physics, "rk4"))
     np.testing.assert_array_equal(a["state"], b["state"])
     np.testing.assert_array_equal(a["constants"], b["constants"])
-
-
-# --- options ---
-
-
-def test_given_start_state_takes_effect(task, physics, make_env):
-    state = [0.1, -0.2, 0.3, -0.1, 0.5, 0.6, -0.7, 0.8]
-    env = make_env(task, physics=physics)
-    _, info = env.reset(seed=0, options={"state": state})
-    np.testing.assert_array_equal(info["state"], state)
-    *_, info = env.step([0.0, 0.0])
-    assert info["state"][0] == pytest.approx(0.1 + 0.5 * 0.02, abs=5e-3)  # it moved from there
 
 
 def test_given_constants_take_effect_by_name_and_as_a_vector(task, make_env):
@@ -278,9 +227,6 @@ def test_own_robot_is_simulated(physics, make_env, params):
     assert speeds[2] == pytest.approx(speeds[0] * 100 / 350, rel=0.05)  # nearly linear for one step
 
 
-# --- ends ---
-
-
 def test_falling_terminates_and_costs_the_time_not_lived(task, physics, make_env):
     env = make_env(task, physics=physics, render_mode=None)
     env.reset(seed=0, options={"state": leaning(1.0)})
@@ -312,7 +258,8 @@ def test_stabilize_succeeds_if_it_rests_at_the_end_and_not_before(make_env, phys
     env = make_env(physics=physics, duration=0.1)
     env.reset(options={"state": UPRIGHT})
     steps = play(env, [[0.0, 0.0]] * 9)
-    assert [step[-1]["success"] for step in steps] == [False] * 4 + [True]
+    for name in ("success", "is_success"):  # as Stable-Baselines3 looks for it
+        assert [step[-1][name] for step in steps] == [False] * 4 + [True]
     env.reset(options={"state": [0.2, 0, 0, 0, 0, 0, 0, 0]})
     assert not play(env, [[0.0, 0.0]] * 9)[-1][-1]["success"]
 
@@ -330,12 +277,6 @@ def test_turn_ends_in_success_at_the_gate_at_no_further_cost(make_env, physics):
     assert reward == pytest.approx(env.task.survival_pay - info["cost"])
 
 
-def test_turn_is_no_success_at_the_gate_in_the_wrong_direction(make_env):
-    env = make_env("turn", physics="rk4")
-    env.reset(options={"constants": {"speed": 3.0}, "state": [1.0, 0.0, 0, 0, 0, 3.0, 0, 0]})
-    assert not env.step([0.0, 0.0])[-1]["success"]
-
-
 def test_touching_an_obstacle_with_the_balls_rim_fails(make_env, physics):
     env = make_env("weave", physics=physics)
     _, info = env.reset(seed=0)
@@ -347,9 +288,6 @@ def test_touching_an_obstacle_with_the_balls_rim_fails(make_env, physics):
     assert len(steps) == 3  # 0.05 m at 1 m/s
     assert steps[-1][1]
     assert steps[-1][-1]["failure"]
-
-
-# --- actions ---
 
 
 def test_action_beyond_one_is_clipped_and_info_says_so(task, physics, make_env):
@@ -365,13 +303,6 @@ def test_action_beyond_one_is_clipped_and_info_says_so(task, physics, make_env):
     np.testing.assert_array_equal(beyond["state"], limit["state"])
 
 
-@pytest.mark.parametrize("action", [np.array([0.25, -0.5], np.float32), [0.25, -0.5], (0.25, -0.5)])
-def test_action_is_the_force_in_units_of_the_limit(make_env, action):
-    env = make_env(physics="rk4")
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.step(action)[-1]["force"], [87.5, -175.0])
-
-
 def test_bad_action_is_refused_and_changes_nothing(make_env, physics):
     env = make_env(physics=physics)
     env.reset(seed=0)
@@ -381,14 +312,6 @@ def test_bad_action_is_refused_and_changes_nothing(make_env, physics):
     after = env.step([0.1, 0.1])[0]
     env.reset(seed=0)
     np.testing.assert_array_equal(env.step([0.1, 0.1])[0], after)
-
-
-# --- bad input ---
-
-
-def test_unknown_task_field_through_gymnasium_make_is_a_type_error(task):
-    with pytest.raises(TypeError, match=f"{task.id} got an unexpected keyword argument 'colour'; it has"):
-        gymnasium.make(task.id, colour="red")
 
 
 def test_step_after_the_end_is_refused(physics, make_env):
@@ -408,9 +331,6 @@ def test_closed_environment_refuses_everything_but_close(physics, make_env):
         with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="closed"):
             use()
     env.close()
-
-
-# --- rendering ---
 
 
 def test_frames_are_images_that_show_the_lean(task, physics, make_env):
@@ -480,23 +400,12 @@ def test_what_an_env_is_made_of_cannot_be_set(name, make_env):
     assert getattr(copy.deepcopy(env), name) == before
 
 
-def test_keys_push_in_the_directions_of_the_picture(make_env):
-    keys = make_env(physics="rk4").get_keys_to_action()
-    space = make_env(physics="rk4").action_space
-    assert all(action in space for action in keys.values())
-    np.testing.assert_allclose(keys["w",], -keys["s",])
-    np.testing.assert_allclose(keys["w", "a"], keys["w",] + keys["a",], rtol=1e-6)
-    ahead, left = keys["w",], keys["a",]
-    assert ahead[0] * left[1] - ahead[1] * left[0] > 0  # left is left of ahead
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_gymnasium_plays_every_task(name, monkeypatch):
+def test_gymnasium_plays_it(monkeypatch):
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     from gymnasium.utils.play import play
 
-    env = gymnasium.make(TASKS[name].id, render_mode="rgb_array", physics="rk4")
+    env = gymnasium.make("BallbotTurn-v0", render_mode="rgb_array", physics="rk4")
     forces = []
 
     def quit_after_three_steps(*step):
@@ -509,46 +418,10 @@ def test_gymnasium_plays_every_task(name, monkeypatch):
     env.close()
 
 
-def test_render_without_a_mode_warns(make_env):
-    env = make_env(physics="rk4")
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert env.render() is None
-
-
 def test_render_before_reset_is_refused(make_env):
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"render\(\) before reset"):
         make_env(render_mode="rgb_array").render()
 
 
-def test_frame_rate_is_that_of_the_control_steps(make_env):
-    assert make_env(physics="rk4").metadata["render_fps"] == 50
-    assert make_env(physics="rk4", control_dt=0.04).metadata["render_fps"] == 25
-
-
 if __name__ == "__main__":  # the other process of test_same_seed_is_bit_identical_across_processes
     print(json.dumps({f"{task} {physics}": digest(task, physics) for task in TASKS for physics in installed_physics()}))
-
-
-# --- functions of the observation as controllers ---
-
-
-def test_action_controller_sees_the_envs_observations_and_applies_its_forces(task, make_env, rng):
-    env = make_env(type(task)(duration=0.2), physics="rk4")
-    seen = []
-
-    def act(observation, begins):
-        seen.append((observation, begins))
-        return np.array([0.2, -0.1])
-
-    controller = ActionController(env.task, env.params, act)
-    for _ in range(2):
-        seen.clear()
-        episode = rollout(env, controller, seed=5)
-        observation, _ = env.reset(seed=5)
-        for k, (observed, begins) in enumerate(seen):
-            assert observed.dtype == np.float32
-            np.testing.assert_array_equal(observed, observation)
-            assert begins == (k == 0)
-            observation, *_, info = env.step(np.array([0.2, -0.1]))
-            np.testing.assert_allclose(info["force"], episode.trajectory.u[k], rtol=1e-12)

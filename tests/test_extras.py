@@ -1,6 +1,6 @@
 """What is not installed is named, with the extra that brings it."""
 
-import json
+import re
 import subprocess
 import sys
 from importlib.metadata import metadata
@@ -15,40 +15,48 @@ def run(code, *blocked):
     return done.stdout + done.stderr
 
 
-TYPED = "import sys\nsys.argv = ['ballbot', '{}']\nfrom ballbot_train.cli import main\nmain()"
+MISSING = [  # in an order in which nothing imports what is missing later
+    ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0')", "torch", "train"),
+    (
+        "import ballbot_gym, ballbot_baselines as b; b.CONTROLLERS['lqr'](ballbot_gym.TASKS['turn'](), None)",
+        *("scipy", "baselines"),
+    ),
+    (
+        "from ballbot_gym.trajectory import Trajectory; Trajectory([0, 1], [[0] * 8] * 2, [[0, 0]]).plot()",
+        *("matplotlib", "train"),
+    ),
+    ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
+    (
+        "from ballbot_train.executors import Workers, open_pool; open_pool(Workers(ray='local')).__enter__()",
+        *("ray", "ray"),
+    ),
+    ("import ballbot_train.rllib", "ray", "rllib"),
+    ("import ballbot_train.learning.tuning", "optuna", "tune"),
+    ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
+]
 
 
-@pytest.mark.parametrize(
-    ("code", "library", "extra"),
-    [
-        ("import gymnasium, ballbot_gym; gymnasium.make_vec('BallbotTurn-v0')", "torch", "train"),
-        (
-            "import ballbot_gym, ballbot_baselines as b; b.CONTROLLERS['lqr'](ballbot_gym.TASKS['turn'](), None)",
-            "scipy",
-            "baselines",
-        ),
-        ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
-        (
-            "from ballbot_train.executors import Workers, open_pool; open_pool(Workers(ray='local')).__enter__()",
-            "ray",
-            "ray",
-        ),
-        ("import ballbot_train.rllib", "ray", "rllib"),
-        (
-            "from ballbot_gym.trajectory import Trajectory; Trajectory([0, 1], [[0] * 8] * 2, [[0, 0]]).plot()",
-            "matplotlib",
-            "train",
-        ),
-        ("import ballbot_train.learning.tuning", "optuna", "tune"),
-        (TYPED.format("compare"), "tyro", "train"),
-        ("from ballbot_train.commands.export import export; export('sac')", "onnxscript", "onnx"),
-    ],
-)
-def test_missing_library_names_its_extra(code, library, extra):
-    wrote = run(code, library)
-    assert library in wrote
-    assert f'pip install "ballbot-gym[{extra}]", or in a checkout pip install -e ".[{extra}]"' in wrote
-    assert extra in metadata("ballbot-gym").get_all("Provides-Extra")
+def test_missing_library_names_its_extra():
+    code = f"""
+for code, library, extra in {MISSING!r}:
+    sys.modules[library] = None
+    try:
+        exec(code)
+    except (ImportError, SystemExit) as error:
+        print(extra, library, "missing:", error)
+    del sys.modules[library]
+"""
+    wrote = run(code)
+    for _, library, extra in MISSING:
+        (line,) = re.findall(rf"^{extra} {library} missing: .*", wrote, re.MULTILINE)
+        assert f'pip install "ballbot-gym[{extra}]", or in a checkout pip install -e ".[{extra}]"' in line, wrote
+        assert library in line.partition("missing:")[2]
+        assert extra in metadata("ballbot-gym").get_all("Provides-Extra")
+
+
+def test_a_command_without_the_library_of_commands_names_its_extra():
+    wrote = run("sys.argv = ['ballbot', 'compare']\nfrom ballbot_train.cli import main\nmain()", "tyro")
+    assert 'the commands need pip install "ballbot-gym[train]"' in wrote
 
 
 EXTRAS = (
@@ -96,24 +104,6 @@ def test_without_an_engine_the_default_is_rk4_with_one_notice_and_others_say_how
     assert wrote.count('Neither PyBullet nor MuJoCo is installed: physics="rk4" is used') == 1
     assert 'refused physics="mujoco" needs mujoco, which is not installed: pip install "ballbot-gym[mujoco]"' in wrote
     assert 'refused PyBullet is not installed. Get it with "pip install pybullet"' in wrote
-
-
-def test_with_pybullet_the_default_is_bullet():
-    pytest.importorskip("pybullet")
-    assert "bullet" in run("import ballbot_gym; print(ballbot_gym.BallbotEnv().physics)")
-
-
-def test_commands_run_without_pybullet_and_say_once_which_physics_they_use(tmp_path):
-    typed = f"robustness --tasks turn --controllers lqr --stresses com --episodes 1 --workers 1 --out {tmp_path}"
-    wrote = run(
-        "import os\nos.environ['BALLBOT_IN_PROCESS'] = '1'\n"
-        f"from ballbot_train.cli import main\nsys.argv = ['ballbot', *{typed.split()!r}]\nmain()\n",
-        *("pybullet", "mujoco"),
-    )
-    assert "physics=rk4" in wrote
-    assert wrote.count('Neither PyBullet nor MuJoCo is installed: physics="rk4" is used') == 1
-    assert "Warning" not in wrote
-    assert json.loads((tmp_path / "robustness.json").read_text())["about"]["physics"] == "rk4"
 
 
 def test_without_pybullet_mujoco_is_the_default_and_everything_works_without_a_warning():

@@ -48,11 +48,6 @@ def test_fresh_episodes_are_neither_certified_nor_for_validation_nor_of_another_
     assert len(np.unique(starts, axis=0)) == 3 * count + len(episodes)
 
 
-def test_more_fresh_episodes_begin_with_the_same_ones(task):
-    for few, many in zip(fresh.draw(task, range(3), 7), fresh.draw(task, range(8), 7), strict=True):
-        np.testing.assert_array_equal(few, many[:3])
-
-
 def test_every_task_measures_its_episodes_in_finite_numbers(task):
     for x, c in zip(*fresh.draw(task, range(20), 0), strict=True):
         assert all(math.isfinite(value) for value in task.measures(x, c, default_params()).values())
@@ -78,15 +73,6 @@ def test_measures_are_what_their_names_say(params):
     assert measured["obstacles"] == 2
     assert measured["tightest gap, m"] == pytest.approx(2.0 - 0.3 - 0.4 - 0.2)
     assert measured["widest obstacle, m"] == 0.4
-
-
-def test_the_tilt_rate_is_the_derivative_of_the_tilt(params):
-    x, dt = np.array([0.0, 0.0, 0.4, -0.3, 0.0, 0.0, 0.7, 0.9]), 1e-6
-    later = x.copy()
-    later[2:4] += dt * x[6:]
-    now, then = (Stabilize().measures(state, np.zeros(0), params) for state in (x, later))
-    change = math.radians(then["tilt, degrees"] - now["tilt, degrees"]) / dt
-    assert now["tilt rate, rad/s"] == pytest.approx(change, rel=1e-4)
 
 
 def test_a_fresh_episode_costs_what_it_costs_in_the_environment(turns, make_env):
@@ -168,20 +154,6 @@ def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path
     assert (out / "fresh.png").exists()
     assert (out / "certified" / "leaderboard.csv").exists()
     assert worst["replay"] in capsys.readouterr().out
-
-
-def test_bins_are_drawn_for_every_measure():
-    from ballbot_train.report import figures
-
-    result = evaluate_fresh("shac", "stabilize", 30)
-    drawn = figures.fresh_figure(result, result.bins())
-    assert len(drawn.axes) >= 3 * len(result.measures)
-
-
-def test_a_policy_file_names_its_task(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    evaluate(str(shipped_policies(Turn())["dagger"]), fresh=10, out=tmp_path / "out")
-    assert json.loads((tmp_path / "out" / "fresh.json").read_text())["about"]["task"] == "turn"
 
 
 def test_what_does_not_act_is_refused():

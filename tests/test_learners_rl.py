@@ -1,54 +1,31 @@
 """PPO and SAC, with and without demonstrations: they run, and go on from a state as if never stopped."""
 
-import io
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from resuming import goes_on_as_if_never_stopped, parameters, through_a_file
 
-from ballbot_gym import dynamics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.learning.critics import CriticInputs, cost_to_go, relative_advantages, value_of_living
-from ballbot_train.learning.curricula import FAILURE_PRICE, CurriculumBatch
+from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, model_free, ppo, sac
-from ballbot_train.learning.learners.model_free import ScopedRng, TrainingEnv
+from ballbot_train.learning.learners.model_free import TrainingEnv
 from ballbot_train.policy import PolicyNetwork, load_network, save_policy, shipped_policies
 
+SHARED = {"gamma": 0.995, "final_gamma": 0.999, "iterations": 3, "num_envs": 4, "hidden": (16, 8)}
+RELATIVE = {"relative_advantages": False, "relative_values": False}
 TINY = {
-    "ppo": ppo.PpoConfig(
-        iterations=3,
-        num_envs=4,
-        num_steps=16,
-        gamma=0.995,
-        final_gamma=0.999,
-        episode_seconds=0.4,
-        hidden=(16, 8),
-        batch_size=32,
-        gae_lambda=0.95,
-        relative_advantages=False,
-        relative_values=False,
-    ),
+    "ppo": ppo.PpoConfig(num_steps=16, episode_seconds=0.4, batch_size=32, gae_lambda=0.95, **RELATIVE, **SHARED),
     "sac": sac.SacConfig(
-        products=True,
-        gamma=0.995,
-        final_gamma=0.999,
-        iterations=3,
-        num_envs=4,
-        num_steps=8,
-        gradient_steps=2,
-        episode_seconds=0.2,
-        hidden=(16, 8),
-        batch_size=16,
-        n_steps=1,
+        products=True, num_steps=8, gradient_steps=2, episode_seconds=0.2, batch_size=16, n_steps=1, **SHARED
     ),
 }
 CLONED = 2  # iterations
@@ -94,33 +71,9 @@ def observed(batch, size=8):
     return torch.randn(batch, size, generator=torch.Generator().manual_seed(0))
 
 
-def parameters(learner):
-    return torch.cat([value.flatten() for value in learner.network.state_dict().values()])
-
-
-def through_a_file(state):
-    """As a checkpoint does: tensors and plain values only."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    return torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
-
-
 @pytest.mark.parametrize("demonstrated", [False, True])
 def test_a_learner_goes_on_from_its_state_as_if_never_stopped(name, demonstrated, demos):
-    demos = demos if demonstrated else None
-    whole = make(name, demos)
-    start = parameters(whole)
-    run(whole)
-    for stop in (0, whole.iterations // 2, whole.iterations - 1):
-        first = run(make(name, demos), stop) if stop else make(name, demos)
-        state = through_a_file(first.state_dict())
-        second = make(name, demos, seed=1)
-        second.load_state_dict(state)
-        torch.manual_seed(99)  # nothing depends on what else is drawn
-        np.random.seed(99)
-        assert torch.equal(parameters(run(second)), parameters(whole))
-    assert not torch.equal(parameters(whole), start)
-    assert not torch.equal(parameters(run(make(name, demos, seed=1))), parameters(whole))
+    assert goes_on_as_if_never_stopped(lambda seed: make(name, demos if demonstrated else None, seed))
 
 
 def test_the_policy_acts_as_the_actor_does(name, tmp_path):
@@ -134,29 +87,6 @@ def test_the_policy_acts_as_the_actor_does(name, tmp_path):
     np.testing.assert_allclose(actions.numpy(), expected, atol=1e-6)  # float32
 
 
-@pytest.mark.parametrize("products", [False, True])
-def test_the_discount_rises_and_takes_all_values_with_it(name, products):
-    learner = make(name, gamma=0.99, final_gamma=0.999, **({"products": products} if name == "sac" else {}))
-    model, seen = learner._model, observed(20)
-
-    def values():
-        with torch.no_grad():
-            return model.critic(seen, torch.zeros(20, 2)) if name == "sac" else (model.policy.predict_values(seen),)
-
-    before = values()
-    learner._raise_gamma(0.999)
-    change = value_of_living(make_task("stabilize"), SCALE, 0.999) - value_of_living(
-        make_task("stabilize"), SCALE, 0.99
-    )
-    for ours, value in zip(values(), before, strict=True):
-        torch.testing.assert_close(ours, value + change)
-    learner._raise_gamma(0.99)
-    logged = [learner.iterate()["train/gamma"] for _ in range(3)]
-    assert logged == pytest.approx([0.99, 1 - 10 ** (-2 - 1 / 3), 1 - 10 ** (-2 - 2 / 3)])
-    buffer = learner._replay if name == "sac" else model.rollout_buffer
-    assert buffer.gamma == learner._env.batch.gamma == model.gamma
-
-
 def test_learning_rate_and_deviation_fall_as_they_are_set(name):
     learner = make(name, learning_rate=1e-3, final_learning_rate_fraction=0.1)
     rates = [learner.iterate()["train/learning_rate"] for _ in range(2)]
@@ -166,54 +96,10 @@ def test_learning_rate_and_deviation_fall_as_they_are_set(name):
         assert [learner.iterate()["train/std"] for _ in range(3)] == pytest.approx([0.2, 0.1, 0.05])
 
 
-def test_schedules_wait_until_the_task_is_its_own(monkeypatch):
-    monkeypatch.setattr(model_free, "_WAITING_PROGRESS", 0.25)
-    monkeypatch.setattr(model_free, "_SETTLED_LEARNING_RATE", 4e-4)
-    settings = {"iterations": 8, "gamma": 0.9, "final_gamma": 0.99, "backwards": True, "symmetry": "none"}
-    settings |= {"learning_rate": 1e-3, "final_learning_rate_fraction": 0.1}
-
-    def turn():
-        return LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], **settings), 0)
-
-    def gone(whole):  # shares of the schedule of the discount, by iteration
-        figures = [whole.iterate() for _ in range(4)]
-        return [-math.log10((1 - each["train/gamma"]) / 0.1) for each in figures], [
-            each["train/learning_rate"] for each in figures
-        ]
-
-    monkeypatch.setattr(CurriculumBatch, "_start_on_optima", lambda batch, ended: None)
-    learner = turn()
-    shares, rates = gone(learner)
-    assert shares == pytest.approx([0, 0.125, 0.25, 0.25])
-    assert rates == pytest.approx([1e-3, 1e-3 * (1 - 0.9 / 8), 1e-3 * (1 - 0.9 / 4), 1e-3 * (1 - 0.9 / 4)])
-    batch = learner._env.batch
-    batch._goal_factor, batch._ramp["max_speed"], batch._has_settled = 1.0, batch.own_task.max_speed, True
-    resumed = turn()
-    resumed.load_state_dict(learner.state_dict())
-    shares, rates = gone(resumed)
-    assert shares == pytest.approx([0.25, 0.4375, 0.625, 0.8125])
-    assert rates == pytest.approx([4e-4 - 3e-4 * k / 4 for k in range(4)])
-
-
 @pytest.mark.parametrize("setting", ["gamma", "final_gamma"])
 def test_a_discount_that_is_no_discount_is_refused(name, setting):
     with pytest.raises(ValueError, match=f"^{setting} must be between 0 and 1, not 1"):
         make(name, **{setting: 1.0})
-
-
-def test_the_advantages_of_ppo_are_relative_to_the_cost_to_go():
-    learner = make("ppo", relative_advantages=True)
-    learner.iterate()
-    buffer = learner._model.rollout_buffer
-    living = value_of_living(make_task("stabilize"), SCALE, learner._model.gamma)
-    returns, values = torch.as_tensor(buffer.returns), torch.as_tensor(buffer.values)
-    torch.testing.assert_close(torch.as_tensor(buffer.advantages), relative_advantages(returns, values, living))
-    assert buffer.advantages.std() == pytest.approx(1, abs=0.02)
-
-
-def test_demonstrations_of_another_task_are_refused(name, demos):
-    with pytest.raises(ValueError, match="not of Orbit"):
-        LEARNERS[name].make(make_task("orbit"), default_params(), TINY[name], 0, demos)
 
 
 def test_with_demonstrations_it_first_imitates_and_then_teaches_its_critic_alone(name, demos):
@@ -293,32 +179,6 @@ def test_a_warm_start_is_one_and_not_backwards(demos, name):
         make(name, demos, **other)
 
 
-def test_from_demonstrations_of_a_task_that_ends_at_its_goal_rewards_are_minus_the_cost(name):
-    task = make_task("turn")
-    one, flag = np.ones((1, len(task.observation_scale)), np.float32), np.ones(1, bool)
-    shown = Demos(one, one[:, :2], np.array([1.5], np.float32), one, ~flag, flag, one[:, :2])
-    kind = {"ppo": ppo.Ppo, "sac": sac.Sac}[name]
-    learner = kind(task, default_params(), replace(TINY[name], num_envs=1, episode_seconds=8.0), 0, shown)
-    run(learner, CLONED + 2)
-    if name == "sac":
-        sample = learner._model.replay_buffer.sample(2)
-        paid = task.survival_reward * task.control_dt
-        assert float(sample.rewards[1]) == pytest.approx((1.5 - paid) * model_free._COST_SCALE)
-    observation = torch.as_tensor(learner._env.reset())
-    _, reward, done, _ = learner._env.step(np.zeros((1, 2), np.float32))
-    assert not done.any()
-    assert (reward < 0).all()
-    for _ in range(200):  # it falls
-        _, reward, done, _ = learner._env.step(np.ones((1, 2), np.float32))
-        if done.any():
-            break
-    assert (reward[done] < -model_free._COST_SCALE * FAILURE_PRICE).all()
-    assert (reward[done] > -model_free._COST_SCALE * (FAILURE_PRICE + 20.0)).all()
-    if name == "ppo":
-        with torch.no_grad():
-            assert learner._model.policy.predict_values(observation).abs().max() < 3.0  # not the value of living
-
-
 @pytest.mark.parametrize("name", ["turn", "stabilize"])
 def test_demonstrations_without_pay_cost_what_the_episodes_did(name):
     """One episode arrives or rests, one falls, one is cut short by the next."""
@@ -344,36 +204,6 @@ def test_demonstrations_without_pay_cost_what_the_episodes_did(name):
     np.testing.assert_allclose(paid.without_pay(task, 40.0).rewards, -np.array(costs), atol=1e-3)
 
 
-def test_demonstrated_rewards_are_scaled_and_ends_by_time_are_no_ends():
-    one = np.ones((1, 8), np.float32)
-    action, flag = np.zeros((1, 2), np.float32), np.ones(1, bool)
-    shown = Demos(one, action, np.array([-3.0], np.float32), one, ~flag, flag, action + 0.5)
-    learner = sac.Sac(make_task("stabilize"), default_params(), TINY["sac"], 0, shown)
-    run(learner, CLONED + 1)
-    sample = learner._model.replay_buffer.sample(2)
-    assert float(sample.rewards[1]) == pytest.approx(-3 * SCALE)
-    assert float(sample.dones[1]) == 0
-    assert sample.actions[1].tolist() == [0.5, 0.5]
-
-
-@pytest.mark.parametrize("frame", [None, "radial", "slalom"])
-def test_a_quadratic_value_is_linear_in_what_the_critic_sees(frame):
-    entries = 8 if frame is None else FRAMES[frame].size
-    observation = observed(400, {None: 8, "radial": 13, "slalom": 23}[frame])
-    seen = CriticInputs(observation.shape[1], products=True, frame=frame)(observation).double()
-    plain = CriticInputs(observation.shape[1], products=False, frame=frame)(observation).double()
-    form = torch.randn(entries, entries, dtype=torch.double)
-    wanted = ((plain @ form) * plain).sum(1, keepdim=True) + plain[:, :1]
-    fitted = seen @ torch.linalg.lstsq(seen, wanted, driver="gelsd").solution
-    torch.testing.assert_close(fitted, wanted, rtol=1e-4, atol=1e-4)
-    assert seen.shape[1] == entries + entries * (entries + 1) // 2
-
-
-def test_the_value_of_living_is_finite_without_a_discount():
-    task = make_task("stabilize")
-    assert value_of_living(task, 1.0, 1.0) == pytest.approx(task.survival_pay)
-
-
 @pytest.mark.parametrize(
     ("task", "symmetry"),
     [*((task, LEARNERS["ppo"].settings(task).symmetry) for task in TASKS), ("turn", "frame"), ("weave", "mirrors")],
@@ -394,17 +224,6 @@ def test_the_actor_of_ppo_has_the_symmetry_of_its_task(task, symmetry):
 def test_ppo_refuses_a_symmetry_that_the_task_has_not():
     with pytest.raises(ValueError, match="BallbotTurn-v0 has no mirror images"):
         LEARNERS["ppo"].make(make_task("turn"), default_params(), replace(TINY["ppo"], symmetry="mirrors"), 0, None)
-
-
-def test_sac_holds_forces_longer_from_scratch_and_living_pays_as_much(monkeypatch):
-    monkeypatch.setattr(sac, "_CONTROL_DT", 0.05)
-    learner = make("sac", gamma=0.9)
-    assert learner._model.gamma == pytest.approx(0.9**2.5)
-    run(learner)
-    assert learner._env.batch.task.control_dt == 0.05
-    assert learner.network.spec.task == make_task("stabilize").problem()
-    paid = SCALE * make_task("stabilize").survival_reward * 0.05
-    assert learner._value_of_living(0.9) == pytest.approx(paid / 0.1)
 
 
 @pytest.mark.parametrize(
@@ -428,17 +247,6 @@ def test_sac_sees_and_acts_in_the_frame_of_its_task_and_keeps_the_steady_motion(
             assert learner.network(torch.zeros(8)).tolist() == [0.0, 0.0]
 
 
-def test_gradients_at_ppos_critic_are_relative_to_the_cost_to_go():
-    gradients = []
-    for learner in (make("ppo"), make("ppo", relative_values=True)):
-        seen = torch.linspace(-1, 1, 128).reshape(16, 8).requires_grad_()
-        values = learner._model.policy.evaluate_actions(seen, torch.zeros(16, 2))[0]
-        gradients.append(torch.autograd.grad(values.sum(), seen)[0])
-    weights = 1 / cost_to_go(values.detach(), learner._value_of_living(learner._model.gamma))
-    torch.testing.assert_close(gradients[1], gradients[0] * weights / weights.mean())
-    assert float(weights.max() / weights.min()) > 1.01
-
-
 @pytest.mark.parametrize("demonstrated", [False, True])
 def test_sac_with_mirrors_learns_from_mirror_images_and_acts_the_same_in_them(demonstrated, demos):
     learner = run(make("sac", demos if demonstrated else None, symmetry="mirrors"))
@@ -459,16 +267,6 @@ def test_sac_with_mirrors_learns_from_mirror_images_and_acts_the_same_in_them(de
     assert not all((steps == sample).all(1).any() for sample in drawn.observations.numpy())
 
 
-def test_a_mirrored_sample_is_a_step_of_the_mirrored_robot():
-    learner = run(make("sac", symmetry="mirrors"), 1)
-    task, params = make_task("stabilize"), default_params()
-    scale, substeps = np.array(task.observation_scale), dynamics.substeps_for(task.control_dt)
-    drawn = learner._replay.sample(50)
-    for before, action, after, done in zip(*(part.numpy() for part in drawn[:4]), strict=True):
-        state = dynamics.step(params, tuple(scale * before), tuple(350.0 * action), task.control_dt, substeps)
-        assert done or np.abs(np.array(state) / scale - after).max() < 1e-5
-
-
 def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
     task = make_task("orbit")
     frame = FRAMES[task.frame]
@@ -483,31 +281,6 @@ def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
             np.testing.assert_allclose(REACH * np.array(back(tuple(there))), action, atol=1e-6)
 
 
-@pytest.mark.parametrize(("task", "most"), [("stabilize", 4.0), ("turn", 16.0)])
-def test_targets_of_sac_do_not_exceed_what_can_be_earned(task, most):
-    settings = replace(TINY["sac"], gamma=0.99, products=False)
-    model = LEARNERS["sac"].make(make_task(task), default_params(), settings, 0, None)._model
-    for critic in (model.critic, model.critic_target):
-        for network in critic.q_networks:
-            torch.nn.init.constant_(network[-1].bias, 1e3)
-    seen = torch.zeros(3, *model.observation_space.shape), torch.zeros(3, 2)
-    with torch.no_grad():
-        assert min(float(value.min()) for value in model.critic(*seen)) > 500
-    for value in model.critic_target(*seen):
-        torch.testing.assert_close(value, torch.full((3, 1), most))
-
-
-def test_sac_in_a_frame_goes_on_from_a_state_as_if_never_stopped():
-    def learner():
-        settings = replace(TINY["sac"], symmetry="frame")
-        return LEARNERS["sac"].make(make_task("orbit"), default_params(), settings, 0, None)
-
-    whole, begun = run(learner()), run(learner(), 1)
-    resumed = learner()
-    resumed.load_state_dict(through_a_file(begun.state_dict()))
-    assert torch.equal(parameters(run(resumed)), parameters(whole))
-
-
 def test_training_envs_never_end_together():
     batch = CurriculumBatch(make_task("stabilize", max_tilt=1.5, duration=0.4), 5, default_params())
     env = TrainingEnv(batch, 0.1)
@@ -516,19 +289,3 @@ def test_training_envs_never_end_together():
     ends = [env.step(np.zeros((5, 2)))[2].sum() for _ in range(20)]
     assert max(ends) == 1
     assert sum(ends) == 5
-
-
-def test_a_learners_random_numbers_are_its_own():
-    own = ScopedRng()
-    with own:
-        first = torch.rand(3), np.random.rand(3)
-    state = own.state_dict()
-    with own:
-        expected = torch.rand(3), np.random.rand(3)
-    own.load_state_dict(state)
-    torch.rand(5)
-    with own:
-        again = torch.rand(3), np.random.rand(3)
-    assert torch.equal(again[0], expected[0])
-    assert np.array_equal(again[1], expected[1])
-    assert not torch.equal(first[0], expected[0])

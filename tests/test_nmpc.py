@@ -5,7 +5,7 @@ pytest.importorskip("casadi")
 
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
 from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.horizon import Grid, HorizonQp
+from ballbot_baselines.horizon import HorizonQp
 from ballbot_gym import certified, dynamics
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import DelayedController, rollout, simulate
@@ -32,46 +32,9 @@ def pushed(speed, lean_rate):
     return x
 
 
-# --- the horizon's grid ---
-
-
-def test_forty_nodes_over_a_second_start_with_single_control_steps():
-    grid = Grid.make(50, 40)
-    np.testing.assert_array_equal(grid.lengths, [1] * 30 + [2] * 10)
-    assert grid.offsets[-1] == 50
-
-
-@pytest.mark.parametrize(("steps", "nodes"), [(50, 50), (50, 2), (7, 3), (100, 40)])
-def test_grid_covers_the_horizon_and_holds_its_first_force_for_one_step(steps, nodes):
-    grid = Grid.make(steps, nodes)
-    assert len(grid.lengths) == nodes
-    assert grid.lengths.sum() == steps
-    assert grid.lengths[0] == 1
-
-
-@pytest.mark.parametrize(("steps", "nodes"), [(50, 51), (50, 1)])
-def test_grid_with_too_many_or_too_few_nodes_is_refused(steps, nodes):
-    with pytest.raises(ValueError, match="nodes"):
-        Grid.make(steps, nodes)
-
-
-def test_shift_moves_a_solution_one_control_step_on():
-    grid = Grid.make(50, 40)
-    line = np.minimum(grid.offsets, 49.0)  # linear in time but for the end, beyond which nothing is known
-    np.testing.assert_allclose(grid.shift_states()[:-2] @ line, grid.offsets[:-2] + 1)
-    forces = np.arange(40.0)
-    shifted = grid.shift_inputs() @ forces
-    np.testing.assert_allclose(shifted[:29], forces[1:30])
-    np.testing.assert_allclose(shifted[30:39], forces[30:39] + 0.5)  # half of two intervals
-    assert shifted[39] == forces[39] / 2  # half of one, half beyond the horizon
-
-
 def test_horizon_must_be_whole_control_steps(params):
     with pytest.raises(ValueError, match=r"whole number of control steps of 0\.02 s, not 0\.03 s"):
         NmpcController(Stabilize(), params, horizon=0.03)
-
-
-# --- what it costs ---
 
 
 def test_without_disturbance_the_closed_loop_costs_the_optimum(make_env, task):
@@ -106,30 +69,6 @@ def test_the_costate_is_the_slope_of_the_optimal_cost(params):
         unit = h * np.eye(8)[i]
         costs = [find_optimum(rest, params, optimum.trajectory.x[k] + s * unit, NO_CONSTANTS).cost for s in (1, -1)]
         assert optimum.costates[k - 1, i] == pytest.approx((costs[0] - costs[1]) / (2 * h), rel=1e-3, abs=1e-3)
-
-
-def test_one_iteration_per_step_is_nearly_as_good_as_converging(make_env):
-    """From a state far from the plan that it follows."""
-    task, x = Stabilize(), pushed(5.0, 1.2)
-    costs = []
-    for iterations in (1, 20):
-        env = make_env(task, physics="rk4")
-        controller = AtRest(NmpcController(task, env.params, iterations=iterations))
-        run = rollout(env, controller, options={"state": x})
-        assert run.success
-        costs.append(run.cost)
-    assert costs[0] == pytest.approx(costs[1], rel=0.01)
-
-
-def test_converged_solution_no_longer_changes(params):
-    controller = NmpcController(Stabilize(), params, iterations=20)
-    controller.reset(0.0, REST, NO_CONSTANTS)
-    x = pushed(3.0, 0.8)
-    first = controller.act(0.0, x)
-    needed = controller.counts.iterations
-    assert 1 < needed < 20
-    np.testing.assert_allclose(controller.act(0.0, x), first, atol=0.1)
-    assert controller.counts.iterations == needed + 1
 
 
 class AtRest:
@@ -186,9 +125,6 @@ def test_missed_first_exit_goal_is_planned_anew(make_env):
     assert controller.counts.replans >= 1
 
 
-# --- delay ---
-
-
 def test_delay_that_is_known_costs_little(make_env):
     task = Stabilize()
     aware, run, _ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2), delay=0.04)
@@ -200,20 +136,10 @@ def test_delay_that_is_known_costs_little(make_env):
     assert aware == pytest.approx(unavoidable, abs=0.03)
 
 
-def test_delay_that_is_not_known_costs_more(make_env):
-    task = Stabilize()
-    aware, *_ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2), delay=0.04)
-    unaware, *_ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2))
-    assert unaware > aware
-
-
 def coasted(params, x, steps):
     for _ in range(steps):
         x = dynamics.step(params, x, np.zeros(2), 0.02)
     return x
-
-
-# --- failures ---
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])
@@ -246,9 +172,6 @@ def test_controllers_of_one_task_do_not_disturb_each_other(params):
     first.reset(0.0, REST, NO_CONSTANTS)
     second.act(0.02, -x)
     np.testing.assert_array_equal(first.act(0.0, x), alone)
-
-
-# --- a robot that differs from the model ---
 
 
 def test_disturbance_in_lean_and_force_is_found(rng):

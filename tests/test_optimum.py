@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,14 +10,13 @@ from ballbot_baselines import optimum as optimum_module
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.ocp import FEASIBLE, Bounds, Ocp, OcpSolver
 from ballbot_baselines.optimum import Backoff, find_optimum, plan_to_track
-from ballbot_baselines.shooting import robot_numbers, shooting_ocp, shooting_parameters
 from ballbot_gym import dynamics
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
-from ballbot_gym.tasks.weave import Weave, split_constants
+from ballbot_gym.tasks.weave import Weave
 
 
 def episode(task, seed=3):
@@ -37,15 +34,6 @@ def optimum_of():
         return optima[task]
 
     return find
-
-
-def bump(steps):
-    """(steps+1, 2) a detour of up to 0.15 m that leaves both ends where they are."""
-    s = np.linspace(0, 1, steps + 1)
-    return 0.15 * np.column_stack([np.sin(2 * np.pi * s), -np.sin(np.pi * s)])
-
-
-# --- every task's optimum ---
 
 
 def test_a_plan_is_an_episode_of_its_cost_that_obeys_the_limits_and_ends_at_the_goal(task, optimum_of, params):
@@ -82,19 +70,6 @@ def test_optimum_costs_no_more_than_lqr_and_less_than_a_fall(task, optimum_of, m
     lqr = rollout(make_env(task, physics="rk4"), LqrController(task, params), options={"state": x0, "constants": c})
     assert optimum_of(task).cost <= lqr.cost * (1 + 1e-6)
     assert optimum_of(task).cost < task.survival_pay
-
-
-def test_perturbed_guess_leads_back_to_the_same_optimum(task, optimum_of, params):
-    optimum, (x0, c) = optimum_of(task), episode(task)
-    path = optimum.trajectory.x[:, :2] + bump(len(optimum.trajectory.u))
-    again = find_optimum(task, params, x0, c, paths=[path])
-    assert again.cost == pytest.approx(optimum.cost, rel=1e-4)
-
-
-def test_no_other_guess_finds_anything_better(task, optimum_of, params):
-    optimum, (x0, c) = optimum_of(task), episode(task)
-    paths = [path + bump(len(path) - 1) for path in task.guess_paths(x0, c, params)[:3]]
-    assert find_optimum(task, params, x0, c, paths=paths).cost >= optimum.cost * (1 - 1e-4)
 
 
 def test_small_changes_of_the_forces_gain_nothing(optimum_of, params, rng):
@@ -141,17 +116,6 @@ def test_backoff_from_the_goal_ends_well_inside_it(params):
     assert max(np.max(g) for g in task.goal(kept.trajectory.x[-1], c)) <= 0.5**2 - 1 + 1e-6
 
 
-def test_weave_tries_both_sides_and_keeps_the_cheaper(params):
-    task = Weave()
-    x0, c = episode(task, 3)
-    goal, obstacles = split_constants(c)
-    sides = [(1,) * len(obstacles), (-1,) * len(obstacles)]
-    costs = [
-        find_optimum(task, params, x0, c, paths=[task.side_path(x0, goal, obstacles, side)]).cost for side in sides
-    ]
-    assert find_optimum(task, params, x0, c).cost <= min(costs) * (1 + 1e-6)
-
-
 def test_hopeless_start_raises_with_every_solvers_status_and_violation(params):
     # 74° of tilt, and falling at 5 rad/s: no 350 N catch that
     task = Stabilize(duration=1.0)
@@ -173,20 +137,6 @@ def test_an_episode_where_fatrop_goes_in_circles_has_an_optimum_nevertheless(par
     assert found.is_optimal
     assert found.cost == pytest.approx(19.5707702, rel=1e-6)  # that of other guessed paths too
 
-
-@pytest.mark.slow
-def test_exhaustive_search_over_sides_rarely_finds_a_better_slalom(params):
-    task, better = Weave(), []
-    for seed in range(30):
-        x0, c = episode(task, seed)
-        found = find_optimum(task, params, x0, c)
-        best = find_optimum(task, params, x0, c, guesses=32)
-        if best.cost < found.cost * (1 - 0.005):
-            better.append((seed, found.cost / best.cost))
-    assert len(better) <= 2, better
-
-
-# --- the solver itself, on a small problem that uses every kind of constraint ---
 
 N = 8
 
@@ -267,20 +217,6 @@ def test_staged_derivatives_are_exact_to_second_order():
     assert solve_toy("ipopt").iterations == iterations
 
 
-def test_violation_is_the_largest_of_constraints_and_bounds():
-    ocp = toy()
-    solution = OcpSolver(ocp, N, "ipopt", max_iterations=1).solve(
-        np.zeros((N + 1, 3)), np.zeros((N, 2)), toy_bounds(ocp), [0.4]
-    )
-    s, w = solution.states, solution.inputs
-    defects = [s[k + 1] - np.array(ocp.next(*(casadi.DM(v) for v in (s[k], w[k])), 0.4)).ravel() for k in range(N)]
-    assert not solution.success
-    assert not solution.is_optimal
-    assert "Maximum_Iterations" in solution.status
-    assert solution.violation >= np.abs(defects).max()
-    assert solution.violation >= abs(s[0] @ ocp.initial_matrix[0])
-
-
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_infeasible_bounds_are_reported_not_hidden(solver):
     ocp = toy()
@@ -292,53 +228,6 @@ def test_infeasible_bounds_are_reported_not_hidden(solver):
     assert solution.status
 
 
-def test_straight_line_is_bent_into_the_nearest_motion(rng):
-    # of linear dynamics: no other motion between the ends is nearer, and motions stay as they are (but for the damping)
-    ocp = Ocp(
-        name="integrator",
-        states=2,
-        inputs=1,
-        params=0,
-        next=lambda s, w, p: casadi.vertcat(s[0] + 0.1 * s[1], s[1] + 0.1 * w[0]),
-        cost=lambda s, w, p: casadi.sumsqr(s) + w[0] ** 2,
-    )
-    solver, bounds = OcpSolver(ocp, N), Bounds.free(ocp, N)
-    bounds.state_lower[[0, -1]] = bounds.state_upper[[0, -1]] = [[0, 0], [1, 0]]
-    line, still = np.linspace([0, 0], [1, 0], N + 1), np.zeros((N, 1))
-    states, inputs = solver.toward_consistency(line, still, bounds)
-    np.testing.assert_array_equal(states[[0, -1]], line[[0, -1]])
-    np.testing.assert_allclose(states[1:, 0], states[:-1, 0] + 0.1 * states[:-1, 1], atol=1e-5)
-    np.testing.assert_allclose(states[1:, 1], states[:-1, 1] + 0.1 * inputs[:, 0], atol=1e-5)
-    again = solver.toward_consistency(states, inputs, bounds)
-    np.testing.assert_allclose(again[0], states, atol=1e-4)
-
-    def distance(x, a):
-        return np.sum((x - line) ** 2) + np.sum((a - still) ** 2)
-
-    for _ in range(20):
-        other = solver.toward_consistency(
-            states + 0.1 * rng.normal(size=states.shape), inputs + rng.normal(size=inputs.shape), bounds
-        )
-        assert distance(*other) > distance(states, inputs)
-
-
-def test_step_toward_consistency_brings_a_rough_guess_nearer_and_respects_bounds(rng):
-    ocp = toy()
-    solver, bounds = OcpSolver(ocp, N), toy_bounds(ocp)
-    states, inputs = np.tile([0.4, -0.3, 0.2], (N + 1, 1)), np.zeros((N, 2))
-    for _ in range(4):
-        states, inputs = solver.toward_consistency(states, inputs, bounds, [0.4])
-        assert (states >= bounds.state_lower).all()
-        assert (states <= bounds.state_upper).all()
-        assert (inputs >= bounds.input_lower).all()
-        assert (inputs <= bounds.input_upper).all()
-    # Newton's: four are enough from here, with the parameter, path, initial and final equalities all met
-    after = [np.array(ocp.next(*(casadi.DM(v) for v in (states[k], inputs[k])), 0.4)).ravel() for k in range(N)]
-    np.testing.assert_allclose(states[1:], after, atol=1e-6)
-    assert states[0] @ ocp.initial_matrix[0] == pytest.approx(0, abs=1e-6)
-    assert states[-1, 2] ** 2 + states[-1, 2] == pytest.approx(0.2, abs=1e-6)
-
-
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
 def test_compiled_and_interpreted_functions_lead_to_the_same_solution(monkeypatch, solver):
     fast = solve_toy(solver)
@@ -346,31 +235,6 @@ def test_compiled_and_interpreted_functions_lead_to_the_same_solution(monkeypatc
     slow = solve_toy(solver)
     assert slow.cost == pytest.approx(fast.cost, rel=1e-12)
     np.testing.assert_allclose(slow.states, fast.states, atol=1e-9)
-
-
-def test_the_dynamics_of_a_task_depend_on_how_long_forces_are_held_and_on_the_robot_and_on_nothing_else(task, params):
-    compiled_dynamics = shooting_ocp(task, params).stages.dynamics
-    assert compiled_dynamics.params <= 1 + len(robot_numbers(params))
-    x, a = task.sample(np.random.default_rng(0), params)[0], np.array([0.3, -0.2])
-    for coarseness in (1, 2):
-        p = shooting_parameters(task, params, np.zeros(len(task.constant_names)), Backoff(), coarseness)
-        held = coarseness * task.control_dt
-        columns = [
-            np.tile(column[:, None], compiled.LANES)
-            for column in (np.append(x, a), np.array(p[: compiled_dynamics.params]))
-        ]
-        reached = np.array(compiled_dynamics.value(*columns))[:, 0]
-        np.testing.assert_allclose(
-            reached, dynamics.step(params, x, params.force_limit * a, held), rtol=1e-13, atol=1e-13
-        )
-
-
-def test_other_robot_has_another_optimum(params, interpreted):
-    x0 = episode(Stabilize(), 3)[0]
-    weak = replace(params, force_limit=120.0)
-    optimum = find_optimum(Stabilize(), weak, x0, ())
-    assert np.abs(optimum.trajectory.u).max() <= 120.0
-    assert optimum.cost >= find_optimum(Stabilize(), params, x0, ()).cost
 
 
 def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(params, monkeypatch):
@@ -388,9 +252,3 @@ def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(p
     monkeypatch.setattr(optimum_module, "find_optimum", find)
     assert plan_to_track(Stabilize(), params, x0, [], reserve).is_optimal
     assert failed == [reserve]
-
-
-def test_a_share_of_a_backoff_is_no_less_than_the_default():
-    half, none = Backoff(margin=0.04, goal=0.2).times(0.5), Backoff(margin=0.04, goal=0.2, force=0.0).times(0.0)
-    assert half == Backoff(margin=0.02, goal=0.1)
-    assert none == Backoff(force=0.0)

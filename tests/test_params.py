@@ -69,58 +69,34 @@ def block(start, end):
 
 
 BODY_INERTIA = '<inertia ixx="1.2875" iyy="1.2875" izz="0.075" ixy="0" ixz="0" iyz="0"/>'
-ZERO_INERTIAL = block('<link name="slide">', "</link>")
 
 BAD_URDFS = {
     "missing link": ('<link name="world"/>', "", "link 'world' is missing"),
-    "missing massless link": (block('<link name="yoke">', "</link>"), "", "link 'yoke' is missing"),
     "missing joint": (block('<joint name="theta"', "</joint>"), "", "joint 'theta' is missing"),
     "missing inertial": (
         block('<inertial>\n      <mass value="0.5"/>', "</inertial>"),
         "",
         "link 'ball' has no <inert",
     ),
-    "missing massless inertial": (ZERO_INERTIAL, '<link name="slide"/>', "link 'slide' has no <inertial>"),
     "missing mass": ('<mass value="15"/>', "", "link 'body' has no <inertial><mass>"),
-    "missing inertia": (BODY_INERTIA, "", "link 'body' has no <inertial><inertia>"),
-    "missing visual": ('<sphere radius="0.1"/>', "", "link 'ball' has no <visual><geometry><sphere>"),
-    "missing limit": ('<limit effort="350" velocity="10000"/>', "", "joint 'x' has no <limit>"),
     "missing attribute": ('<mass value="15"/>', "<mass/>", "mass of link 'body' has no attribute 'value'"),
     "negative mass": ('<mass value="15"/>', '<mass value="-15"/>', "link 'body' has negative mass -15.0 kg"),
     "zero mass": ('<mass value="0.5"/>', '<mass value="0"/>', "link 'ball' has mass 0"),
     "massless link with mass": ('<mass value="0"/>', '<mass value="1"/>', "link 'slide' has mass 1.0 kg"),
-    "massless link with inertia": (
-        '<mass value="0"/>\n      <inertia ixx="0"',
-        '<mass value="0"/>\n      <inertia ixx="1"',
-        "link 'slide'",
-    ),
     "zero inertia": ('izz="0.075"', 'izz="0"', "inertia of link 'body' must be positive"),
-    "negative inertia": ('ixx="0.002"', 'ixx="-0.002"', "inertia of link 'ball' must be positive"),
     "body not round": ('iyy="1.2875"', 'iyy="1.3"', "link 'body' must be round"),
     "product of inertia": (BODY_INERTIA, BODY_INERTIA.replace('ixy="0"', 'ixy="1"'), "link 'body': ixy must be 0"),
-    "product of inertia not a number": (BODY_INERTIA, BODY_INERTIA.replace('ixy="0"', 'ixy="no"'), "link 'body': ixy"),
     "mass not a number": ('<mass value="15"/>', '<mass value="heavy"/>', "mass of link 'body': value = 'heavy'"),
-    "mass not finite": ('<mass value="15"/>', '<mass value="nan"/>', "mass of link 'body': value = 'nan'"),
-    "vector not numbers": ('<axis xyz="1 0 0"/>', '<axis xyz="1 0"/>', "axis of joint 'x': xyz = '1 0'"),
     "wrong axis": ('<axis xyz="-1 0 0"/>', '<axis xyz="1 0 0"/>', "joint 'theta' has axis"),
     "wrong type": ('name="y" type="prismatic"', 'name="y" type="fixed"', "joint 'y' is of type 'fixed'"),
     "wrong parent": ('<parent link="ball"/>', '<parent link="slide"/>', "joint 'gamma' has parent link 'slide'"),
-    "wrong child": ('<child link="body"/>', '<child link="yoke"/>', "joint 'theta' has child link 'yoke'"),
     "displaced joint": ('<child link="body"/>', '<child link="body"/><origin xyz="0 0 0.2"/>', "joint 'theta'"),
     "centre of mass off axis": (
         '<origin xyz="0 0 0.6"/>',
         '<origin xyz="0.1 0 0.6"/>',
         "link 'body' must have its cent",
     ),
-    "centre of mass below": ('<origin xyz="0 0 0.6"/>', '<origin xyz="0 0 -0.6"/>', "link 'body' must have its centre"),
-    "tilted inertia": (
-        '<origin xyz="0 0 0.6"/>\n      <mass',
-        '<origin xyz="0 0 0.6" rpy="0.3 0 0"/>\n      <mass',
-        "link 'body'",
-    ),
     "radius not positive": ('<sphere radius="0.1"/>', '<sphere radius="0"/>', "positive radius, not 0.0 m"),
-    "no force": ('effort="350"', 'effort="0"', "positive effort limit"),
-    "unreadable XML": ("</robot>", "", "not well-formed XML"),
 }
 
 

@@ -17,17 +17,6 @@ def test_basis_is_that_of_cubic_hermite_splines():
         np.testing.assert_allclose(polynomial, spline([0, 1], values, slopes)(s), atol=1e-15)
 
 
-def test_interpolated_values_are_bit_by_bit_those_of_the_formula_written_out(rng):
-    s, (p0, v0, p1, v1), duration = np.linspace(0, 1, 41)[:, None], rng.normal(size=(4, 2)), 40 * 0.02
-    expected = (
-        (1 + 2 * s) * (1 - s) ** 2 * p0
-        + s * (1 - s) ** 2 * duration * v0
-        + s**2 * (3 - 2 * s) * p1
-        + s**2 * (s - 1) * duration * v1
-    )
-    np.testing.assert_array_equal(cubic(p0, v0, p1, v1, 40, 0.02), expected)
-
-
 def test_cubic_has_the_positions_and_velocities_asked_for_at_its_ends(rng):
     p0, v0, p1, v1 = rng.normal(size=(4, 2))
     dt = 1e-5

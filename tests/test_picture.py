@@ -4,25 +4,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from ballbot_gym.drawing import Drawing, GroundPath, Robot
-from ballbot_gym.picture import YAW, Camera, PictureScene, picture
+from ballbot_gym.picture import YAW, PictureScene, picture
 from ballbot_gym.tasks.marker import Marker
 
 UPRIGHT = np.zeros(8)
-
-
-def test_camera_looks_at_its_target_and_sees_up_as_up_and_far_as_small():
-    camera = Camera(np.array([3.0, -1.0, 0.5]))
-    (middle, above, farther), depth = camera.project(
-        np.array([[3.0, -1.0, 0.5], [3.0, -1.0, 1.5], 2 * np.array([3.0, -1.0, 0.5]) - camera.eye])
-    )
-    assert middle == pytest.approx([0, 0], abs=1e-12)
-    assert above[0] == pytest.approx(0, abs=1e-12)
-    assert above[1] > 0.2
-    assert farther == pytest.approx([0, 0], abs=1e-12)
-    assert depth[2] == pytest.approx(2 * depth[0])
 
 
 def pixels(frame, color):

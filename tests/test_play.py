@@ -16,14 +16,19 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.play import views
+from ballbot_train.play import crew, views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
-from ballbot_train.play.world import PLANT, randomization
-from ballbot_train.policy_files import BEST, PolicyError
+from ballbot_train.policy_files import BEST
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
+
+
+@pytest.fixture
+def no_optimum(monkeypatch):
+    """The optimum of the episode is not searched, which would compile a problem that no other test solves."""
+    monkeypatch.setattr(crew, "_optimum_costs", lambda task, *problem: np.zeros(task.steps + 1))
 
 
 @pytest.fixture
@@ -47,9 +52,6 @@ def go(playground, seconds):
         assert playground.step()
 
 
-# --- the episode ---
-
-
 @pytest.mark.parametrize("episode", [STANDING, FALLING])
 def test_an_episode_without_pushes_costs_what_the_env_says(play, episode):
     playground = play(episode=episode)
@@ -70,17 +72,6 @@ def test_the_optimum_costs_what_is_certified(play):
     early = playground.optimum_cost_so_far
     go(playground, 1.0)
     assert 0 < early < playground.optimum_cost_so_far < playground.optimum_cost
-
-
-def test_a_push_makes_the_robot_lean(play):
-    playground = play()
-    go(playground, 7.0)
-    before = playground.main.samples[-1].tilt
-    playground.push(30.0, 0.0)
-    go(playground, 0.2)
-    assert before < math.radians(0.5)
-    assert max(sample.tilt for sample in list(playground.main.samples)[-10:]) > math.radians(5)
-    assert views.drawing(playground).robots[-1].push is not None
 
 
 def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shipped_policy(play):
@@ -119,17 +110,6 @@ def test_ghosts_get_the_same_start_and_the_same_pushes(play):
     assert playground.main.x != ghost.x
 
 
-def test_a_ghost_that_is_added_begins_where_the_robot_is(play):
-    playground = play()
-    go(playground, 0.5)
-    here = playground.main.x
-    playground.set_ghosts(["shac"])
-    assert playground.crew.runners[1].x == here
-    playground.settle()
-    go(playground, 0.1)
-    assert playground.crew.ghosts == ("shac",)
-
-
 def test_controllers_change_without_a_jump(play):
     playground = play()
     go(playground, 0.5)
@@ -147,16 +127,6 @@ def test_controllers_change_without_a_jump(play):
     assert len(playground.trajectory().u) > 25  # one episode all along
 
 
-def test_after_an_episode_the_robot_goes_on_where_it_is(play):
-    playground = play()
-    go(playground, 7.9)
-    before = np.array(playground.main.x)
-    go(playground, 0.2)
-    assert len(playground.scores) == 1
-    assert playground.seconds < 0.2
-    assert np.abs(np.array(playground.main.x) - before)[:2].max() < 0.05
-
-
 def test_after_a_fall_the_same_episode_begins_again(play):
     playground = play(episode=FALLING)
     go(playground, 0.5)
@@ -171,14 +141,6 @@ def test_after_a_fall_the_same_episode_begins_again(play):
     assert playground.step()
     assert not playground.ended
     assert playground.episode == FALLING
-
-
-def test_next_begins_the_next_certified_episode(play):
-    playground = play(episode=FALLING)
-    playground.at_end = "next"
-    for _ in range(110):
-        playground.step()
-    assert playground.episode == FALLING + 1
 
 
 @pytest.mark.slow
@@ -207,16 +169,6 @@ def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
 
 
-def test_every_hidden_change_can_go_to_both_ends_while_the_robot_moves(play):
-    playground = play(episode=STANDING)
-    for stress, span in PLANT.items():
-        for severity in (span.low, span.high, 0.0):
-            playground.set_plant(stress, severity)
-            go(playground, 0.04)
-    assert playground.crew.notice == ""
-    assert randomization(playground.plant).active is False
-
-
 def test_the_score_of_a_robot_that_falls_is_a_regret(play):
     playground = play(episode=FALLING)
     while not playground.scores:
@@ -227,7 +179,7 @@ def test_the_score_of_a_robot_that_falls_is_a_regret(play):
 
 
 @pytest.mark.parametrize(("physics", "seed"), [("rk4", 0), ("bullet", 1)])
-def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
+def test_an_episode_of_another_robot_is_that_of_the_env(play, no_optimum, seed, physics):
     if physics == "bullet":
         pytest.importorskip("pybullet")
     playground = play(robot="rolling", episode=None, seed=seed, physics=physics)
@@ -241,7 +193,7 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, seed, physics):
     assert (score.failure != "") == expected.failure
 
 
-def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, interpreted):
+def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, no_optimum):
     playground = play(controller="lqr", ghosts=["shac"])
     playground.set_robot("kugle")
     playground.settle()
@@ -256,9 +208,6 @@ def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, interpret
         "lqr",
         (),
     )
-
-
-# --- bad input ---
 
 
 def test_no_push_harms(play):
@@ -316,14 +265,6 @@ def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_m
     assert saved_model not in playground.controllers
 
 
-def test_a_file_that_was_used_once_is_offered_from_then_on(play, saved_model):
-    playground = play(ghosts=[saved_model])
-    playground.set_ghosts([])
-    assert saved_model in playground.controllers
-    with pytest.raises(PolicyError, match="gone"):
-        play(policies=["gone.zip"])
-
-
 def test_a_controller_that_fails_gives_no_force_and_is_named(play):
     playground = play()
 
@@ -362,19 +303,6 @@ def test_what_happened_can_be_saved(play, tmp_path):
     np.testing.assert_array_equal(Trajectory.load(path).x[-1], playground.main.x)
 
 
-def test_the_history_that_is_plotted_stays_short(play):
-    playground = play(ghosts=["shac"])
-    go(playground, 9.0)
-    history = views.history(playground, 200)
-    assert len(history.seconds) == 200
-    assert (np.diff(history.seconds) > 0).all()
-    assert all(np.isfinite(line).all() and line.shape == (200, 4) for line in history.lines.values())
-    assert len(playground.main.trace) == 400
-
-
-# --- time ---
-
-
 class Watch:
     def __init__(self):
         self.now = 100.0
@@ -411,19 +339,6 @@ def test_a_short_hold_up_is_caught_up_and_a_long_one_is_given_up():
     assert LATE == 0.02
 
 
-def test_speed_stretches_time_and_a_pause_owes_no_steps():
-    watch = Watch()
-    clock = Clock(0.02, speed=0.5, now=watch)
-    clock.take()
-    watch.now += 0.03
-    assert not clock.take()
-    assert clock.wait() == pytest.approx(0.01)
-    clock.stop()
-    watch.now += 100.0
-    assert clock.take()
-    assert not clock.take()
-
-
 def test_another_process_computes_and_is_started_anew_after_it_was_killed():
     background = Background(other_process=True)
     try:
@@ -445,12 +360,6 @@ def test_a_job_of_another_process_does_not_hold_up_the_end():
     job = background.submit(lambda: background.compute(time.sleep, 60.0))
     background.close()
     assert job.done()
-
-
-def test_a_job_that_raises_gives_its_error():
-    background = Background()
-    assert isinstance(background.submit(lambda: 1 / 0).exception(5), ZeroDivisionError)
-    background.close()
 
 
 def test_every_episode_of_a_track_has_a_robot_of_its_own(play):

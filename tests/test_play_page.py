@@ -13,9 +13,7 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-from browser import start_chromium
 
 from ballbot_gym.trajectory import Trajectory
 from ballbot_gym.viewer import Viewer
@@ -83,9 +81,6 @@ def quiet(capfd):
     assert "never retrieved" not in said.err
 
 
-# --- controls ---
-
-
 def test_controls_change_the_playground(opened, visitor):
     visitor.change("Masses, %", 50.0)
     visitor.change("Speed", 2.0)
@@ -118,11 +113,6 @@ def test_a_policy_file_becomes_a_controller_that_can_be_chosen(opened, visitor):
 def test_what_a_file_is_called_is_shown_as_it_is(opened, visitor):
     visitor.change("Policy file", "<img src=x onerror=alert(1)>[a](b).json")
     wait_for(lambda: "&#60;img src=x onerror=alert(1)&#62;[a]&#40;b).json" in visitor.text())
-
-
-def test_another_task_brings_its_own_controllers(opened, visitor):
-    visitor.change("Task", "orbit")
-    wait_for(lambda: "DAgger" in visitor.controls["Controller"]["options"])
 
 
 def test_a_push_comes_from_the_sliders(opened, visitor):
@@ -183,48 +173,29 @@ def test_a_pause_holds_everything_and_a_step_moves_once(opened, visitor):
     assert opened.playground.seconds == pytest.approx(before + 0.02)
 
 
-def test_files_are_saved_and_handed_to_the_browser(opened, visitor, tmp_path):
-    opened.goes_on()
-    visitor.change("Trajectory file")
-    wait_for(lambda: visitor.files)
-    assert list(visitor.files) == ["stabilize-lqr-1.npz"]
-    assert len(Trajectory.load(tmp_path / "stabilize-lqr-1.npz").u) > 3
-
-
-@pytest.mark.parametrize(("name", "most"), [("MOST_FILES", 3), ("MOST_BYTES", 1)])
-def test_only_so_much_can_be_saved(opened, visitor, tmp_path, monkeypatch, name, most):
-    monkeypatch.setattr(saving, name, most)
+def test_files_are_saved_and_handed_to_the_browser_but_only_so_many(opened, visitor, tmp_path, monkeypatch):
+    monkeypatch.setattr(saving, "MOST_FILES", 3)
     opened.goes_on()
     for _ in range(6):
         visitor.change("Trajectory file")
     wait_for(lambda: "start ballbot play again to save more" in opened.playground.crew.notice)
-    assert len(list(tmp_path.iterdir())) == most
-
-
-# --- what a browser sends ---
+    assert len(list(tmp_path.iterdir())) == 3
+    wait_for(lambda: "stabilize-lqr-1.npz" in visitor.files)
+    assert len(Trajectory.load(tmp_path / "stabilize-lqr-1.npz").u) > 3
 
 
 NONSENSE = [
     ("Speed", math.nan),
-    ("Speed", -1.0),
     ("Speed", "fast"),
-    ("Speed", None),
-    ("Speed", [1.0, 2.0]),
-    ("Speed", True),
     ("Speed", 1e18),
     ("Masses, %", math.inf),
     ("Masses, %", -1e300),
     ("Task", "dance"),
-    ("Task", 3),
     ("Controller", "../../etc/passwd"),
     ("Controller", {"a": 1}),
-    ("Certified episode", math.nan),
     ("Certified episode", -5),
-    ("Certified episode", 1e18),
     ("Certified episode", 1e300),
     ("At the end", "explode"),
-    ("Start", "Nowhere"),
-    ("Policy file", 7),
     ("Policy file", "x" * 5000),
     ("Push", "hard"),
 ]
@@ -253,12 +224,8 @@ def works(opened, visitor, k=0):
 UPDATES = [
     {"gui_api": 5},
     {"value": 0.5, "gui_api": 5},
-    {"update_cb": []},
     {"removed": True},
-    {"props": None},
-    {"disabled": True},
     {"label": "<script>"},
-    {"__class__": "int"},
     {"no_such_field": 1},
     {},
 ]
@@ -276,16 +243,11 @@ MESSAGES = [
     {"type": "NoSuchMessage"},
     {"type": "GuiUpdateMessage", "uuid": "no", "updates": {"value": 1}},
     {"type": "GuiFormDirtyMessage", "uuid": "x" * 1000},
-    {"type": "GuiFormSubmitMessage", "uuid": "x"},
     {"type": "ShareUrlRequest"},
-    {"type": "ShareUrlDisconnect"},
     {"type": "RunJavascriptMessage", "source": "alert(1)"},
-    {"type": "GetRenderResponseMessage", "payload": b"0"},
     {"type": "SceneNodeDragMessage", "phase": "sideways", "name": "/world"},
     CAMERA | {"position": ["a", "b", "c"]},
-    CAMERA | {"look_at": [1.0]},
     CAMERA | {"wxyz": [math.nan] * 4, "position": [math.inf] * 3},
-    CAMERA | {"image_width": "wide"},
     CAMERA | {"image_width": math.nan},
 ]
 
@@ -313,25 +275,6 @@ def test_junk_ends_at_most_its_own_connection(quiet, opened, visitor):
             other.connection.send(junk)
             other.connection.ping().wait(1)
         works(opened, visitor, k)
-
-
-@pytest.mark.parametrize("state", [{"disabled": True}, {"visible": False}])
-def test_hidden_and_disabled_controls_take_nothing(quiet, opened, visitor, state):
-    control = opened.viewer.server.gui.add_slider("Mine", 0.0, 1.0, 0.1, 0.0, **state)
-    wait_for(lambda: "Mine" in visitor.controls)
-    visitor.change("Mine", 1.0)
-    works(opened, visitor)
-    assert control.value == 0.0
-
-
-def test_who_does_not_say_where_the_camera_is_changes_nothing(quiet, opened, visitor):
-    with Visitor(opened.viewer.port, arrive=False) as silent:
-        wait_for(lambda: "Speed" in silent.controls)
-        silent.change("Speed", 0.5)
-        silent.change("Task", "orbit")
-        opened.goes_on()
-    assert visitor.value("Speed") == 1.0
-    assert opened.playground.world.task_name == "stabilize"
 
 
 def test_a_flood_of_messages_does_not_hold_up_the_others(quiet, opened, visitor):
@@ -399,9 +342,6 @@ def runs(pid):
         os.kill(pid, 0)
         return True
     return False
-
-
-# --- who may connect ---
 
 
 def asked(port, path="/", **headers):
@@ -492,133 +432,3 @@ def test_what_is_no_request_is_dropped(quiet, opened):
 def test_where_nothing_can_listen_is_said(host, port):
     with pytest.raises(OSError, match="cannot listen on"):
         Viewer(host, port)
-
-
-# --- in a browser ---
-
-
-@pytest.fixture
-def chromium(tmp_path_factory):
-    started = []
-
-    def start():
-        browser = start_chromium(
-            tmp_path_factory.mktemp("chromium"), "640,480", "use-gl=angle", "use-angle=swiftshader"
-        )
-        started.append(browser)
-        return browser
-
-    yield start
-    for browser in started:
-        browser.quit()
-
-
-def shown(browser, words, seconds=120.0):
-    """Waits until the page's text has these words."""
-    wait_for(lambda: words in browser.execute_script("return document.body.innerText"), seconds)
-
-
-def focus(browser, has):
-    """Whether the page has the focus; without it viser's page does not try again where its first connection fails."""
-    browser.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", {"enabled": has})
-
-
-def choose(browser, present, wanted):
-    """Chooses another controller in the page, as a hand does."""
-    from selenium.webdriver.support.ui import WebDriverWait
-
-    find = "return [...document.querySelectorAll('input')].filter(i => i.value == arguments[0])[0]"
-    offered = (
-        "return [...document.querySelectorAll('[role=option]')].filter(o => o.innerText.trim() == arguments[0])[0]"
-    )
-    browser.execute_script(find, present).click()
-    option = WebDriverWait(browser, 60).until(lambda _: browser.execute_script(offered, wanted))
-    browser.execute_script("arguments[0].click()", option)
-
-
-def watched(opened):
-    """A list that gets the place of the robot after every step from now on."""
-    places, step = [], opened.playground.step
-
-    def recorded():
-        moved = step()
-        places.append(opened.playground.main.x[:2])
-        return moved
-
-    opened.playground.step = recorded
-    return places
-
-
-def severe(browser):
-    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-
-
-@pytest.mark.slow
-def test_a_phones_panel_is_folded(opened, chromium):
-    browser = chromium()
-    browser.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride", {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    )
-    focus(browser, True)
-    browser.get(f"{opened.viewer.address}/?fixedDpr=0.1")
-    wait_for(lambda: opened.page.visitors, 60)
-    folded = "return [...document.querySelectorAll('[role=tab]')].every(tab => !tab.getBoundingClientRect().height)"
-    wait_for(lambda: browser.execute_script(folded), 60)
-    assert severe(browser) == []
-
-
-@pytest.mark.slow
-def test_two_browsers_watch_and_drive_through_reload_and_restart(opened, chromium, tmp_path):
-    one, two = chromium(), chromium()
-    port = opened.viewer.port
-    address = f"{opened.viewer.address}/?fixedDpr=0.1"  # large pixels, because the processor draws them
-    for browser in (one, two):
-        focus(browser, True)
-    one.get(address)
-    shown(one, "LQR")
-    wait_for(lambda: len(opened.viewer.server.get_clients()) == 1)
-    two.get(address)
-    shown(two, "Take the controls")
-    shown(one, "2 browsers show this page")
-
-    # a push makes the robot lean
-    push = "return [...document.querySelectorAll('button')].filter(b => b.innerText.trim() == 'Push')[0].click()"
-    opened.do(lambda: setattr(opened.page._controls, "_impulse", 20.0))  # which LQR survives
-    two.execute_script(push)  # it watches: nothing happens
-    time.sleep(1.0)
-    before = max(sample.tilt for sample in list(opened.playground.main.samples)[-20:])
-    opened.do(lambda: opened.playground.set_ghosts(["shac"]))
-    one.execute_script(push)
-    wait_for(lambda: opened.playground.main.samples[-1].tilt > max(before, np.radians(4)), 60)
-    assert opened.playground.crew.runners[1].samples
-
-    # the ghost gets the push too, and the driver chooses another controller: the robot goes on where it is
-    leaning = [sample.tilt for sample in opened.playground.crew.runners[1].samples]
-    assert max(leaning[-200:]) > np.radians(4)
-    opened.do(lambda: opened.playground.set_ghosts([]))
-    places = watched(opened)
-    choose(one, "LQR", "SHAC")
-    wait_for(lambda: opened.playground.main.name == "shac", 60)
-    choose(one, "SHAC", "LQR")
-    wait_for(lambda: opened.playground.main.name == "lqr", 60)
-    assert np.abs(np.diff(places, axis=0)).max() < 0.02 * 8  # m: a control step at less than 8 m/s
-
-    # a reload in the middle: the page comes back, and whoever acts first drives
-    one.refresh()
-    shown(one, "LQR")
-    assert opened.thread.is_alive()
-    for browser in (one, two):
-        assert severe(browser) == []
-
-    # the server is stopped and started: the pages come back by themselves, even those that have not the focus
-    for browser in (one, two):
-        focus(browser, False)
-    opened.close()
-    again = Opened(tmp_path, port=port, task="orbit")
-    try:
-        assert again.viewer.port == port
-        wait_for(lambda: len(again.viewer.server.get_clients()) == 2, 120)
-        shown(one, "of 8 s")
-    finally:
-        again.close()
-        opened.__init__(tmp_path)  # for the fixture to close

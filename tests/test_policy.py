@@ -50,17 +50,6 @@ def test_a_saved_policy_acts_as_before(name, squash, tmp_path):
     assert json.loads(path.read_text())["measured"]["regret_mean"] == 0.1
 
 
-@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.frame is not None])
-def test_in_a_frame_one_observation_gets_the_action_that_it_gets_among_others(name):
-    task = make_task(name)
-    policy = PolicyController(task, default_params(), network_of(task, frame=task.frame))
-    seen = np.random.default_rng(0).uniform(-1, 1, (100, len(task.observation_scale))).astype(np.float32)
-    one_by_one = [policy.predict(each)[0] for each in seen]
-    assert {(action.dtype, action.shape) for action in one_by_one} == {(np.dtype(np.float32), (2,))}
-    np.testing.assert_allclose(one_by_one, policy.predict(seen)[0], atol=5e-6)
-    assert np.ptp(one_by_one, axis=0).min() > 0.01
-
-
 def test_forces_are_what_the_env_would_apply_for_the_predicted_actions(tmp_path):
     env = BallbotEnv("orbit", physics="rk4", duration=0.2)
     policy = PolicyController(env.task, env.params, network_of(env.task))

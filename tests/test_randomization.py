@@ -10,7 +10,7 @@ import torch
 
 from ballbot_gym import Randomization
 from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.randomization import TRACKS, actuate, normals
+from ballbot_gym.randomization import TRACKS, normals
 from ballbot_gym.vector import BallbotVectorEnv
 
 ROBOTS = Randomization(body_mass=(0.8, 1.3), ball_mass=(0.5, 2.0), com_height=(0.9, 1.1), inertia=(0.7, 1.4))
@@ -46,9 +46,6 @@ def assert_same(got, expected):
             np.testing.assert_array_equal(left, right)
 
 
-# --- the ranges ---
-
-
 def test_everything_is_off_by_default(physics, make_env, rng):
     assert not Randomization().active
     actions = rng.uniform(-1, 1, (60, 2))
@@ -68,9 +65,6 @@ def test_draws_fill_their_ranges(rng):
     values, counts = np.unique(drawn[:, 5], return_counts=True)
     assert values.tolist() == [0, 1, 2, 3]
     assert counts.min() > 900
-
-
-# --- robots ---
 
 
 def test_each_episode_has_a_robot_of_its_own_within_the_ranges(physics, make_env, params):
@@ -98,19 +92,9 @@ def test_randomized_robot_moves_as_one_made_with_its_parameters(robots, physics,
             np.testing.assert_array_equal(env.step(action)[4]["state"], same.step(action)[4]["state"])
 
 
-def test_task_starts_as_it_would_without_randomization(make_env):
-    plain, varied = make_env("weave", physics="rk4"), make_env("weave", physics="rk4", randomization=EVERYTHING)
-    a, b = plain.reset(seed=4)[1], varied.reset(seed=4)[1]
-    np.testing.assert_array_equal(a["state"], b["state"])
-    np.testing.assert_array_equal(a["constants"], b["constants"])
-
-
 def test_seed_repeats_a_randomized_episode(physics, make_env, rng):
     env, actions = make_env(physics=physics, randomization=EVERYTHING), rng.uniform(-1, 1, (50, 2))
     assert_same(play(env, actions, seed=2), play(env, actions, seed=2))
-
-
-# --- actuators ---
 
 
 def test_delayed_force_comes_the_drawn_number_of_steps_later(make_env):
@@ -130,11 +114,6 @@ def test_lagging_force_approaches_its_command_exponentially(make_env):
     np.testing.assert_allclose(forces, expected, rtol=1e-6)  # the tiny constant in the gain is 2e-8 of the lag
 
 
-def test_actuator_without_lag_or_delay_is_exact():
-    gain, delay = Randomization().draw((0.3,) * 6, 0.02)[4:]
-    assert actuate((1.1, -2.3), (), (5.0, 7.0), gain, delay) == (1.1, -2.3)
-
-
 def test_cost_charges_the_force_applied(make_env, rng):
     env = make_env(physics="rk4", randomization=EVERYTHING)
     _, info = env.reset(seed=0)
@@ -144,9 +123,6 @@ def test_cost_charges_the_force_applied(make_env, rng):
         assert not terminated
         assert not truncated
         assert info["cost"] == pytest.approx(env.task.cost(x, info["force"], c) * 0.02)
-
-
-# --- sensors and pushes ---
 
 
 def test_normal_numbers_are_normal(rng):
@@ -190,40 +166,8 @@ def test_push_moves_the_ball_and_is_not_charged(physics, make_env, params):
     assert info["force"].tolist() == [0, 0]
 
 
-# --- the same in batches ---
-
-
 def batch(count, randomization, **kwargs):
     return BallbotBatch("stabilize", count, dtype=torch.float64, compile=False, randomization=randomization, **kwargs)
-
-
-def test_randomized_batch_moves_as_single_robots_with_its_parameters(make_env, rng):
-    vec = batch(6, ROBOTS)
-    vec.reset(seed=0)
-    singles = [make_env(physics="rk4", params=vec.robot(i)) for i in range(6)]
-    assert len({env.params for env in singles}) == 6
-    for i, env in enumerate(singles):
-        env.reset(options={"state": vec.state.x[:, i].numpy()})
-    for actions in rng.uniform(-0.1, 0.1, (8, 6, 2)):
-        result = vec.step(torch.from_numpy(actions))
-        for i, env in enumerate(singles):
-            _, reward, *_, info = env.step(actions[i])
-            np.testing.assert_allclose(result.final_x[:, i], info["state"], rtol=1e-11, atol=1e-12)
-            assert result.reward[i].item() == pytest.approx(reward, rel=1e-11)
-
-
-def test_batched_actuators_are_those_of_single_envs(make_env, rng):
-    slow = Randomization(actuator_lag=(0.03, 0.03), actuator_delay=(0.04, 0.04))
-    vec, env = batch(1, slow, duration=0.3), make_env(physics="rk4", randomization=slow, duration=0.3)
-    vec.reset(seed=0)
-    env.reset(options={"state": vec.state.x[:, 0].numpy()})
-    for action in rng.uniform(-0.3, 0.3, (40, 2)):
-        result = vec.step(torch.from_numpy(action[None]))
-        _, reward, terminated, truncated, info = env.step(action)
-        np.testing.assert_allclose(result.force[:, 0], info["force"], rtol=1e-9, atol=1e-9)
-        assert result.reward[0].item() == pytest.approx(reward, rel=1e-9)
-        if terminated or truncated:
-            env.reset(options={"state": vec.state.x[:, 0].numpy()})
 
 
 def test_randomized_episodes_depend_neither_on_batch_size_nor_on_position():
@@ -234,14 +178,6 @@ def test_randomized_episodes_depend_neither_on_batch_size_nor_on_position():
         expected, got = whole.step(a), part.step(a[5:8])
         assert torch.equal(expected.observation[5:8], got.observation)
         assert torch.equal(expected.reward[5:8], got.reward)
-
-
-def test_batch_draws_a_new_robot_for_each_episode():
-    vec = batch(4, EVERYTHING, duration=0.02)
-    vec.reset(seed=0)
-    before = vec.state.drawn.clone()
-    vec.step(torch.zeros(4, 2))
-    assert (vec.state.drawn[:4] != before[:4]).all()
 
 
 def test_batched_sensors_and_pushes_have_the_statistics_asked_for():
@@ -267,16 +203,6 @@ def test_gradients_flow_through_randomized_robots_and_actuators():
     (gradient,) = torch.autograd.grad(cost, actions)
     assert torch.isfinite(gradient).all()
     assert (gradient[0] != 0).all()
-
-
-def test_vector_env_tells_the_robots_of_its_running_episodes(params):
-    vec = BallbotVectorEnv(3, randomization=ROBOTS)
-    vec.reset(seed=0)
-    assert len(set(vec.get_attr("episode_params"))) == 3
-    vec.close()
-
-
-# --- tracks ---
 
 
 @pytest.mark.parametrize("track", TRACKS)
@@ -328,14 +254,6 @@ def test_biased_sensors_are_wrong_by_the_same_all_the_time_and_odometry_drifts(m
     for k, error in enumerate(errors, start=1):
         expected = [*(k * env.task.control_dt * drift), *lean, *drift, *rate]
         np.testing.assert_allclose(error, expected, atol=1e-5)
-
-
-def test_unknown_track_is_refused_with_the_names_of_all(make_env):
-    with pytest.raises(ValueError, match="unknown randomization 'windy'; known: 'unknown', 'late', 'noisy', 'real'"):
-        make_env(randomization="windy")
-
-
-# --- observations for memory ---
 
 
 @pytest.mark.parametrize("task", ["stabilize", "orbit"])

@@ -13,7 +13,7 @@ from ballbot_gym.env import make_task
 from ballbot_train import jobs
 from ballbot_train.commands.certify import certify
 from ballbot_train.evaluation.benchmark import benchmark
-from ballbot_train.executors import Workers, open_pool
+from ballbot_train.executors import Workers
 from ballbot_train.learning import tuning
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
@@ -117,23 +117,6 @@ def test_an_error_of_an_item_is_the_error_of_the_run(cluster, tmp_path):
     head, _ = cluster
     with pytest.raises(ValueError, match=r"^no such item$"):
         jobs.run([jobs.Job("job", refuses, (), (0, 1))], tmp_path, Workers(ray=head.address), lambda *_: None)
-
-
-def test_few_tasks_are_in_flight(cluster):
-    head, _ = cluster
-    with open_pool(Workers(ray=head.address)) as pool:
-        started = 0
-        while pool.has_room():
-            pool.start(started, numbers, 1)
-            started += 1
-        assert started == 4  # two for each core
-        ended = set()
-        while len(ended) < started:
-            ended |= {event.key for event in pool.events() if event.kind == "ended"}
-
-
-def numbers(count):
-    yield from range(count)
 
 
 def test_a_search_runs_its_trials_on_the_nodes(cluster, tmp_path):

@@ -36,16 +36,8 @@ def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
 
 def test_the_same_seed_draws_the_same_pushes(tmp_path):
     def costs(name, seed):
-        results = robustness.run(
-            {"stabilize": ["lqr"]},
-            robustness.conditions(["push"]),
-            1,
-            "rk4",
-            tmp_path / name,
-            1,
-            lambda name, count: None,
-            seed,
-        )
+        pushes = robustness.conditions(["push"])
+        results = robustness.run({"stabilize": ["lqr"]}, pushes, 1, "rk4", tmp_path / name, 1, lambda *_: None, seed)
         return [result.cost for result in results]
 
     first, again, other = costs("a", 0), costs("b", 0), costs("c", 1)

@@ -5,33 +5,26 @@ import dataclasses
 import math
 from types import SimpleNamespace
 
-import casadi
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from ballbot_baselines import certification, righting
-from ballbot_baselines.collocation import hermite_simpson
 from ballbot_baselines.linearize import linearize
 from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.paper_problems import between_states
 from ballbot_gym import certified, dynamics
 from ballbot_gym.engines.bullet import BulletContactSimulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.env import BallbotEnv, limit_names, make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, UrdfError, default_params
-from ballbot_gym.robots import ROBOTS, checked_robot, named_robot, robot_name
+from ballbot_gym.robots import ROBOTS, checked_robot, named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import Orbit, Stabilize
-from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands.transfer import transfer
 from ballbot_train.evaluation import transfer as matrix
-from ballbot_train.learning import training
-from ballbot_train.learning.learners import shac
 from ballbot_train.policy import load_network, load_policy
 from ballbot_train.policy_files import PolicyError, PolicySpec, shipped_policies
 
@@ -116,33 +109,9 @@ def test_the_linearization_of_the_rolling_robot_moves_as_derived(rolling):
     assert (a[4, 2], a[6, 2], b[4, 0], b[6, 0]) == pytest.approx((-33.12, 57.77, 0.316, -0.441), abs=0.005)
 
 
-def test_a_steady_orbit_stays_one(rolling):
-    """Without the axial inertia, which the formula leaves out, the orbit is steady to rounding."""
-    thin = dataclasses.replace(rolling, axial_inertia=1e-12)
-    radius, tilt = 1.5, math.radians(30)
-    speed = orbit_speed(thin, radius, tilt)
-    (x,), (u,) = steady_orbit(thin, radius, speed, np.zeros(1))
-    ax, ay, gamma_ddot, theta_ddot = dynamics.accelerations(thin, x, u)
-    rate = speed / radius
-    assert dynamics.tilt(x) == pytest.approx(tilt)
-    # the body's axis turns at a constant rate: n = −sin(tilt) (cos Ωt, sin Ωt), of constant height
-    assert (ax, ay) == pytest.approx((-(rate**2) * radius, 0), abs=1e-9)
-    assert theta_ddot == pytest.approx(0, abs=1e-9)
-    assert gamma_ddot == pytest.approx(rate**2 * math.sin(tilt) * math.cos(tilt), rel=1e-9)
-
-
 def test_standing_the_floor_carries_the_weight(robot):
     assert dynamics.contact(robot, np.zeros(8), np.zeros(2)) == pytest.approx((0, 0, robot.weight))
     assert dynamics.limits(robot, np.zeros(8), np.zeros(2)) == pytest.approx((0.98, 1))
-
-
-def test_the_second_limit_is_zero_on_the_cone(rolling):
-    fx, fy, normal = dynamics.contact(rolling, np.array(START), np.array([40.0, 30.0]))
-    needed = dynamics.needed_friction((fx, fy, normal))
-    on_the_cone = dataclasses.replace(rolling, friction=float(needed))
-    assert dynamics.limits(on_the_cone, np.array(START), np.array([40.0, 30.0]))[1] == pytest.approx(0, abs=1e-12)
-    assert dynamics.limits(on_the_cone, np.array(START), np.array([40.0, 30.0]), backoff=0.1)[1] < 0
-    assert dynamics.needed_friction((1.0, 0.0, -5.0)) == math.inf
 
 
 def test_the_contact_at_the_end_of_a_step_is_that_of_its_end_state(rolling, rng):
@@ -158,15 +127,6 @@ def test_the_contact_at_the_end_of_a_step_is_that_of_its_end_state(rolling, rng)
 def test_the_paper_has_no_limits_of_grip(params, rng):
     assert dynamics.limits(params, np.zeros(8), np.zeros(2)) == ()
     assert params.moving_mass == params.total_mass
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_a_robots_urdf_is_read_back_exactly(name, tmp_path):
-    robot = named_robot(name)
-    path = tmp_path / "robot.urdf"
-    path.write_text(robot.to_urdf())
-    assert BallbotParams.from_urdf(path) == robot
-    assert robot_name(robot) == name
 
 
 @pytest.mark.parametrize(
@@ -279,12 +239,6 @@ def test_slipping_is_no_failure_in_bullet():
     env.close()
 
 
-def test_the_papers_info_has_no_grip(make_env):
-    env = make_env(physics="rk4")
-    assert "grip" not in env.reset(seed=0)[1]
-    assert limit_names(env.task, env.params) == env.task.limit_names
-
-
 @pytest.mark.parametrize("engine", ["torch", "loop"])
 def test_batches_lose_grip_as_single_envs_do(engine):
     torch = pytest.importorskip("torch")
@@ -340,16 +294,6 @@ def test_nmpc_keeps_the_friction_cone(rolling):
     limits = dynamics.limits(rolling, episode.trajectory.x[:-1], episode.trajectory.u, hold=0.02)
     assert np.min(limits) >= 0
     assert episode.cost == pytest.approx(controller.plan.cost, rel=0.02)
-
-
-def test_every_knot_of_collocation_keeps_the_cone(rolling):
-    problem = between_states("grip", np.zeros(8), np.zeros(8))
-    s, w = casadi.SX.sym("s", 11), casadi.SX.sym("w", 8)
-    rows = [
-        (ocp.inequalities(s, w, casadi.SX(0, 1)).shape[0], ocp.final_inequalities(s, casadi.SX(0, 1)).shape[0])
-        for ocp in (hermite_simpson(problem, robot) for robot in (default_params(), rolling))
-    ]
-    assert rows == [(0, 0), (2, 2)]
 
 
 def test_simulated_recoveries_grip(rolling):
@@ -440,36 +384,3 @@ def test_weights_to_start_from_may_be_of_another_robot_and_its_episodes():
     assert load_network(path, there, robot=None).spec.robot == "paper"
     with pytest.raises(PolicyError, match="was trained on Orbit, not on Turn"):
         load_network(path, make_task("turn"), robot=None)
-
-
-def taught(robot, **settings):
-    """shac on Stabilize after some iterations, from LQR."""
-    config = shac.ShacConfig(num_envs=64, hidden=(16,), symmetry="odd", **settings)
-    learner = shac.Shac(make_task("stabilize", robot), named_robot(robot), config)
-    for _ in range(config.iterations):
-        learner.iterate()
-    return learner.network
-
-
-def test_the_penalty_on_slipping_is_for_robots_that_can_slip(monkeypatch):
-    def same(robot):
-        networks = []
-        for penalty in (3000.0, 0.0):
-            monkeypatch.setattr(shac, "_GRIP_PENALTY", penalty)
-            networks.append(taught(robot, iterations=1, horizon=5))
-        return all(torch.equal(*pair) for pair in zip(*(network.parameters() for network in networks), strict=True))
-
-    assert same("paper")
-    assert not same("rolling")
-
-
-@pytest.mark.slow
-def test_shac_learns_to_keep_its_grip(monkeypatch):
-    """The penalty's gradient leads away from slipping, which without it is only counted."""
-
-    def failures(grip_penalty):
-        monkeypatch.setattr(shac, "_GRIP_PENALTY", grip_penalty)
-        network = taught("rolling", iterations=40, horizon=15)
-        return training.validate(network, make_task("stabilize", "rolling"), "rolling").failures
-
-    assert failures(3000.0) < 0.8 * failures(0.0)

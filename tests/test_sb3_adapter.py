@@ -6,8 +6,6 @@ pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from ballbot_gym import dynamics
@@ -75,38 +73,6 @@ def test_seeds_and_options_are_used_once():
     assert np.abs(env.reset()).max() > 0
 
 
-def test_options_must_be_alike_for_every_env():
-    env = make(2)
-    env.set_options([{"state": np.zeros(8)}, {}])
-    with pytest.raises(ValueError, match="same keys"):
-        env.reset()
-
-
-def test_attributes_are_given_per_env():
-    env = make(3)
-    assert env.get_attr("task", [0, 2]) == [env.env.task] * 2
-    assert env.get_attr("render_mode") == [None] * 3
-    assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
-    with pytest.raises(AttributeError, match="cannot be set"):
-        env.set_attr("task", None)
-
-
-def test_films_run_at_the_speed_of_the_control_steps():
-    assert make(1, render_mode="rgb_array").metadata["render_fps"] == 50
-    assert make(1, render_mode="rgb_array", control_dt=0.04).metadata["render_fps"] == 25
-    assert make(1, render_mode="rgb_array").metadata["render_modes"] == ["human", "rgb_array"]  # Stable-Baselines3's
-
-
-def test_evaluations_of_plain_envs_count_successes(tmp_path):
-    env, other = (gymnasium.make("BallbotStabilize-v0", physics="rk4", duration=0.02) for _ in range(2))
-    monitored = Monitor(env, info_keywords=("is_success",))
-    logged = EvalCallback(monitored, n_eval_episodes=3, eval_freq=8, log_path=str(tmp_path), verbose=0)
-    PPO("MlpPolicy", other, n_steps=8, batch_size=8, n_epochs=1, device="cpu").learn(16, logged)
-    successes = np.load(tmp_path / "evaluations.npz")["successes"]
-    assert successes.shape[1] == 3
-    assert successes.dtype == bool
-
-
 def test_ends_of_episodes_report_what_a_vec_monitor_reports():
     env = make(6, duration=0.2)
     with pytest.warns(UserWarning, match="Monitor"):
@@ -125,15 +91,6 @@ def test_ends_of_episodes_report_what_a_vec_monitor_reports():
                 assert a["episode"]["r"] == pytest.approx(b["episode"]["r"], rel=1e-5)
                 assert a["episode"]["t"] >= 0
     assert ends >= 12
-
-
-def test_episodes_are_as_long_as_max_episode_steps_says():
-    env = BallbotVecEnv(gymnasium.make_vec("BallbotStabilize-v0", num_envs=2, max_episode_steps=7))
-    env.set_options({"state": np.zeros(8)})
-    env.reset()
-    ends = [env.step(np.zeros((2, 2))) for _ in range(7)]
-    assert [done.tolist() for _, _, done, _ in ends] == [[False] * 2] * 6 + [[True] * 2]
-    assert [info["TimeLimit.truncated"] for info in ends[-1][3]] == [True] * 2
 
 
 def test_only_same_step_autoreset_is_taken():

@@ -96,11 +96,6 @@ def test_a_damaged_manifest_is_named(text, tmp_path):
         shards.Shards(tmp_path)
 
 
-def test_a_place_that_does_not_exist_is_named():
-    with pytest.raises(shards.ShardError, match="nowhere://set cannot be read"):
-        shards.Shards("nowhere://set")
-
-
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demos")

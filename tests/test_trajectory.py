@@ -1,4 +1,3 @@
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -81,22 +80,6 @@ def test_before_and_after_the_ends_hold(linear, slopes):
         np.testing.assert_array_equal(trajectory.force(t), trajectory.u[end])
 
 
-def test_what_is_read_off_is_a_copy():
-    trajectory = example()
-    trajectory.state(trajectory.t[-1])[:] = 0
-    trajectory.force(trajectory.t[-1])[:] = 0
-    assert trajectory.x[-1].any()
-    assert trajectory.u[-1].any()
-
-
-def test_duration_and_tilt_are_of_the_states():
-    t, x = np.array([1.0, 3.5]), np.zeros((2, 8))
-    x[1, 2:4] = 0.3, -0.4
-    trajectory = Trajectory(t, x, np.zeros((1, 2)))
-    assert trajectory.duration == 2.5
-    np.testing.assert_allclose(trajectory.tilt, [0, np.arccos(np.cos(0.3) * np.cos(0.4))])
-
-
 def test_single_state_is_a_trajectory_too():
     trajectory = Trajectory([0.0], np.ones((1, 8)), np.zeros((1, 2)))
     assert trajectory.duration == 0
@@ -159,15 +142,3 @@ def test_file_is_whole_when_its_name_appears(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "replace", look)
     files.write(tmp_path / "new.bin", b"whole")
     assert seen == [(b"whole", False)]
-
-
-def test_small_file_takes_little_memory_however_large_a_file_may_be(tmp_path):
-    path = files.write(tmp_path / "small", b"x" * 3 * 2**20)
-    tracemalloc.start()
-    try:
-        assert len(files.read(path, 2**40)) == 3 * 2**20
-        assert tracemalloc.get_traced_memory()[1] < 10 * 2**20  # the pieces, and the whole of them joined
-    finally:
-        tracemalloc.stop()
-    with pytest.raises(files.FileError, match="is larger than 2 MiB"):
-        files.read(path, 2 * 2**20)

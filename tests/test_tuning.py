@@ -113,19 +113,6 @@ def test_a_killed_search_goes_on_with_the_trial_that_was_running(fakes, tmp_path
     assert fakes[before].learning_rate == pytest.approx(interrupted.params["learning_rate"])
 
 
-def test_a_search_that_is_killed_before_it_proposes_still_starts_with_the_tuned_settings(fakes, tmp_path, monkeypatch):
-    def killed(*arguments):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(tuning, "_proposed", killed)
-        for _ in range(2):
-            with pytest.raises(KeyboardInterrupt):
-                tuning.run(SEARCH, 1, tmp_path)
-    tuning.run(SEARCH, 1, tmp_path)
-    assert fakes[0].learning_rate == LEARNERS["ppo"].settings("stabilize").learning_rate
-
-
 def test_a_damaged_study_is_named(fakes, tmp_path):
     (tmp_path / "study.db").write_bytes(b"no database" * 100)
     with pytest.raises(ValueError, match=r"study\.db cannot be read or written \(.*file is not a database"):
@@ -162,18 +149,9 @@ def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, c
     assert (tmp_path / "ppo.yml").exists()
 
 
-def test_a_search_belongs_to_a_robot(fakes, tmp_path, capsys):
-    tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path, robot="kugle")
-    assert "--robot kugle" in capsys.readouterr().out
-    assert not (tmp_path / "ppo.yml").exists()  # rl-zoo3 knows the ids alone
-    with pytest.raises(ValueError, match="robot"):
-        tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path)
-
-
-@pytest.mark.parametrize("robot", ["paper", "rolling"])
-def test_real_trainings_have_an_outcome_per_seed(robot):
+def test_real_trainings_have_an_outcome_per_seed():
     tiny = {"num_envs": 4, "num_steps": 4, "hidden": (4,), "batch_size": 8}
-    search = Search("ppo", "stabilize", (0, 1), 32, 1, robot)
+    search = Search("ppo", "stabilize", (0, 1), 32, 1, "rolling")
     cost, outcome = tuning.outcome_of(search, settings_of(search, tiny))
     assert isinstance(cost, float)
     assert isinstance(outcome, Outcome)

@@ -1,26 +1,20 @@
-import importlib.util
 import logging
 import math
-import sys
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 pytest.importorskip("torch")
 
 import torch
 
-from ballbot_gym import BallbotEnv, BallbotParams, counter_rng, dynamics
 from ballbot_gym import batch as batch_module
+from ballbot_gym import counter_rng, dynamics
 from ballbot_gym.batch import BallbotBatch, run_episodes
-from ballbot_gym.engines.bullet import BulletSimulator
 from ballbot_gym.env import REWARD_PARTS
-from ballbot_gym.params import default_params
-from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.vector import BallbotVectorEnv
@@ -57,35 +51,6 @@ def assert_same_info(got, expected, tolerance):
         np.testing.assert_allclose(got[key], expected[key], rtol=tolerance, atol=tolerance, err_msg=key)
 
 
-# --- whole episodes ---
-
-
-def test_episodes_run_at_once_are_those_that_single_envs_run(task, make_env, rng):
-    """Starts are such that some episodes end early; the policy is a linear function of the observation."""
-    short = type(task)(duration=1.0)
-    starts = [short.sample(rng, default_params()) for _ in range(6)]
-    x, c = (np.array(part) for part in zip(*starts, strict=True))
-    x[0, 2], x[0, 6] = 1.3, 4.0  # falls
-    weights = torch.tensor(rng.normal(0, 0.3, (2, len(short.observation_scale))), dtype=torch.float64)
-
-    def policy(observation):
-        return torch.tanh(observation.double() @ weights.T)
-
-    batch = BallbotBatch(short, len(x), dtype=torch.float64, compile=False)
-    run = run_episodes(batch, policy, x, c, record=True)
-    assert run.failure[0]
-    env = make_env(short, physics="rk4")
-    for i in range(len(x)):
-        controller = ActionController(short, env.params, lambda seen, begins: policy(torch.as_tensor(seen)).numpy())
-        alone = rollout(env, controller, options={"state": x[i], "constants": c[i]})
-        ended_early = len(alone.trajectory.u) < short.steps
-        assert (run.success[i], run.failure[i], run.steps[i]) == (alone.success, alone.failure, len(alone.trajectory.u))
-        assert run.terminated[i] == (alone.failure or (ended_early and alone.success))
-        # the env rounds observations to float32, and the robot multiplies that rounding by e^7.8 in a second
-        assert run.cost[i].item() == pytest.approx(alone.cost, rel=1e-3)
-        np.testing.assert_allclose(run.states[: run.steps[i], :, i], alone.trajectory.x[1:], atol=1e-2)
-
-
 def test_episodes_are_not_recorded_and_carry_no_gradient_unless_asked():
     task = TASKS["stabilize"](duration=0.1)
     weights = torch.zeros(8, 2, requires_grad=True)
@@ -96,9 +61,6 @@ def test_episodes_are_not_recorded_and_carry_no_gradient_unless_asked():
     assert not run.cost.requires_grad
     assert run.success.all()
     assert run.steps.tolist() == [5, 5]
-
-
-# --- the same environment as BallbotEnv(physics="rk4") ---
 
 
 def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task, make_vec, make_env, rng):
@@ -132,25 +94,6 @@ def test_batch_follows_single_envs_step_for_step_over_the_ends_of_episodes(task,
     assert ends >= 8
 
 
-def test_one_step_in_float32_is_within_its_rounding(task, make_env, rng):
-    """From equal states, 2 · 4 evaluations of the accelerations leave some 1e-6 of relative error."""
-    name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
-    batch = BallbotBatch(name, 64, compile=False)
-    batch.reset(seed=2)
-    env = make_env(name, physics="rk4")
-    for _ in range(3):
-        x, c = batch.state.x.T.double().numpy(), batch.state.c.T.double().numpy()
-        actions = rng.uniform(-1, 1, (64, 2)).astype(np.float32)
-        result = batch.step(torch.from_numpy(actions))
-        for i in range(64):
-            env.reset(options={"state": x[i], "constants": c[i]})
-            observation, reward, terminated, _, info = env.step(actions[i])
-            np.testing.assert_allclose(result.final_x[:, i], info["state"], rtol=5e-6, atol=5e-6)
-            np.testing.assert_allclose(result.final_observation[i], observation, rtol=5e-6, atol=5e-6)
-            assert result.reward[i].item() == pytest.approx(reward, rel=5e-6, abs=2e-5)  # pay less cost may be near 0
-            assert result.terminated[i] == terminated
-
-
 def test_reaching_turns_goal_ends_the_episode_as_a_success_without_further_cost(make_vec):
     vec = make_vec(2, "turn")
     gate = np.array([0.98, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
@@ -163,56 +106,6 @@ def test_reaching_turns_goal_ends_the_episode_as_a_success_without_further_cost(
     cost = vec.task.cost(tuple(gate), (0.0, 0.0), (3.0,)) * 0.02
     assert infos["final_info"]["cost"][0] == pytest.approx(cost)
     assert rewards[0] == pytest.approx(vec.task.survival_pay - cost)
-
-
-def test_resting_at_the_origin_to_the_end_is_a_success(make_vec):
-    vec = make_vec(2, duration=0.1)
-    vec.reset(seed=0, options={"state": np.stack([np.zeros(8), np.full(8, 0.3)])})
-    for _ in range(5):
-        *_, truncations, infos = vec.step(np.zeros((2, 2)))
-    assert truncations.all()
-    assert infos["final_info"]["success"].tolist() == [True, False]
-
-
-def test_state_that_is_not_finite_fails_and_its_neighbours_go_on():
-    batch = BallbotBatch("stabilize", 3, compile=False)
-    batch.reset(seed=0)
-    batch.state.x[2, 1] = math.nan
-    result = batch.step(torch.zeros(3, 2))
-    assert result.failure.tolist() == [False, True, False]
-    assert torch.isfinite(batch.state.x).all()
-
-
-def test_tilt_is_of_the_state_that_follows_and_final_tilt_of_the_one_before_the_restart():
-    batch = BallbotBatch("stabilize", 64, dtype=torch.float64, compile=False, duration=0.1)
-    batch.reset(seed=0)
-    for _ in range(7):
-        result = batch.step(torch.zeros(64, 2))
-        for tilt, x in ((result.tilt, batch.state.x), (result.final_tilt, result.final_x)):
-            np.testing.assert_allclose(np.cos(tilt), np.cos(x[2]) * np.cos(x[3]), rtol=1e-12)
-        assert (result.final_tilt != result.tilt).tolist() == (result.terminated | result.truncated).tolist()
-
-
-def test_batch_agrees_with_pybullet_to_its_integrators_error(params):
-    """Bullet is of first order, so its distance from the RK4 model falls to a quarter with a quarter of its step."""
-    x0, action = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0), (60 / 350, -40 / 350)
-    batch = BallbotBatch("stabilize", 1, dtype=torch.float64, compile=False)
-    batch.reset(x=torch.tensor(x0, dtype=torch.float64)[:, None])
-    for _ in range(15):
-        batch.step(torch.tensor([action], dtype=torch.float64))
-    errors = []
-    for physics_dt in (1e-3, 0.25e-3):
-        bullet = BulletSimulator(params, 0.02, physics_dt)
-        bullet.reset(x0)
-        for _ in range(15):
-            x = bullet.step((60.0, -40.0))
-        bullet.close()
-        errors.append(np.abs(np.array(x) - batch.state.x[:, 0].numpy()).max())
-    assert errors[0] == pytest.approx(2.0e-2, rel=0.1)  # DESIGN: measured against the exact solution
-    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
-
-
-# --- Gymnasium's rules ---
 
 
 def test_make_vec_gives_the_batched_env_with_the_spaces_of_the_single_one(task):
@@ -308,75 +201,6 @@ def test_steps_before_reset_and_after_close_and_bad_actions_are_refused(make_vec
             use()
 
 
-def test_what_a_step_returned_is_never_written_to_again(make_vec, rng):
-    vec = make_vec(8, dtype=torch.float32, duration=0.1)
-    returned = [vec.reset(seed=0)[0]]
-    copies = [returned[0].copy()]
-    for _ in range(12):
-        observations, rewards, *_, infos = vec.step(rng.uniform(-1, 1, (8, 2)))
-        returned += [observations, rewards, infos["state"]]
-        copies += [a.copy() for a in returned[-3:]]
-    for a, b in zip(returned, copies, strict=True):
-        np.testing.assert_array_equal(a, b)
-    with pytest.raises(ValueError, match="read-only"):
-        infos["state"][0] = 0
-
-
-def test_gymnasiums_episode_statistics_are_the_sum_of_rewards(make_vec, rng):
-    vec = RecordEpisodeStatistics(make_vec(4, duration=0.3))
-    vec.reset(seed=0)
-    total, seen = np.zeros(4), 0
-    for _ in range(40):
-        _, rewards, terminations, truncations, infos = vec.step(rng.uniform(-1, 1, (4, 2)))
-        total += rewards
-        for i in np.flatnonzero(terminations | truncations):
-            assert infos["episode"]["r"][i] == pytest.approx(total[i])
-            total[i], seen = 0, seen + 1
-    assert seen > 6
-
-
-@pytest.mark.parametrize("mode", AutoresetMode)
-def test_infos_hold_nothing_but_numbers_so_that_torch_can_take_them(mode, make_vec, monkeypatch):
-    if importlib.util.find_spec("array_api_compat") is None:  # SciPy brings a copy
-        monkeypatch.setitem(sys.modules, "array_api_compat", pytest.importorskip("scipy._lib.array_api_compat"))
-    from gymnasium.wrappers.vector import NumpyToTorch
-
-    vec, ends = NumpyToTorch(make_vec(3, "weave", autoreset_mode=mode, duration=0.2)), 0
-    vec.reset(seed=0)
-    for _ in range(25):
-        *_, terminated, truncated, infos = vec.step(torch.ones(3, 2))
-        assert infos["violated"].dtype == torch.int64
-        done = terminated | truncated
-        ends += int(done.sum())
-        if mode is AutoresetMode.SAME_STEP and done.any():
-            assert not infos["final_obs"][done].isnan().any()
-        if mode is AutoresetMode.DISABLED and done.any():
-            vec.reset(options={"reset_mask": done})
-    assert ends >= 3
-
-
-def test_attributes_are_given_per_env(make_vec):
-    vec = make_vec(3)
-    vec.reset(seed=5)
-    assert vec.np_random_seed == vec.get_attr("np_random_seed") == (5, 6, 7)
-    assert vec.call("task") == (vec.task,) * 3
-    assert vec.get_attr("limit_names") == (("tilt", "arena"),) * 3
-    assert all(isinstance(params, BallbotParams) for params in vec.get_attr("episode_params"))
-    with pytest.raises(AttributeError):
-        vec.set_attr("task", None)
-
-
-def test_what_envs_are_made_of_cannot_be_set(make_vec):
-    vec = make_vec(3)
-    of_vec = ("render_mode", "autoreset_mode", "action_space", "single_observation_space")
-    for face, names in ((vec, of_vec), (vec.batch, ("dtype",))):
-        for name in ("task", "params", "randomization", "num_envs", *names):
-            with pytest.raises(AttributeError, match=f"'{name}' cannot be set"):
-                setattr(face, name, getattr(face, name))
-    with pytest.raises(AttributeError, match="'params' cannot be set"):
-        gymnasium.make_vec("BallbotTurn-v0", 2, "sync", physics="rk4").set_attr("params", vec.params)
-
-
 def test_every_env_is_drawn(make_vec):
     vec = make_vec(2, "weave", render_mode="rgb_array")
     vec.reset(seed=0)
@@ -384,9 +208,6 @@ def test_every_env_is_drawn(make_vec):
     assert len(images) == 2
     assert images[0].shape[2] == 3
     assert (images[0] != images[1]).any()
-
-
-# --- reproducibility ---
 
 
 def play(batch, actions, first=0):
@@ -418,12 +239,6 @@ def test_seed_repeats_everything_and_without_one_the_next_episodes_come():
     assert (other.reset() != BallbotBatch("weave", 5, compile=False).reset()).any()
 
 
-def test_float32_and_float64_start_alike(task):
-    name = next(name for name, kind in TASKS.items() if isinstance(task, kind))
-    single, double = (BallbotBatch(name, 9, dtype=dtype, compile=False) for dtype in (torch.float32, torch.float64))
-    np.testing.assert_allclose(single.reset(seed=1), double.reset(seed=1), rtol=1e-5, atol=1e-6)
-
-
 def test_hashed_numbers_are_uniform_and_uncorrelated():
     n = 20_000
     seed = torch.arange(n)
@@ -437,9 +252,6 @@ def test_hashed_numbers_are_uniform_and_uncorrelated():
     both = torch.corrcoef(torch.cat([z, later, z[:, torch.roll(seed, 1)]]))
     assert (both - torch.eye(24)).abs().max() < 5 / math.sqrt(n)
     assert len(counter_rng._mix(torch.arange(2**16)).unique()) == 2**16
-
-
-# --- gradients ---
 
 
 def rollout_cost(batch, x0, gain, forces):
@@ -510,22 +322,11 @@ def test_gradient_ends_with_the_episode():
     assert (torch.autograd.grad(beyond, action, allow_unused=True)[0] == 0).all()
 
 
-def test_detach_cuts_the_gradient():
-    batch = BallbotBatch("stabilize", 2, compile=False)
-    batch.reset(seed=0)
-    batch.step(torch.zeros(2, 2, requires_grad=True))
-    assert batch.state.x.requires_grad
-    batch.detach()
-    assert not batch.state.x.requires_grad
-
-
-# --- compiled ---
-
-
 ONE_STEP = {"duration": 0.1, "control_dt": 0.01}  # one RK4 step: two in a row compile twice as long
 needs_compiler = pytest.mark.skipif(not batch_module._has_compiler(torch.device("cpu")), reason="no C++ compiler")
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wherever_an_env_stands():
     """37 envs fill vector registers and leave a remainder, and turning the order round moves each elsewhere."""
@@ -543,16 +344,6 @@ def test_compiled_batch_agrees_with_eager_to_rounding_and_with_itself_bitwise_wh
     for name in last._fields:
         a, b = getattr(last, name), getattr(last_eager, name)
         assert (a.dtype, a.shape) == (b.dtype, b.shape), name
-
-
-@pytest.mark.slow  # it compiles twice
-@needs_compiler
-def test_compiled_batch_of_5_envs_which_fill_no_register_has_the_bits_of_a_larger_one():
-    actions = torch.rand(30, 37, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    with torch.no_grad():
-        many = play(BallbotBatch("stabilize", 37, compile=True, **ONE_STEP), actions, range(37))
-        few = play(BallbotBatch("stabilize", 5, compile=True, **ONE_STEP), actions[:, 7:12], range(7, 12))
-    assert all(torch.equal(a, b[:, 7:12]) for a, b in zip(few, many, strict=True))
 
 
 def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monkeypatch, caplog):
@@ -577,15 +368,3 @@ def test_without_a_working_compiler_auto_falls_back_with_a_word_in_the_log(monke
     must.reset(seed=0)
     with pytest.raises(RuntimeError, match="no such compiler"):
         must.step(torch.zeros(4, 2))
-
-
-def test_small_batches_are_not_compiled_by_themselves():
-    assert not BallbotBatch("stabilize", 16).compiled
-
-
-def test_single_env_and_batch_are_of_one_task_object(make_vec):
-    task = TASKS["turn"](duration=1.0)
-    vec = make_vec(1, task)
-    env = BallbotEnv(task, physics="rk4")
-    assert vec.task is env.task
-    env.close()

@@ -68,12 +68,6 @@ def test_many_drawings_leave_no_more_messages_than_a_few(viewer, params):
     assert messages_after(200) <= messages_after(10) + 5
 
 
-def test_drawing_after_the_end_does_nothing(viewer, params):
-    viewer.close()
-    viewer.close()
-    viewer.draw(Drawing(params, (Robot(STATE),)))
-
-
 @pytest.mark.parametrize(
     ("end", "expected"),
     [

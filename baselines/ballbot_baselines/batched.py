@@ -93,7 +93,12 @@ def solves(task: Task, params: BallbotParams) -> bool:
 
 
 def find_optima(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, forces: np.ndarray | None = None
+    task: Task,
+    params: BallbotParams,
+    x0: np.ndarray,
+    c: np.ndarray,
+    forces: np.ndarray | None = None,
+    backoff: Backoff = Backoff(),
 ) -> BatchOptima:
     """Optimizes B episodes on one core.
 
@@ -104,6 +109,7 @@ def find_optima(
         c: (B, nc) constants.
         forces: (B, at least n, 2) N, of episodes to start from where they are cheaper than the simulated recoveries, as those
             of a policy; for tasks that end at rest without obstacles.
+        backoff: what they keep from margins and goal, and of the grip.
 
     Raises:
         ValueError: an array has the wrong shape.
@@ -135,6 +141,7 @@ def find_optima(
             x0[rows],
             c[rows],
             BatchOptima(**{f.name: getattr(optima, f.name)[rows] for f in fields(optima)}),
+            replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal)),
         )
         batch.search(None if forces is None else forces[rows, :n])
     optima.solved[:] = np.isfinite(optima.costs)
@@ -167,8 +174,11 @@ class _Guesses:
 class _Batch:
     """The search of some episodes, which fills in their `BatchOptima`."""
 
-    def __init__(self, task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, optima: BatchOptima):
+    def __init__(
+        self, task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, optima: BatchOptima, backoff: Backoff
+    ):
         self._task, self._params, self._x0, self._c, self._optima = task, params, x0, c, optima
+        self._backoff = backoff
         self._solver = ilqr(task, params)
 
     def search(self, forces: np.ndarray | None) -> None:
@@ -186,8 +196,7 @@ class _Batch:
     def _given(self, c: np.ndarray, then_rest: bool = False, free_time: bool = False) -> np.ndarray:
         """Parameters of `ilqr`, (J, np), of constants (J, nc). With `then_rest`, LQR's cost-to-go counts."""
         share = [] if free_time or self._solver.rest is None else [float(then_rest)]
-        backoff = replace(Backoff(), margin=MARGIN, goal=MARGIN)
-        _, *given = shooting_parameters(self._task, self._params, c[0], backoff)
+        _, *given = shooting_parameters(self._task, self._params, c[0], self._backoff)
         rows = np.tile([*given, *share], (len(c), 1))
         first = len(robot_numbers(self._params))
         rows[:, first : first + c.shape[1]] = c

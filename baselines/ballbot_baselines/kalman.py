@@ -38,6 +38,7 @@ class TrackFilter:
     |---|---|---|
     | `x` | (8,) | the state |
     | `factors` | (3,) | on the nominal values of what `FACTORS` names |
+    | `covariance` | (17, 17) | of all that is estimated |
     | `deviations` | (3,) | standard deviations of `factors` |
     | `errors` | (6,) | drift of odometry, m/s, biases of leans, rad, and of lean rates, rad/s |
     | `delay` | | control steps from a command to its force |
@@ -107,8 +108,12 @@ class TrackFilter:
         return self._z[self._best, _FACTORS].copy()
 
     @property
+    def covariance(self) -> np.ndarray:
+        return self._p[self._best].copy()
+
+    @property
     def deviations(self) -> np.ndarray:
-        return np.sqrt(np.diagonal(self._p[self._best])[_FACTORS])
+        return np.sqrt(np.diagonal(self.covariance)[_FACTORS])
 
     @property
     def errors(self) -> np.ndarray:

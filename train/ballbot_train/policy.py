@@ -102,14 +102,14 @@ class PolicyNetwork(torch.nn.Module):
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             seen = tuple(observation.tolist())
-            features, back = self._features(seen if self.routes is None else seen + self.routes.alone(seen))
+            features, back = self.features(seen if self.routes is None else seen + self.routes.alone(seen))
             output = self._in_frame(features, observation.new_tensor)
             forwards, sideways = output.tolist()
             return observation.new_tensor(back((forwards, sideways)))
         if self.routes is not None:
             observation = self.routes.behind(observation)
         if self._frame is not None:
-            features, back = self._features(observation.unbind(-1))
+            features, back = self.features(observation.unbind(-1))
             action = self._in_frame(features, lambda values: torch.stack(values, -1))
             return torch.stack(back((action[..., 0], action[..., 1])), -1)
         total = self._sum(observation)
@@ -117,7 +117,7 @@ class PolicyNetwork(torch.nn.Module):
             total = total + action_signs * self._sum(signs * observation)
         return total / (1 + len(self._mirrors)) if self._mirrors else total
 
-    def _features(self, observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
+    def features(self, observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
         """Features of the present observation, and behind them those of the past ones with their actions; the way back."""
         assert self._frame is not None
         count, own = self.spec.history, self.spec.observations
@@ -137,10 +137,10 @@ class PolicyNetwork(torch.nn.Module):
         """Action in the frame (..., 2) before it is squashed; stack: makes tensors (..., n) of n values."""
         output = self._sum(stack(features))
         if self._steady is not None:
-            output = centred(output, features, self._sum, self._kept, self.spec.squash, stack)
+            output = centred(output, features, self._sum, self.kept, self.spec.squash, stack)
         return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
 
-    def _kept(self, features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+    def kept(self, features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
         """Features of the steady motion, as if it had gone on for all of the history, and the action that keeps it."""
         assert self._steady is not None
         assert self._frame is not None

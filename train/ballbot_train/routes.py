@@ -30,7 +30,7 @@ class Routes(torch.nn.Module):
         own: dict[str, Any] = {"device": device, "dtype": torch.float32}
         route = FRAMES[frame].route
         assert route is not None
-        self._route = route
+        self.route = route
         layers: list[torch.nn.Module] = []
         for fan_in, fan_out in itertools.pairwise((3 * route.obstacles, *hidden)):
             layers += [torch.nn.Linear(fan_in, fan_out, **own), torch.nn.Tanh()]
@@ -41,17 +41,17 @@ class Routes(torch.nn.Module):
 
     def layout(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 3 n) x, y and radius of every obstacle as seen from the goal, of observations (..., no)."""
-        return torch.stack(self._route.layout(observation.unbind(-1)), -1)
+        return torch.stack(self.route.layout(observation.unbind(-1)), -1)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., n) 1 for every obstacle that is passed on its left, −1 on its right, of observations (..., no)."""
         best = self.mlp(self.layout(observation)).argmax(-1)
-        return torch.stack(self._route.sides(observation.unbind(-1), self._choices[best].unbind(-1)), -1)
+        return torch.stack(self.route.sides(observation.unbind(-1), self._choices[best].unbind(-1)), -1)
 
     def alone(self, observation: tuple[float, ...]) -> tuple[float, ...]:
         """The sides (n) of one observation (no), in plain numbers, which take less time than tensors do."""
-        best = int(self.mlp(self._choices.new_tensor(self._route.layout(observation))).argmax())
-        return self._route.sides(observation, farther_choices(self._route.obstacles)[best])
+        best = int(self.mlp(self._choices.new_tensor(self.route.layout(observation))).argmax())
+        return self.route.sides(observation, farther_choices(self.route.obstacles)[best])
 
     def behind(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., no + n) observations with the sides behind them, as the frame's features take them."""

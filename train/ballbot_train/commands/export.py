@@ -1,6 +1,7 @@
-"""`ballbot export POLICY`: a policy as an ONNX file."""
+"""`ballbot export POLICY`: a policy as an ONNX file or as a C file."""
 
 from pathlib import Path
+from typing import Literal
 
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER, file_name
@@ -8,23 +9,37 @@ from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import policy_path, task_name
 
 
-def export(policy: str, /, task: str | None = None, onnx: Path | None = None, robot: RobotName = PAPER) -> None:
-    """Writes a policy as an ONNX file, which needs neither Python nor torch to run.
+def export(
+    policy: str,
+    /,
+    task: str | None = None,
+    format: Literal["onnx", "c"] = "onnx",
+    out: Path | None = None,
+    robot: RobotName = PAPER,
+) -> None:
+    """Writes a policy as an ONNX or a C file, which needs neither Python nor torch to run.
 
-    Its input is the observation, its output the action in [-1, 1]. Its metadata names the task, the units, the layout and the
-    control rate.
+    An ONNX file takes the observation, and gives the action in [-1, 1]. Its metadata names the task, the units, the layout
+    and the control rate. A C file is C99 for microcontrollers, without malloc. It holds the observation too, the same facts
+    as a comment, and a test of itself.
 
     Args:
-        policy: a policy file, or the name of a policy that comes with the package.
+        policy: a policy file, or the name of a policy that comes with the package; for C also lqr.
         task: name of its task; default the one that its file names, or else stabilize.
-        onnx: path of the ONNX file; default runs/export/TASK-POLICY.onnx.
+        format: onnx or c.
+        out: path of the file; default runs/export/TASK-POLICY with the ending .onnx or .c.
         robot: name of the policy's robot.
     """
-    from ballbot_train.onnx_export import export_onnx  # it imports torch
-
     task = task_name(policy, task, robot)
     problem = make_task(task, robot)
-    source = policy_path(policy, problem, robot)
-    path = Path("runs") / "export" / f"{file_name(task, robot)}-{Path(policy).stem}.onnx" if onnx is None else onnx
-    written = export_onnx(source, path, problem, robot)
-    console.print(f"ONNX: {written}, {written.stat().st_size / 1e3:.0f} kB; input observation, output action")
+    source = policy if (policy, format) == ("lqr", "c") else policy_path(policy, problem, robot)
+    path = Path("runs") / "export" / f"{file_name(task, robot)}-{Path(policy).stem}.{format}" if out is None else out
+    if format == "c":
+        from ballbot_train.report.c_export import export_c  # it imports torch
+
+        written, how = export_c(source, path, problem, robot), "compiled with -DBALLBOT_TEST it checks itself"
+    else:
+        from ballbot_train.onnx_export import export_onnx  # it imports torch
+
+        written, how = export_onnx(source, path, problem, robot), "input observation, output action"
+    console.print(f"{written}: {written.stat().st_size / 1e3:.0f} kB; {how}")

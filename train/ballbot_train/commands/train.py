@@ -56,9 +56,9 @@ class Run:
     demos: str | None = None
     """Dataset of `ballbot demos`, or the URL of shards."""
     start: Path | None = None
-    """Policy file to train on from; ppo, sac, shac."""
+    """Policy file to train on from."""
     randomization: str | None = None
-    """Track: unknown, late, noisy or real; ppo, shac."""
+    """Track: unknown, late, noisy or real; not sac."""
     history: int = 0
     """Earlier observations and actions that are seen."""
     seed: int = 0

@@ -48,10 +48,18 @@ class Samples:
 class Fit:
     """Fits a policy network to samples: Adam on the weighted mean squared error of its actions."""
 
-    def __init__(self, task: Task, params: BallbotParams, symmetry: RoutedSymmetry, hidden: tuple[int, ...], seed: int):
+    def __init__(
+        self,
+        task: Task,
+        params: BallbotParams,
+        symmetry: RoutedSymmetry,
+        hidden: tuple[int, ...],
+        seed: int,
+        history: int = 0,
+    ):
         """The network starts as LQR if the task ends at rest in an equilibrium, and at zero otherwise."""
         torch.manual_seed(seed)
-        self.network = PolicyNetwork(spec_for(task, symmetry, hidden, linear=True))
+        self.network = PolicyNetwork(spec_for(task, symmetry, hidden, True, history))
         start_as_lqr(self.network, task, params)
         self._optimizer = torch.optim.Adam(self.network.parameters())
 

@@ -2,7 +2,7 @@
 pushes them, or drives an episode.
 
 Everything is in the page: the closed-form model, the tasks' costs, limits and observations, LQR's gains and the policies'
-weights. The model and the tasks are printed as JavaScript from the lines that Python runs; see `javascript`.
+weights. The model and the tasks are printed as JavaScript from the lines that Python runs; see `printed`.
 """
 
 import base64
@@ -27,8 +27,8 @@ from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy_files import BEST, PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
-from ballbot_train.report.javascript import javascript_function
 from ballbot_train.report.page import asset, render, scene_data
+from ballbot_train.report.printed import javascript_function
 
 LARGEST = 2_000_000
 """Bytes that the page may have."""

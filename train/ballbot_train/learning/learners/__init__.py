@@ -37,8 +37,6 @@ class Algorithm:
     """One line for the command line."""
     demonstrations: bool
     """Whether the learner can use demonstrations."""
-    starts: bool
-    """Whether it can start from a policy."""
 
     @property
     def name(self) -> str:
@@ -60,11 +58,9 @@ class Algorithm:
         return table.get(task, table[""])
 
     def check(self, demos: object, start: object) -> None:
-        """Raises a ValueError where demonstrations or a policy to start from are of no use to this learner."""
+        """Raises a ValueError where demonstrations are of no use to this learner, or a policy to start from beside them."""
         if demos is not None and not self.demonstrations:
             raise ValueError(f"{self.name} uses no demonstrations")
-        if start is not None and not self.starts:
-            raise ValueError(f"{self.name} cannot start from a policy; use ppo, sac or shac")
         if demos is not None and start is not None:
             raise ValueError("training starts from demonstrations or from a policy; give one of --demos and --start")
 
@@ -88,8 +84,8 @@ class Algorithm:
             seed: of everything that the learner draws. Its envs get the one that `seeding.spawned` makes of it.
             demos: folder of a dataset of demonstrations, or None.
             start: a policy to train on from, or None; it may be of another robot.
-            randomization: what varies in training, for ppo and shac.
-            history: how many earlier observations and actions the policy sees, for ppo and shac.
+            randomization: what varies in training, for dagger, ppo and shac.
+            history: how many earlier observations and actions the policy sees, for dagger, ppo and shac.
 
         Returns:
             The learner before its first iteration.
@@ -102,10 +98,10 @@ class Algorithm:
             raise ValueError(
                 f"{self.name} does not know the time, on which cost and goal of {task.id} depend; train ppo or sac"
             )
-        given: dict[str, Any] = {"demos": demos} | ({"start": start} if self.starts else {})
+        given: dict[str, Any] = {"demos": demos, "start": start}
         if randomization is not None or history:
-            if self.name not in ("ppo", "shac"):
-                raise ValueError(f"{self.name} knows no randomization and no history; train ppo or shac")
+            if self.name == "sac":
+                raise ValueError("sac knows no randomization and no history; train dagger, ppo or shac")
             given |= {"randomization": randomization, "history": history}
         with load("ballbot_train.weights:own_defaults")():
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
@@ -161,10 +157,8 @@ def check_settings(settings: Any) -> None:
 _HERE = __name__
 
 LEARNERS: dict[str, Algorithm] = {
-    "dagger": Algorithm(
-        f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True, starts=False
-    ),
-    "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True, starts=True),
-    "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True, starts=True),
-    "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False, starts=True),
+    "dagger": Algorithm(f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True),
+    "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True),
+    "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True),
+    "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False),
 }

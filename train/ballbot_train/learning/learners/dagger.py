@@ -19,7 +19,7 @@ too.
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,13 +32,15 @@ from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_baselines.tvlqr import TvlqrController
-from ballbot_gym.batch import BallbotBatch, BatchEpisodes, run_episodes
-from ballbot_gym.params import BallbotParams
+from ballbot_gym import dynamics
+from ballbot_gym.batch import BallbotBatch, BatchEpisodes, BatchState, run_episodes
+from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.paths import then_stay
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry
+from ballbot_train.learning.actors import RoutedSymmetry, check_start, started
 from ballbot_train.learning.datasets import Demos, StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
@@ -167,6 +169,7 @@ TUNED: dict[str, DaggerConfig] = {
 _BETA = 0.8  # share of rollouts that start on the plan and not at its beginning; falls to 0.2 of it
 _HARD_SHARE = 0.25  # of the beginnings of optima found at once: those of many drawn that cost the learner most
 _BATCH_STATES = 32  # of each of these optima that become samples, each with `tube_samples` around it
+_ROBOTS = 16  # of an iteration on a track
 _FINAL_LEARNING_RATE_FRACTION = 0.01
 _MIN_COST = 1.0  # cheaper episodes are weighted as if their optimum cost this much
 
@@ -181,21 +184,26 @@ class Dagger:
         config: DaggerConfig,
         seed: int = 0,
         samples: Samples | StreamedDemos | None = None,
+        randomization: Randomization | None = None,
+        history: int = 0,
     ):
         """Args: samples: the first samples, such as those of demonstrations; default, none.
 
         Raises:
-            ValueError: optima are to be found at once, and this task or robot does not allow it.
+            ValueError: optima are to be found at once, and this task or robot does not allow it; or a track needs that.
         """
+        if randomization is not None and not config.batch_episodes:
+            raise ValueError("on a track, optima are found at once: give --batch-episodes 512")
         if config.batch_episodes and not batched.solves(task, params):
             raise ValueError(
                 f"optima of {task.id} with this robot are not found at once; give --batch-episodes 0, which plans each alone"
             )
-        self.config, self.iteration = config, 0
+        self.config, self.iteration, self._warm = config, 0, False
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
-        self._fit = Fit(task, params, config.symmetry, config.hidden, seed)
-        none = np.zeros((0, len(task.observation_scale)))
+        self._randomization, self._history = randomization, history
+        self._fit = Fit(task, params, config.symmetry, config.hidden, seed, history)
+        none = np.zeros((0, len(task.observation_scale) * (1 + history) + 2 * history))
         self._streamed = samples if isinstance(samples, StreamedDemos) else None
         self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, 2)))
 
@@ -203,9 +211,15 @@ class Dagger:
     def network(self) -> PolicyNetwork:
         return self._fit.network
 
+    def start_from(self, network: PolicyNetwork) -> None:
+        """As of `Shac`."""
+        check_start(network.spec, self.network.spec)
+        self.network.load_state_dict(started(network, self.network.spec).state_dict())
+        self._warm = True
+
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes
-        if routes is not None and self.iteration == 0:
+        if routes is not None and self.iteration == 0 and not self._warm:
             fit_routes(routes, self._task, self._params, self._seed)
         rng = np.random.default_rng([self._seed, self.iteration])
         if self._streamed is not None:  # one shard after the other is in memory
@@ -234,6 +248,8 @@ class Dagger:
 
     def _gather(self, rng: np.random.Generator) -> dict[str, float]:
         """Plans episodes, rolls the learner out, and labels the states that it reaches."""
+        if self._randomization is not None:
+            return self._gather_track(self._randomization, rng)
         if self.config.batch_episodes:
             return self._gather_batch(rng)
         plans = self._planned(rng)
@@ -276,6 +292,104 @@ class Dagger:
         forces = np.concatenate([u, near_u])
         self._samples.add(self._samples_of(np.concatenate([x, near_x]), forces, c[of % len(x0)], costs[of]))
         return {"train/labelled": float(optima.solved.mean())}
+
+    def _gather_track(self, randomization: Randomization, rng: np.random.Generator) -> dict[str, float]:
+        """Labels what the learner sees on robots that it is not told.
+
+        The expert is the optimum of the episode's own robot, from where that will be when a force of now arrives. Half of
+        the episodes follow the expert, the others the learner: from their beginnings, and then, with new optima, from a
+        state that they came to.
+        """
+        task, each = self._task, -(-self.config.batch_episodes // (2 * _ROBOTS))
+        x, c = (
+            np.array(part)
+            for part in zip(*(task.sample(rng, self._params) for _ in range(each * _ROBOTS)), strict=True)
+        )
+        draws = rng.random((_ROBOTS, len(Randomization.DRAWN)))
+        drawn = np.array([randomization.draw(tuple(z), task.control_dt) for z in draws]).repeat(each, axis=0)
+        batch = BallbotBatch(
+            task, len(x), compile=False, params=self._params, randomization=randomization, history=self._history
+        )
+        start = batch.initial_state(
+            int(rng.integers(2**31)), None, *(torch.as_tensor(part.T, dtype=batch.dtype) for part in (x, c))
+        )
+        start = start._replace(drawn=torch.as_tensor(drawn.T, dtype=batch.dtype))
+        robots = [randomization.robot(self._params, tuple(row)) for row in drawn.tolist()]
+        states, lasted, costs = self._labelled_run(batch, start, robots, rng)
+        at = rng.integers(lasted).tolist()
+        reached = (torch.stack([parts[k][..., i] for i, k in enumerate(at)], -1) for parts in zip(*states, strict=True))
+        _, _, again = self._labelled_run(batch, BatchState(*reached), robots, rng, costs)
+        return {"train/labelled": float(np.isfinite([costs, again]).mean())}
+
+    def _labelled_run(
+        self,
+        batch: BallbotBatch,
+        state: BatchState,
+        robots: Sequence[BallbotParams],
+        rng: np.random.Generator,
+        weighted_as: np.ndarray | None = None,
+    ) -> tuple[list[BatchState], np.ndarray, np.ndarray]:
+        """Runs B episodes from a state under expert or learner, and labels what is seen near the optimum of each.
+
+        Returns:
+            The states of all control steps, how many of them each episode lasted (B,), and what the optima cost (B,).
+        """
+        task, limits = self._task, np.array([[robot.force_limit] for robot in robots])
+        c = state.c.T.double().numpy()
+        optima = self._optima_of(robots, self._ahead(batch, state), c)
+        costs = optima.costs if weighted_as is None else np.where(np.isnan(weighted_as), optima.costs, weighted_as)
+        steps = round(self.config.label_seconds / task.control_dt)
+        expert = rng.random((len(robots), 1)) < 0.5
+        states, lasted, running = [], np.zeros(len(robots), int), np.ones(len(robots), bool)
+        seen, labels, weights = [], [], []
+        for k in range(min(steps, task.steps)):
+            states.append(state)
+            lasted += running
+            observation = batch.observe(state)
+            off = self._ahead(batch, state) - optima.states[:, k]
+            change = -np.einsum("bij,bj->bi", optima.gains[:, k], off)
+            label = np.clip((optima.forces[:, k] + change) / limits, -1, 1)
+            near = (np.abs(change) < _SMALL * limits).all(1) & running & optima.solved & (k < optima.steps)
+            seen.append(observation[near])
+            labels.append(label[near])
+            weights.append(1 / np.maximum(costs[near], _MIN_COST))
+            with torch.no_grad():
+                actions = np.where(expert, label, self.network(observation))
+            state, result = batch.transition(state, torch.as_tensor(actions))
+            running &= ~(result.terminated | result.truncated).numpy()
+            if not running.any():
+                break
+        self._samples.add(Samples.of(torch.cat(seen).numpy(), np.concatenate(labels), np.concatenate(weights)))
+        return states, lasted, optima.costs
+
+    def _optima_of(self, robots: Sequence[BallbotParams], x: np.ndarray, c: np.ndarray) -> batched.BatchOptima:
+        """The optima of B episodes, each with its robot, from states x (B, 8) with constants c (B, nc)."""
+        rows: dict[BallbotParams, list[int]] = {}
+        for i, robot in enumerate(robots):
+            rows.setdefault(robot, []).append(i)
+        found = [
+            batched.find_optima(self._task, robot, x[of], c[of], backoff=self.config.backoff)
+            for robot, of in rows.items()
+        ]
+        back = np.argsort(np.concatenate(list(rows.values())))
+        return batched.BatchOptima(
+            **{
+                f.name: np.concatenate([getattr(part, f.name) for part in found])[back]
+                for f in fields(batched.BatchOptima)
+            }
+        )
+
+    def _ahead(self, batch: BallbotBatch, state: BatchState) -> np.ndarray:
+        """(B, 8) where the robots will be when a force of now arrives, after those that are on their way."""
+        x, commands = state.x.unbind(0), state.actuator[2:].unflatten(0, (-1, 2)) if len(state.actuator) > 2 else ()
+        robot: Any = self._params
+        if batch.randomization.varies_robot:
+            robot = ModelNumbers.of(batch.randomization.robot(self._params, state.drawn.unbind(0)))
+        for age in range(len(commands), 0, -1):
+            dt = self._task.control_dt
+            later = dynamics.step(robot, x, commands[age - 1].unbind(0), dt, dynamics.substeps_for(dt))
+            x = tuple(torch.where(state.drawn[5] >= age, new, old) for new, old in zip(later, x, strict=True))
+        return torch.stack(x, 1).double().numpy()
 
     def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Initial states (count, 8) and constants (count, nc); some of them are those of many that cost the learner most."""
@@ -474,9 +588,22 @@ def tube_gains(task: Task, params: BallbotParams, plan: Optimum, c: np.ndarray) 
     return TvlqrController(params, trajectory, dt, q * dt, r * dt, active @ active.T + 1e-3 * np.eye(8)).gains.k
 
 
-def make(task: Task, params: BallbotParams, config: DaggerConfig, seed: int, demos: str | Path | None) -> Dagger:
+def make(
+    task: Task,
+    params: BallbotParams,
+    config: DaggerConfig,
+    seed: int,
+    demos: str | Path | None,
+    start: PolicyNetwork | None = None,
+    randomization: Randomization | None = None,
+    history: int = 0,
+) -> Dagger:
     """Makes the learner; demonstrations, if given, are its first samples. Raises a ValueError where they do not fit."""
     samples: Samples | StreamedDemos | None = None
+    if demos is not None and (randomization is not None or history):
+        raise ValueError(
+            "demonstrations show no past and no track; leave out --demos, or --randomization and --history"
+        )
     if demos is not None and is_set(demos):
         if config.gathering_iterations:
             raise ValueError(f"{demos} is a set of shards, which dagger only clones: give --gathering-iterations 0")
@@ -487,7 +614,10 @@ def make(task: Task, params: BallbotParams, config: DaggerConfig, seed: int, dem
         samples = Samples.of(loaded.observations, loaded.actions, weights)
     elif not config.gathering_iterations:
         raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
-    return Dagger(task, params, config, seed, samples)
+    learner = Dagger(task, params, config, seed, samples, randomization, history)
+    if start is not None:
+        learner.start_from(start)
+    return learner
 
 
 def _median_cost(demos: Demos, task: Task) -> float:

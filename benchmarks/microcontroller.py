@@ -1,0 +1,191 @@
+"""Exported C files here and on a simulated Cortex-M7: the largest error of an action, instructions per step, sizes.
+
+Each controller drives an episode in Python. The C file then gets the same states in the same order. A step is observing and
+acting. QEMU counts one instruction as one nanosecond, and the steps of the episode are counted one by one, each as the mean
+of many repetitions. It needs gcc and Debian's gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm.
+"""
+
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from ballbot_gym import files
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.rollout import rollout
+from ballbot_train.evaluation.controllers import make_controller, policy_path
+from ballbot_train.report.c_export import LQR, export_c
+from ballbot_train.report.printed import c_number
+
+_STRICT = ("-std=c99", "-O2", "-Wall", "-Werror", "-ffunction-sections", "-fdata-sections")
+_ARM = ("arm-none-eabi-gcc", "-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard")
+_LINKED = ("-nostartfiles", "--specs=rdimon.specs", "-Wl,--gc-sections")
+_QEMU = ("qemu-system-arm", "-M", "mps2-an500", "-nographic", "-semihosting-config", "enable=on", "-icount", "shift=0")
+_TICK = 40  # instructions: the board's clock has 25 MHz
+_REPETITIONS = 400
+
+_MAP = """
+ENTRY(reset)
+SECTIONS {
+    . = 0; .text : { KEEP(*(.vectors)) *(.text*) *(.rodata*) } .ARM.exidx : { *(.ARM.exidx*) }
+    . = 0x20000000; .data : { *(.data*) } .bss : { *(.bss*) *(COMMON) } end = .;
+}
+"""
+"""Where the board's memories are."""
+
+_MAIN = """
+#define BALLBOT_HEADER
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <unistd.h>
+#include "controller.c"
+
+static const float constants[] = {%(constants)s}, states[] = {%(states)s}, actions[] = {%(actions)s};
+enum { STEPS = sizeof actions / sizeof *actions / 2 };
+
+static void step(int k, float *action)
+{
+    float observation[BALLBOT_OBSERVATIONS];
+    ballbot_observe(states + 8 * k, constants, k * BALLBOT_CONTROL_DT, observation);
+    ballbot_act(observation, action);
+}
+
+int main(void)
+{
+    float worst = 0, action[2];
+    ballbot_reset();
+    for (int k = 0; k < STEPS; ++k) {
+        step(k, action);
+        for (int i = 0; i < 2; ++i)
+            worst = fmaxf(worst, fabsf(action[i] - actions[2 * k + i]));
+    }
+    printf("%%.9g\\n", (double)worst);
+#ifdef __arm__
+    volatile uint32_t *const timer = (uint32_t *)0xE000E010;
+    timer[1] = 0xFFFFFF;
+    timer[0] = 5; /* on, at the processor's clock */
+    for (int k = 0; k < STEPS; k += STEPS / 20) {
+        const uint32_t before = timer[2];
+        for (int i = 0; i < %(repetitions)d; ++i)
+            step(k, action);
+        printf("%%lu\\n", (unsigned long)((before - timer[2]) & 0xFFFFFF));
+    }
+#endif
+    return 0;
+}
+
+#ifdef __arm__
+void initialise_monitor_handles(void);
+
+void reset(void)
+{
+    *(volatile uint32_t *)0xE000ED88 |= 0xF << 20; /* the floating-point unit */
+    initialise_monitor_handles();
+    main();
+    fflush(stdout);
+    _exit(0);
+}
+
+__attribute__((section(".vectors"), used)) static void *const vectors[] = {(void *)0x20400000, (void *)reset};
+#endif
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One controller. Errors are of actions in [-1, 1]; sizes are of the compiled controller without libm, bytes."""
+
+    task: str
+    controller: str
+    source_bytes: int
+    flash_bytes: int
+    ram_bytes: int
+    error_here: float
+    error_arm: float
+    fewest_instructions: float
+    most_instructions: float
+
+
+def main(
+    controllers: tuple[str, ...] = (
+        "stabilize-lqr",
+        "orbit-ppo",
+        "orbit-sac",
+        "orbit-shac-late",
+        "stabilize-shac",
+        "turn-ppo",
+        "weave-dagger",
+    ),
+    out: Path = Path("runs/microcontroller"),
+) -> None:
+    """Writes OUT/microcontroller.csv.
+
+    Args:
+        controllers: TASK-NAME of lqr and of policies that come with the package.
+        out: folder of the table, and of the code of each controller.
+    """
+    missing = [tool for tool in ("gcc", _ARM[0], _QEMU[0]) if shutil.which(tool) is None]
+    if missing:
+        sys.exit(
+            f"{', '.join(missing)} not found. On Debian: "
+            "apt-get install gcc gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
+        )
+    rows = []
+    for each in controllers:
+        rows.append(_measured(*each.split("-", 1), out / each))
+        print(rows[-1])
+    files.write_csv(out / "microcontroller.csv", [asdict(row) for row in rows])
+
+
+def _measured(task: str, name: str, folder: Path) -> Row:
+    problem = make_task(task)
+    source = export_c(LQR if name == LQR else policy_path(name, problem), folder / "controller.c", problem)
+    files.write(folder / "main.c", _MAIN % {**_episode(task, name), "repetitions": _REPETITIONS})
+    files.write(folder / "board.ld", _MAP)
+
+    def run(*command: str) -> list[str]:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
+        if done.returncode:
+            raise RuntimeError(f"{' '.join(command)}: {done.stderr.strip()[-1000:]}")
+        return done.stdout.split()
+
+    run("gcc", *_STRICT, "main.c", "controller.c", "-o", "here", "-lm")
+    run(*_ARM, *_STRICT, "-c", "controller.c", "-o", "controller.o")
+    run(*_ARM, *_STRICT, "main.c", "controller.o", "-T", "board.ld", *_LINKED, "-o", "board.elf", "-lm")
+    code, data, bss = (int(size) for size in run("arm-none-eabi-size", "controller.o")[6:9])
+    error, *ticks = run(*_QEMU, "-kernel", "board.elf")
+    instructions = [_TICK * int(tick) / _REPETITIONS for tick in ticks]
+    return Row(
+        task,
+        name,
+        source.stat().st_size,
+        code + data,
+        data + bss,
+        float(run("./here")[0]),
+        float(error),
+        min(instructions),
+        max(instructions),
+    )
+
+
+def _episode(task: str, name: str) -> dict[str, str]:
+    """Constants and states of an episode, in float32, and the actions of Python's controller there."""
+    params = default_params()
+    controller = make_controller(name, make_task(task), params)
+    episode = rollout(BallbotEnv(task, physics="rk4"), controller, seed=1)
+    c, states = episode.constants.astype(np.float32), episode.trajectory.x[:-1].astype(np.float32)
+    controller.reset(0.0, states[0], c)
+    dt = make_task(task).control_dt
+    forces = np.array([controller.act(k * dt, x) for k, x in enumerate(states)])
+    arrays = {"constants": np.append(c, 0), "states": states, "actions": (forces / params.force_limit).clip(-1, 1)}
+    return {key: ", ".join(c_number(value) for value in array.ravel()) for key, array in arrays.items()}
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,130 @@
+"""Controllers as C files: compiled, they act as Python's do, and drive the same episodes to the same ends."""
+
+import ctypes
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from ballbot_gym import certified, machine_code
+from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.params import default_params
+from ballbot_gym.rollout import rollout
+from ballbot_train.commands.export import export
+from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.policy import SHIPPED, PolicyController, PolicyNetwork, PolicySpec, save_policy
+from ballbot_train.report.c_export import LARGEST_ERROR, LQR, export_c
+
+COMPILER = machine_code.compiler()
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic")
+SHIPPED_NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
+
+
+def built(source, made, *flags):
+    subprocess.run([COMPILER, *STRICT, *flags, str(source), "-o", str(made), "-lm"], check=True)
+    return made
+
+
+class Compiled:
+    """A C file as a Controller that compares its forces with those of Python's controller on the way."""
+
+    def __init__(self, source, task, python):
+        self._code = ctypes.CDLL(str(built(source, source.with_suffix(".so"), "-fPIC", "-shared")))
+        self._python, self._limit, self.error = python, default_params().force_limit, 0.0
+        self._observation = np.zeros(len(task.observation_scale), np.float32)
+
+    def reset(self, t, x, c):
+        self._c = np.array([*c, 0.0], np.float32)  # ctypes has no pointer to nothing
+        self._code.ballbot_reset()
+        self._python.reset(t, x, c)
+
+    def act(self, t, x):
+        action = np.zeros(2, np.float32)
+        state, constants, seen, found = (
+            part.ctypes.data_as(ctypes.c_void_p) for part in (x.astype(np.float32), self._c, self._observation, action)
+        )
+        self._code.ballbot_observe(state, constants, ctypes.c_float(t), seen)
+        self._code.ballbot_act(seen, found)
+        expected = np.clip(self._python.act(t, x) / self._limit, -1, 1)
+        self.error = max(self.error, float(np.abs(action - expected).max()))
+        return self._limit * action.astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("task", "name"),
+    [
+        ("stabilize", "lqr"),
+        ("turn", "ppo"),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (("stabilize", "sac"), ("orbit", "sac"), ("weave", "ppo"))
+        ),
+    ],
+)
+def test_a_compiled_controller_drives_certified_episodes_to_the_same_ends(task, name, tmp_path):
+    made = make_controller(name, make_task(task), default_params())
+    export(name, task=task, format="c", out=tmp_path / "controller.c")
+    task = make_task(task)
+    compiled = Compiled(tmp_path / "controller.c", task, made)
+    env, episodes = BallbotEnv(task, physics="rk4"), certified.load(task, default_params())
+    ends = []
+    for i in range(20):
+        driven, own = (rollout(env, each, options=episodes.options(i)) for each in (compiled, made))
+        ends.append(driven.success)
+        assert (driven.success, driven.failure) == (own.success, own.failure)
+    assert any(ends)
+    assert compiled.error < LARGEST_ERROR
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "orbit-shac-late" else pytest.mark.slow) for name in SHIPPED_NAMES]
+)
+def test_every_shipped_policy_passes_the_test_in_its_file(name, tmp_path):
+    task, *others, learner = name.split("-")
+    if learner in ("late", "unknown"):
+        others, learner = [], f"{others[-1]}-{learner}"
+    export(learner, task=task, format="c", out=tmp_path / "policy.c", robot=others[0] if others else "paper")
+    told = subprocess.run([built(tmp_path / "policy.c", tmp_path / "policy", "-DBALLBOT_TEST")], capture_output=True)
+    assert told.returncode == 0
+    assert told.stdout.startswith(b"PASS")
+
+
+@pytest.mark.parametrize(
+    ("task", "fields"),
+    [
+        ("orbit", {"frame": "radial", "squash": "tanh_in_frame", "centred": True, "history": 2}),
+        ("weave", {"frame": "fine_slalom", "squash": "clip", "centred": True, "activation": "relu"}),
+        ("weave", {"frame": "routed_slalom", "routes": (8,), "activation": "silu"}),
+        ("stabilize", {"mirrors": True, "odd": True, "linear": False, "squash": "clip", "history": 3}),
+    ],
+)
+def test_all_that_a_policy_can_do_is_in_the_file(task, fields, tmp_path):
+    task = make_task(task)
+    if fields.pop("mirrors", False):
+        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
+    torch.manual_seed(0)
+    network = PolicyNetwork(PolicySpec.of(task, hidden=(8, 6), **fields))
+    torch.nn.init.normal_(network.mlp[-1].weight)
+    policy = save_policy(tmp_path / "mine", network, {"training": {"learner": "a */ b *\\\n/ c"}})
+    source = export_c(policy, tmp_path / "mine.c", task)
+    compiled = Compiled(source, task, PolicyController(task, default_params(), network))
+    rollout(BallbotEnv(task, physics="rk4"), compiled, seed=1)
+    assert compiled.error < LARGEST_ERROR
+
+
+def test_the_declarations_alone_can_be_included(tmp_path):
+    export_c(LQR, tmp_path / "lqr.c", make_task("stabilize"))
+    main = tmp_path / "main.c"
+    main.write_text(
+        '#define BALLBOT_HEADER\n#include "lqr.c"\n'
+        "int main(void) { float state[8] = {1}, seen[BALLBOT_OBSERVATIONS], action[2]; ballbot_reset();\n"
+        "    ballbot_observe(state, 0, 0, seen); ballbot_act(seen, action); return action[0] > 0 ? 0 : 1; }\n"
+    )
+    subprocess.run([built(main, tmp_path / "main", str(tmp_path / "lqr.c"))], check=True)
+
+
+def test_lqr_that_differs_from_episode_to_episode_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="export a policy"):
+        export_c(LQR, tmp_path / "lqr.c", make_task("turn"))

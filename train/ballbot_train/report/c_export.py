@@ -1,0 +1,177 @@
+"""Policies and LQR as one C99 file, for microcontrollers: no malloc, no library but math.h, single precision.
+
+`PolicyNetwork` says what is computed. Its frame, routes and steady motion, and the task's observation, are traced and printed
+from the lines that Python runs; see `printed`.
+"""
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import casadi
+import jinja2
+import numpy as np
+import torch
+
+from ballbot_baselines.lqr import equilibrium_gain
+from ballbot_gym import files
+from ballbot_gym.env import BallbotEnv
+from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.rollout import rollout
+from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.symmetry import REACH
+from ballbot_train.escaping import printable
+from ballbot_train.onnx_export import metadata
+from ballbot_train.policy import PolicyController, PolicyError, PolicyNetwork, PolicySpec, load_network
+from ballbot_train.report.printed import c_function, c_number
+from ballbot_train.weights import own_defaults
+
+LQR = "lqr"
+"""What is exported by this name is LQR, and no policy's file."""
+
+LARGEST_ERROR = 1e-5
+"""Of an action in the file's own test; float32 differs from Python by less."""
+
+_TEST_STEPS = 16
+
+
+@own_defaults()
+def export_c(policy: str | Path, path: str | Path, task: Task, robot: str = PAPER) -> Path:
+    """Writes a policy, or LQR, as a C file that observes and acts; its first lines say how to use it.
+
+    Args:
+        policy: the policy's file, or "lqr" for a task whose LQR has one gain for all episodes.
+        path: of the C file.
+        task: what the policy was made for.
+        robot: by name.
+
+    Raises:
+        PolicyError: as `load_network`; or the policy's actions are not finite.
+        ValueError: the task's LQR depends on the episode; or a frame or an observation cannot be printed.
+    """
+    if policy == LQR:
+        network, about = lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
+    else:
+        network, about = load_network(policy, task, robot).eval(), metadata(policy, task, robot)
+    return files.write(path, _source(network, about, task, robot))
+
+
+def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
+    """LQR about the equilibrium in which a task ends, as a policy of one layer.
+
+    Raises:
+        ValueError: the task ends in none.
+    """
+    found = equilibrium_gain(task, named_robot(robot))
+    if found is None:
+        raise ValueError(f"LQR of {task.id} has other gains in each episode, so no C file can hold it; export a policy")
+    network = PolicyNetwork(PolicySpec.of(task, robot=robot, hidden=(), linear=False, odd=True, squash="clip"))
+    gain = np.zeros((2, len(task.observation_scale)))
+    gain[:, :8] = found[0]
+    network.load_state_dict({"mlp.0.weight": torch.as_tensor(gain)})
+    return network.eval()
+
+
+def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str) -> str:
+    spec = network.spec
+    networks = {
+        "mlp": _layers(network.mlp),
+        "linear": _layers([network.linear]),
+        "routes": [] if network.routes is None else _layers(network.routes.mlp),
+    }
+    inputs = networks["mlp"][0][0].shape[1]
+    seen = spec.observations + spec.history * (spec.observations + 2)
+    if network.routes is not None:
+        seen += network.routes.route.obstacles
+    signs = [[*signs, *(spec.history * (*signs, *action)), *action] for signs, action in spec.mirrors]
+    templates = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "assets"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    needed = "needed" if spec.squash == "tanh" else f"needed / {c_number(REACH)}"
+    return templates.get_template("controller.c.j2").render(
+        about=_comment(about),
+        observations=spec.observations,
+        constants=task.constant_names,
+        force_limit=c_number(named_robot(robot).force_limit),
+        dt=c_number(task.control_dt),
+        seen=seen,
+        inputs=inputs,
+        widest=max(weight.shape[0] for layers in networks.values() for weight, _ in layers),
+        networks=networks,
+        functions=_functions(network, task, seen, inputs),
+        activation=spec.activation,
+        history=spec.history,
+        frame=spec.frame,
+        centred=spec.centred,
+        squash=spec.squash,
+        unsquashed=f"atanhf(fmaxf(fminf({needed}, 0.999f), -0.999f))",
+        reach=c_number(REACH),
+        mirrors=_numbers(np.array(signs)),
+        mirror_count=len(signs),
+        test=_test(network, task, robot),
+        largest_error=c_number(LARGEST_ERROR),
+        numbers=_numbers,
+    )
+
+
+def _functions(network: PolicyNetwork, task: Task, seen: int, inputs: int) -> list[str]:
+    """The printed functions that the template calls."""
+    split = casadi.vertsplit
+    own = {"o": network.spec.observations}
+    functions: dict[str, tuple[Any, dict[str, int]]] = {
+        "observed": (
+            lambda x, c, t: task.observe(tuple(split(x)), task.at(tuple(split(c)), t)),
+            {"x": 8, "c": len(task.constant_names), "t": 1},
+        )
+    }
+    if network.spec.frame is not None:
+        functions["features"] = (lambda o: network.features(tuple(split(o)))[0], {"o": seen})
+        functions["back"] = (lambda o, a: network.features(tuple(split(o)))[1]((a[0], a[1])), {"o": seen, "a": 2})
+    if network.spec.centred:
+        functions["kept"] = (lambda f: sum(network.kept(tuple(split(f))), ()), {"f": inputs})
+    if network.routes is not None:
+        route = network.routes.route
+        functions["layout"] = (lambda o: route.layout(tuple(split(o))), own)
+        functions["chosen_sides"] = (
+            lambda o, farther: route.sides(tuple(split(o)), tuple(split(farther))),
+            {**own, "farther": route.obstacles},
+        )
+    return [c_function(name, *function) for name, function in functions.items()]
+
+
+def _layers(modules: Any) -> list[tuple[np.ndarray, np.ndarray | None]]:
+    """Weights and biases of the linear layers among modules."""
+    return [
+        (layer.weight.detach().numpy(), None if layer.bias is None else layer.bias.detach().numpy())
+        for layer in modules
+        if isinstance(layer, torch.nn.Linear)
+    ]
+
+
+def _test(network: PolicyNetwork, task: Task, robot: str) -> dict[str, np.ndarray]:
+    """States of an episode under the policy, as float32, and the actions that it takes there one after the other."""
+    params = named_robot(robot)
+    controller = PolicyController(task, params, network)
+    episode = rollout(BallbotEnv(task, physics="rk4", robot=robot), controller, seed=0)
+    trajectory = episode.trajectory
+    k = np.linspace(0, len(trajectory.u) - 1, _TEST_STEPS).astype(int)
+    states, times = trajectory.x[k].astype(np.float32), (k * task.control_dt).astype(np.float32)
+    c = episode.constants.astype(np.float32)
+    controller.reset(0.0, states[0], c)
+    actions = np.array([controller.act(float(t), x) for t, x in zip(times, states, strict=True)]) / params.force_limit
+    if not np.isfinite(actions).all():
+        raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it anew")
+    return {"constants": c if c.size else np.zeros(1), "states": states, "times": times, "actions": actions}
+
+
+def _numbers(values: np.ndarray) -> str:
+    """Numbers as C lists them."""
+    return textwrap.fill(", ".join(c_number(value) for value in values.ravel()), 120)
+
+
+def _comment(about: dict[str, str]) -> str:
+    """Lines of a C comment, which no text from a file can end."""
+    return printable("\n".join(f"{name}: {value}" for name, value in about.items())).replace("*", "×")
