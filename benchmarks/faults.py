@@ -107,9 +107,7 @@ def _train(learner: str, words: str) -> Command:
 
 
 COMMANDS = {
-    "benchmark": _command(
-        "benchmark --tasks turn stabilize --controllers lqr --episodes 20 --physics rk4 --runs none", _episodes
-    ),
+    "benchmark": _command("benchmark --tasks turn stabilize --controllers lqr --episodes 20 --physics rk4", _episodes),
     "robustness": _command(
         "robustness --tasks turn --controllers lqr --stresses delay mass --episodes 6 --physics rk4", _episodes
     ),

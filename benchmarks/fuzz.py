@@ -164,24 +164,6 @@ def _sb3_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type,
     )
 
 
-def _rsl_model(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    import torch
-
-    from ballbot_gym.env import make_task
-    from ballbot_gym.params import default_params
-    from ballbot_train.policy_files import PolicyError
-    from ballbot_train.saved_models import load_actor
-
-    task = make_task("turn")
-    layers = {"0": (8, len(task.observation_scale)), "2": (2, 8)}
-    weights = {f"mlp.{i}.weight": torch.ones(shape) for i, shape in layers.items()}
-    biases = {f"mlp.{i}.bias": torch.ones(shape[0]) for i, shape in layers.items()}
-    path = folder / "model_1.pt"
-    torch.save({"actor_state_dict": weights | biases, "iter": 1}, path)
-    path.with_suffix(".json").write_text(json.dumps({"activation": "elu"}))
-    return [path, path.with_suffix(".json")], lambda: load_actor(path, task, default_params()), (PolicyError,)
-
-
 def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_train.evaluation.results import Result, leaderboard, read_results, write_leaderboard
 
@@ -189,18 +171,9 @@ def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, .
     write_leaderboard(leaderboard(made), made, {"commit": "a"}, folder)
 
     def read() -> None:
-        for path in (folder / "leaderboard.json", folder / "episodes.csv"):
-            leaderboard(read_results(path)[1] or made)
+        leaderboard(read_results(folder)[1] or made)
 
-    return [folder / "leaderboard.json", folder / "episodes.csv"], read, (ValueError,)
-
-
-def _basins(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
-    from ballbot_train.evaluation.basins import recovered_fractions
-
-    path = folder / "basins.json"
-    path.write_text(json.dumps({"rows": [{"task": "stabilize", "controller": "lqr", "recovered": 0.5}] * 3}))
-    return [path], lambda: recovered_fractions(folder), ()
+    return [folder / "leaderboard.json"], read, (ValueError,)
 
 
 def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
@@ -262,9 +235,7 @@ READERS = {
     "urdf": _urdf,
     "policy": _policy,
     "saved model of Stable-Baselines3": _sb3_model,
-    "saved model of rsl_rl": _rsl_model,
     "results": _results,
-    "basins": _basins,
     "marker": _marker,
     "job entries": _entries,
     "demonstrations": _demos,

@@ -146,7 +146,6 @@ def measure(
         failures=sum(score.failure != "" for score in playground.scores),
     )
     watcher.terminate()
-    page.close()
     viewer.close()
     playground.close()
     for name, value in asdict(result).items():

@@ -1,3 +1,4 @@
+import json
 import math
 
 import numpy as np
@@ -89,24 +90,13 @@ def test_lqr_recovers_upright_and_slow_but_not_fast(robot, bounds, tmp_path):
     assert recovered == {(1, 1): True, (2, 1): False}  # 0 and 15 m/s
 
 
-def test_maps_are_read_back_as_they_were_written_and_drawn(bounds, tmp_path):
+def test_maps_are_written_and_drawn(bounds, tmp_path):
     maps = basins.maps_of(bounds, [entry(2, 2, True), entry(2, 1, True, "lean rate")], ["lqr"], 5)
     basins.write(maps, {"commit": "none", "robot": "rolling"}, tmp_path)
-    for wrote, read in zip(maps, basins.read(tmp_path), strict=True):
-        np.testing.assert_array_equal(wrote.recovered["lqr"], read.recovered["lqr"])
-        np.testing.assert_array_equal(wrote.boundary, read.boundary)
-    assert basins.recovered_fractions(tmp_path, "rolling") == ({("stabilize", "lqr"): pytest.approx(3 / 30)}, "")
-    assert basins.recovered_fractions(tmp_path) == ({}, "")  # of the paper's robot
-    assert basins.recovered_fractions(tmp_path / "nowhere") == ({}, "")
+    written = json.loads((tmp_path / "basins.json").read_text())
+    assert written["rows"][0]["recovered"] == pytest.approx(3 / 30)
+    assert [entry["recovered"] for entry in written["maps"]] == [
+        {"lqr": basin.recovered["lqr"].astype(int).tolist()} for basin in maps
+    ]
     assert len((tmp_path / "basins.csv").read_text().splitlines()) == 1 + 2 * 25
     assert figures.save(figures.basin_figure(maps), tmp_path / "basins.png").exists()
-
-
-@pytest.mark.parametrize(
-    "content", ["", "{", "[]", '{"about": []}', '{"about": {}}', '{"rows": [{"task": "stabilize"}]}', "[" * 100_000]
-)
-def test_damaged_maps_are_named_and_no_error(content, tmp_path):
-    (tmp_path / "basins.json").write_text(content)
-    fractions, why = basins.recovered_fractions(tmp_path)
-    assert fractions == {}
-    assert f"{tmp_path / 'basins.json'} is damaged" in why

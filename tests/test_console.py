@@ -1,19 +1,16 @@
 """What the commands print: progress into a pipe, and marks of times that a busy machine spoils."""
 
 import io
-import math
 import re
 import subprocess
 import sys
 import time
 
 import pytest
-from builders import result
 from rich.console import Console
 
-from ballbot_train import console, provenance
+from ballbot_train import console
 from ballbot_train.escaping import PlainConsole
-from ballbot_train.evaluation.results import HEADER, cells, summarize
 
 
 def test_progress_into_a_pipe_is_a_line_for_every_bar_that_is_not_full(monkeypatch):
@@ -55,26 +52,6 @@ def test_names_neither_rewrite_the_screen_nor_turn_it_around(monkeypatch):
     assert text.count("\\x1b[31m\\u202egnp\\udc80") >= 3
     assert "[red]" in text
     assert ":smile:" in text
-
-
-@pytest.mark.parametrize(
-    ("start", "workers", "end", "busy"),
-    [(0.1, 4, 4.5, False), (3.0, 4, 4.0, True), (0.0, 1, 6.0, True), (math.nan, 4, math.nan, False)],
-)
-def test_a_machine_with_more_to_do_than_cores_is_busy(start, workers, end, busy, monkeypatch):
-    monkeypatch.setattr(provenance.os, "cpu_count", lambda: 4)
-    monkeypatch.setattr(provenance, "load", lambda: end)
-    facts = provenance.load_facts(start, workers)
-    assert facts["busy"] is busy
-    assert facts["load_end"] == (None if math.isnan(end) else end)
-
-
-def test_times_of_a_busy_machine_are_marked():
-    row = summarize([result(episode=i) for i in range(3)])
-    quiet, busy = cells(row), cells(row, busy=True)
-    changed = [name for name, a, b in zip(HEADER, quiet, busy, strict=True) if a != b]
-    assert changed == ["plan", "per step"]
-    assert busy[-1] == f"~{quiet[-1]}"
 
 
 IMPORTED = "from ballbot_gym.engines.bullet_client import import_pybullet; import_pybullet(); print('imported')"

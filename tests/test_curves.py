@@ -9,7 +9,7 @@ import pytest
 
 from ballbot_gym import files
 from ballbot_train.commands.curves import curves
-from ballbot_train.commands.train import train
+from ballbot_train.commands.train import Run, train
 from ballbot_train.learning import seeds
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.report import curves as report
@@ -119,12 +119,12 @@ def test_a_queue_trains_each_seed_in_a_folder_of_its_own_and_does_only_what_is_m
     calls, fails = processes
     fails.add("1")
     with pytest.raises(ValueError, match=r"seeds 1 did not finish \(exit status 1: seed 1 says\)"):
-        train("dagger", seeds="0:3", out=tmp_path, workers=2)
+        train("dagger", Run(seeds="0:3", out=tmp_path, workers=2))
     assert sorted(words[words.index("--seed") + 1] for words in calls) == ["0", "1", "2"]
     assert all("--resume" in words for words in calls)
     fails.clear()
     calls.clear()
-    train("dagger", seeds="0:3", out=tmp_path)
+    train("dagger", Run(seeds="0:3", out=tmp_path))
     assert [words[words.index("--out") + 1] for words in calls] == [str(tmp_path / "seed-1")]
     printed = " ".join(capsys.readouterr().out.split())
     assert "91.0% │ 1 │ 10.00% │ 1.0" in printed  # the median
@@ -138,6 +138,6 @@ def test_a_seed_that_fails_everywhere_is_the_worst():
 
 
 def test_a_queue_is_not_mixed_with_runs_of_other_settings(processes, tmp_path):
-    train("dagger", seeds="0:1", out=tmp_path)
+    train("dagger", Run(seeds="0:1", out=tmp_path))
     with pytest.raises(ValueError, match="holds a run of settings"):
-        train("dagger", seeds="0:1", out=tmp_path, settings=LEARNERS["dagger"].settings("weave"))
+        train("dagger", Run(seeds="0:1", out=tmp_path), LEARNERS["dagger"].settings("weave"))

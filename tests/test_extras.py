@@ -61,7 +61,7 @@ def test_a_command_without_the_library_of_commands_names_its_extra():
 
 EXTRAS = (
     *("casadi", "scipy", "matplotlib", "torch", "stable_baselines3", "minari", "tyro", "rich", "filelock"),
-    *("tensorboard", "safetensors", "jinja2", "plotly", "imageio", "h5py"),
+    *("tensorboard", "safetensors", "jinja2", "imageio", "h5py"),
 )
 """What the extras bring."""
 

@@ -161,7 +161,7 @@ def test_what_does_not_act_is_refused():
         evaluate_fresh(3, "turn", 1)
     with pytest.raises(ValueError, match="trajopt is an expert"):
         evaluate_fresh("trajopt", "turn", 1)
-    with pytest.raises(ValueError, match="unknown policy 'apg'"):
+    with pytest.raises(ValueError, match="unknown controller 'apg'"):
         evaluate_fresh("apg", "turn", 1)
 
 

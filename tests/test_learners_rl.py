@@ -12,6 +12,7 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
+from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.frames import demos_in_frame
@@ -281,7 +282,8 @@ def test_demonstrations_in_a_frame_lead_back_to_the_same_actions(rng):
 
 
 def test_training_envs_never_end_together():
-    env = TrainingEnv(make_task("stabilize", max_tilt=1.5), default_params(), 5, 0.4, 0.1)
+    batch = CurriculumBatch(make_task("stabilize", max_tilt=1.5, duration=0.4), 5, default_params())
+    env = TrainingEnv(batch, 0.1)
     env.seed(0)  # no robot falls with this seed
     env.reset()
     ends = [env.step(np.zeros((5, 2)))[2].sum() for _ in range(20)]

@@ -3,13 +3,12 @@
 import math
 import os
 import signal
-import threading
 import time
-from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
-import torch
+from stable_baselines3 import PPO
 
 from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified, dynamics
@@ -20,9 +19,7 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play import crew, views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import LATE, Clock
-from ballbot_train.play.driving import DRIVE_SPEED, Stick
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
-from ballbot_train.play.tunable import Tunable, weight_names
 from ballbot_train.policy_files import BEST
 
 STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes to rest, and falls at 0.40 s
@@ -95,7 +92,7 @@ def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shippe
 def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
     if physics == "bullet":
         pytest.importorskip("pybullet")
-    playground = play(episode="rest", controller="you (force)", physics=physics)
+    playground = play(episode="rest", controller="lqr", physics=physics)
     playground.push(60.0, 30.0)
     go(playground, 0.02)
     expected = dynamics.step(params, dynamics.pushed(params, (0.0,) * 8, (60.0, 30.0)), (0.0, 0.0), 0.02)
@@ -103,7 +100,7 @@ def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
 
 
 def test_ghosts_get_the_same_start_and_the_same_pushes(play):
-    playground = play(controller="you", ghosts=["lqr"])
+    playground = play(controller="shac", ghosts=["lqr"])
     alone = play(controller="lqr")
     for each in (playground, alone):
         each.push(3.0, -2.0)
@@ -117,7 +114,7 @@ def test_controllers_change_without_a_jump(play):
     playground = play()
     go(playground, 0.5)
     states = [playground.main.x]
-    for name in ("you", "lqr"):
+    for name in ("shac", "lqr"):
         playground.set_controller(name)
         assert playground.step()  # under the old one
         states.append(playground.main.x)
@@ -158,16 +155,7 @@ def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
     assert views.drawing(playground).paths[-1].name in ("plan", "robot")
 
 
-def test_lqr_reacts_to_a_weight(play):
-    playground = play()
-    before = playground.main.controller.act(0.0, np.ones(8))
-    playground.set_weight("effort_weight", 5e-3)
-    playground.settle()
-    after = playground.main.controller.act(0.0, np.ones(8))
-    assert np.abs(after).max() < 0.9 * np.abs(before).max()
-    playground.set_weight("effort_weight", playground.world.base.effort_weight)
-    playground.settle()
-    np.testing.assert_allclose(playground.main.controller.act(0.0, np.ones(8)), before)
+# --- what the user changes ---
 
 
 def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
@@ -181,30 +169,13 @@ def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
 
 
-def test_a_human_drives_the_robot_that_balances_itself(play):
-    playground = play(controller="you")
-    go(playground, 2.0)
-    playground.stick.move(1.0, 0.0)
-    go(playground, 3.0)
-    assert playground.main.x[4] == pytest.approx(DRIVE_SPEED, rel=0.05)
-    assert abs(playground.main.x[5]) < 0.1
-
-
-def test_the_score_of_a_human_is_a_regret(play):
-    playground = play(controller="you (force)", episode=0)
+def test_the_score_of_a_robot_that_falls_is_a_regret(play):
+    playground = play(episode=FALLING)
     while not playground.scores:
         playground.step()
     (score,) = playground.scores
     assert score.failure == "tilt"
     assert score.regret == pytest.approx(score.cost / playground.optimum_cost - 1)
-
-
-def test_a_stick_reaches_no_farther_than_one():
-    stick = Stick()
-    stick.move(30.0, 40.0)
-    assert stick.value == pytest.approx((0.6, 0.8))
-    stick.move(math.nan, 1.0)
-    assert stick.value == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(("physics", "seed"), [("rk4", 0), ("bullet", 1)])
@@ -223,16 +194,20 @@ def test_an_episode_of_another_robot_is_that_of_the_env(play, no_optimum, seed, 
 
 
 def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, no_optimum):
-    playground = play(controller="lqr", ghosts=["you", "shac"])
+    playground = play(controller="lqr", ghosts=["shac"])
     playground.set_robot("kugle")
     playground.settle()
     assert playground.step()
-    assert (playground.world.robot, playground.main.wanted, playground.crew.ghosts) == ("kugle", "lqr", ("you",))
+    assert (playground.world.robot, playground.main.wanted, playground.crew.ghosts) == ("kugle", "lqr", ())
     assert playground.world.params.total_mass == pytest.approx(1.478 + 16.154)
     playground.set_task("orbit")
     playground.settle()
     assert playground.step()
-    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == ("orbit", "lqr", ("you",))
+    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == (
+        "orbit",
+        "lqr",
+        (),
+    )
 
 
 def test_no_push_harms(play):
@@ -253,9 +228,6 @@ WRONG = [
     (lambda p: p.set_controller("nobody"), "unknown controller 'nobody'"),
     (lambda p: p.set_controller("nowhere/policy.json"), "unknown controller"),
     (lambda p: p.set_ghosts(["nobody"]), "unknown controller 'nobody'"),
-    (lambda p: p.set_weight("nothing", 1.0), "unknown weight nothing"),
-    (lambda p: p.set_weight("effort_weight", math.nan), "effort_weight must be"),
-    (lambda p: p.set_weight("effort_weight", -1.0), "effort_weight must be"),
     (lambda p: p.set_plant("mass", math.nan), "mass must be -50 to 100"),
     (lambda p: p.set_plant("mass", 1e9), "mass must be -50 to 100"),
     (lambda p: p.set_plant("weather", 1.0), "unknown change weather"),
@@ -274,10 +246,10 @@ def test_wrong_input_is_refused_and_the_robot_goes_on(play):
 
 @pytest.fixture
 def saved_model(tmp_path):
-    """A checkpoint as rsl_rl writes it, of an actor that commands nothing."""
-    path = tmp_path / "mine.pt"
-    torch.save({"actor_state_dict": {"mlp.0.weight": torch.zeros(2, 8), "mlp.0.bias": torch.zeros(2)}}, path)
-    path.with_suffix(".json").write_text('{"activation": "elu"}')
+    """A model as Stable-Baselines3 writes it."""
+    path = tmp_path / "mine.zip"
+    env = gymnasium.make("BallbotStabilize-v0", physics="rk4")
+    PPO("MlpPolicy", env, n_steps=2, batch_size=2, device="cpu").save(path)
     return str(path)
 
 
@@ -321,32 +293,14 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
     assert "LQR does instead" in playground.crew.notice
 
 
-def test_what_happened_can_be_saved_replayed_and_optimized(play, tmp_path):
-    playground = play(ghosts=["you"])
+# --- what is kept ---
+
+
+def test_what_happened_can_be_saved(play, tmp_path):
+    playground = play(ghosts=["shac"])
     go(playground, 0.5)
     path = playground.trajectory().save(tmp_path / "played.npz")
     np.testing.assert_array_equal(Trajectory.load(path).x[-1], playground.main.x)
-    replay = views.replay(playground)
-    assert [take.label for take in replay.takes] == ["LQR", "you"]
-    command = views.optimize_command(playground).split()
-    assert command[:4] == ["ballbot", "optimize", "stabilize", "--state"]
-    assert [float(value) for value in command[4:]] == pytest.approx(playground.main.x, rel=1e-8)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_a_tunable_task_costs_what_the_task_with_these_weights_costs(task, params, rng):
-    base = TASKS[task]()
-    name = weight_names(base)[0]
-    heavier = replace(base, **{name: 3 * getattr(base, name)})
-    tunable = Tunable.of(base)
-    x, c = base.sample(rng, params)
-    u = rng.uniform(-100, 100, 2)
-    full = tunable.constants(c, {name: getattr(heavier, name)})
-    assert tunable.cost(x, u, full) == pytest.approx(heavier.cost(x, u, c))
-    assert tunable.cost(tuple(x), tuple(u), tuple(full)) == pytest.approx(heavier.cost(x, u, c))
-    assert tunable.margins(x, full) == pytest.approx(base.margins(x, c))
-    np.testing.assert_array_equal(tunable.observe(x, full), base.observe(x, c))
-    assert tunable.steps == base.steps
 
 
 class Watch:
@@ -383,24 +337,6 @@ def test_a_short_hold_up_is_caught_up_and_a_long_one_is_given_up():
     assert sum(clock.take() for _ in range(50)) == 1
     assert clock.timing.real_time_factor < 0.05
     assert LATE == 0.02
-
-
-def test_while_a_slider_moves_only_its_last_value_is_worked_on(play, monkeypatch):
-    playground, hold, made = play(), threading.Event(), []
-
-    def slow(task, params):
-        made.append(task)
-        assert hold.wait(10)
-        return lqr(task, params)
-
-    lqr = CONTROLLERS["lqr"]
-    monkeypatch.setitem(CONTROLLERS, "lqr", slow)
-    for k in range(1, 10):
-        playground.set_weight("effort_weight", k * playground.world.base.effort_weight)
-    hold.set()
-    playground.settle()
-    assert len(made) <= 2  # the first, which was begun, and the last
-    assert playground.world.weights["effort_weight"] == pytest.approx(9 * playground.world.base.effort_weight)
 
 
 def test_another_process_computes_and_is_started_anew_after_it_was_killed():

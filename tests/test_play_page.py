@@ -13,7 +13,6 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ballbot_gym.trajectory import Trajectory
@@ -44,7 +43,6 @@ class Opened:
         self.page.stop()
         self.thread.join(10)
         assert not self.thread.is_alive()
-        self.page.close()
         self.viewer.close()
         self.playground.close()
 
@@ -86,17 +84,14 @@ def quiet(capfd):
 def test_controls_change_the_playground(opened, visitor):
     visitor.change("Masses, %", 50.0)
     visitor.change("Speed", 2.0)
-    visitor.change("effort × 10^", 1.0)
-    visitor.change("Controller", "you")
+    visitor.change("Controller", "SHAC")
     visitor.change("At the end", "again")
     visitor.change("Certified episode", 7)
     playground = opened.playground
     wait_for(lambda: playground.episode == 7)
     assert playground.plant["mass"] == 50.0
     assert opened.page.clock.speed == 2.0
-    weight = playground.world.base.effort_weight
-    assert playground.world.weights["effort_weight"] == pytest.approx(10 * weight)
-    assert playground.main.wanted == "you"
+    assert playground.main.wanted == "shac"
     assert playground.at_end == "again"
     visitor.change("All as the controllers believe")
     wait_for(lambda: playground.plant["mass"] == 0.0 == visitor.value("Masses, %"))
@@ -145,31 +140,12 @@ def test_who_watches_changes_nothing_until_he_takes_over(opened, visitor):
     wait_for(lambda: opened.page.clock.speed == 1.0)
 
 
-def test_dragging_pushes_where_a_controller_acts_and_steers_where_a_human_drives(opened, visitor):
+def test_dragging_pushes(opened, visitor):
     opened.goes_on()
     for phase in ("start", "update", "end"):
         visitor.drag(phase, 0.5)
     wait_for(lambda: opened.playground.shown_push is not None)
     assert opened.playground.shown_push == pytest.approx([65.0, 0.0])  # as far as its arrow reaches
-    visitor.change("Controller", "you")
-    wait_for(lambda: opened.playground.is_driven)
-    opened.goes_on()  # the robot is drawn in another colour
-    visitor.drag("start", 0.5)
-    visitor.drag("update", 0.5)
-    wait_for(lambda: opened.playground.stick.value == (0.5, 0.0))
-    visitor.drag("end", 0.5)
-    wait_for(lambda: opened.playground.stick.value == (0.0, 0.0))
-
-
-def test_keys_and_held_buttons_steer_as_the_browser_looks(opened, visitor):
-    visitor.press("drive left (A)")
-    wait_for(lambda: opened.playground.stick.value != (0.0, 0.0))
-    ahead = np.subtract(CAMERA["look_at"], CAMERA["position"])[:2]
-    assert np.dot(opened.playground.stick.value, ahead) == pytest.approx(0.0, abs=1e-9)
-    wait_for(lambda: opened.playground.stick.value == (0.0, 0.0))  # a key that is let go
-    visitor.send(type="GuiButtonHoldMessage", uuid=visitor.uuid("Back"), frequency=20.0)
-    wait_for(lambda: opened.playground.stick.value != (0.0, 0.0))
-    assert np.dot(opened.playground.stick.value, ahead / np.linalg.norm(ahead)) == pytest.approx(-1.0)
 
 
 def test_nothing_moves_while_nobody_is_there(opened):
@@ -213,7 +189,7 @@ NONSENSE = [
     ("Speed", "fast"),
     ("Speed", 1e18),
     ("Masses, %", math.inf),
-    ("effort × 10^", 1e9),
+    ("Masses, %", -1e300),
     ("Task", "dance"),
     ("Controller", "../../etc/passwd"),
     ("Controller", {"a": 1}),
@@ -280,7 +256,7 @@ def test_no_message_ends_the_simulation(quiet, opened, visitor):
     for k, message in enumerate(MESSAGES):
         with Visitor(opened.viewer.port) as other:
             other.send(**message)
-            other.press("drive left (A)")
+            other.press("push")
             opened.goes_on()
         works(opened, visitor, k)
 
@@ -329,7 +305,7 @@ def test_who_leaves_while_something_is_saved_or_dragged_harms_nothing(quiet, ope
     with Visitor(opened.viewer.port) as other:
         other.change("Take the controls")
         other.drag("start", 0.5)
-        for label in ("Trajectory file", "Push", "Start for ballbot optimize"):
+        for label in ("Trajectory file", "Push"):
             other.change(label)
         other.connection.close()
     wait_for(lambda: opened.page.driver is None)
@@ -345,10 +321,8 @@ def test_the_server_and_its_processes_end_when_they_are_told_to(tmp_path):
         port = int(re.search(r":(\d+)", server.stdout.readline()).group(1))
         with Visitor(port) as visitor:
             wait_for(lambda: "LQR, " in visitor.text().replace("\\", ""), 60)
-            visitor.change("Film (WebP)")
-            wait_for(lambda: "drawing" in visitor.text(), 30)
             mine = children(server.pid)
-            assert len(mine) >= 2  # that plans, and that draws
+            assert mine  # that plans
         server.send_signal(signal.SIGTERM)
         assert server.wait(20) == 0
         wait_for(lambda: not any(map(runs, mine)))

@@ -1,6 +1,5 @@
 """The playground without Python: it computes what Python computes, in node and a browser, and nothing from outside harms."""
 
-import base64
 import json
 import re
 import shutil
@@ -21,7 +20,7 @@ from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
-from ballbot_train.policy_files import BEST, SHIPPED, shipped_policies
+from ballbot_train.policy_files import BEST, shipped_policies
 from ballbot_train.report import playground
 from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
 from ballbot_train.report.printed import javascript_function
@@ -138,93 +137,6 @@ def test_a_link_holds_task_episode_and_score_and_any_other_is_none(engine, tmp_p
     assert text == "turn-1-12.3"
     assert others == [None] * len(HASHES)
     assert challenge["regret"] == 12.3
-
-
-def network_file(path, activation, steps=("Gemm",)):
-    """An ONNX file as other tools write it: two layers, of Gemm, or of MatMul and Add."""
-    onnx = pytest.importorskip("onnx")
-    rng = np.random.default_rng(0)
-    nodes, weights, value = [], [], "o"
-    for layer, (rows, columns) in enumerate(((8, 16), (16, 2))):
-        numbers = {f"w{layer}": rng.normal(size=(rows, columns)), f"b{layer}": rng.normal(size=columns)}
-        weights += [onnx.numpy_helper.from_array(array.astype(np.float32), name) for name, array in numbers.items()]
-        for step in steps:
-            takes = {
-                "Gemm": [value, f"w{layer}", f"b{layer}"],
-                "MatMul": [value, f"w{layer}"],
-                "Add": [value, f"b{layer}"],
-            }
-            nodes.append(onnx.helper.make_node(step, takes[step], [f"{step}{layer}"]))
-            value = f"{step}{layer}"
-        kind = activation if layer == 0 else "Tanh"
-        nodes.append(onnx.helper.make_node(kind, [value], [f"a{layer}"]))
-        value = f"a{layer}"
-    row = [onnx.helper.make_tensor_value_info(name, 1, ["batch", size]) for name, size in (("o", 8), ("a1", 2))]
-    graph = onnx.helper.make_graph(nodes, "network", row[:1], row[1:], weights)
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 14)], ir_version=7)
-    onnx.save(model, str(path))
-    return path
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    """A shipped policy as `ballbot export` writes it."""
-    pytest.importorskip("onnxscript")
-    from ballbot_train.onnx_export import export_onnx
-
-    path = tmp_path_factory.mktemp("onnx") / "mine.onnx"
-    return export_onnx(SHIPPED / "stabilize-shac.json", path, make_task("stabilize"))
-
-
-def read_onnx(engine, tmp_path, files, use):
-    """What a JavaScript expression of `policy` gives for each file, or the error's message."""
-    texts = [base64.b64encode(content).decode() for content in files]
-    script = f"""
-    answer({json.dumps(texts)}.map((text) => {{
-      try {{
-        const policy = new OnnxPolicy(unpacked(text, Uint8Array));
-        return {use};
-      }} catch (error) {{ return error.message; }}
-    }}));
-    """
-    return run_in_node(engine + script, tmp_path)
-
-
-def test_policies_from_onnx_files_act_as_in_onnxruntime(engine, exported, tmp_path, rng):
-    runtime = pytest.importorskip("onnxruntime")
-    paths = [exported, *(network_file(tmp_path / f"{kind}.onnx", kind) for kind in ("Relu", "Elu", "Sigmoid"))]
-    paths += [network_file(tmp_path / "sums.onnx", "Tanh", ("MatMul", "Add"))]
-    observations = rng.normal(size=(5, 8)).astype(np.float32)
-    use = f"{json.dumps(observations.tolist())}.map((observation) => policy.run(observation))"
-    found = read_onnx(engine, tmp_path, [path.read_bytes() for path in paths], use)
-    for path, actions in zip(paths, found, strict=True):
-        session = runtime.InferenceSession(str(path))
-        (expected,) = session.run(None, {session.get_inputs()[0].name: observations})
-        np.testing.assert_allclose(actions, expected, atol=1e-5, err_msg=path.name)  # float32
-
-
-def test_an_onnx_file_that_the_page_cannot_run_is_refused_with_the_reason(engine, tmp_path):
-    good = network_file(tmp_path / "good.onnx", "Relu").read_bytes()
-    changed = [good.replace(b"Relu", name) for name in (b"Sqrt", b"<i>!")] + [good.replace(b"w1", b"w9", 1)]
-    found = read_onnx(engine, tmp_path, [b"", b"\xff" * 50, b"GIF89a", *changed], "policy.task")
-    assert all("ONNX file" in message for message in found[:3])
-    assert found[3].startswith("it needs Sqrt, and this page computes Gemm, MatMul, Add")
-    assert "it needs <i>!" in found[4]
-    assert "nothing before it gives" in found[5]
-
-
-def test_damaged_onnx_files_are_refused_or_act_with_two_numbers(engine, tmp_path, rng):
-    good = network_file(tmp_path / "good.onnx", "Relu").read_bytes()
-    damaged = [good[:size] for size in range(0, len(good), 7)]
-    for _ in range(300):
-        changed = bytearray(good)
-        for place in rng.integers(0, len(good), 3):
-            changed[place] = rng.integers(0, 256)
-        damaged.append(bytes(changed))
-    use = "policy.run(new Array(policy.observations).fill(1)).length"
-    found = read_onnx(engine, tmp_path, damaged, use)
-    assert all(answer == 2 or isinstance(answer, str) for answer in found)
-    assert not [answer for answer in found if isinstance(answer, str) and "undefined" in answer]
 
 
 def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng):
@@ -461,20 +373,6 @@ return found
 
 def test_keys_and_a_drag_hold_the_stick_as_long_as_they_are_held(opened):
     assert opened.execute_script(STEERED) == pytest.approx([1, 1, 0, 0] * 3, abs=1e-6)
-
-
-def test_a_policy_of_ones_own_controls_the_robot_and_a_wrong_file_is_named(opened, exported, tmp_path):
-    chosen = opened.find_element("css selector", ".file")
-    (tmp_path / "wrong.onnx").write_bytes(b"wrong")
-    chosen.send_keys(str(tmp_path / "wrong.onnx"))
-    wait_for(opened, lambda: "wrong.onnx cannot be used: it is cut off" in said(opened))
-    chosen.send_keys(str(exported))
-    wait_for(opened, lambda: "mine.onnx controls the robot in stabilize" in said(opened))
-    opened.execute_script("playground.open(1); playground.setPlaying(false)")
-    (x, _), _, cells = advance(opened, 400)
-    assert cells[0][0] == "mine.onnx"
-    opened.execute_script("playground.own = {}; playground.open(1); playground.setPlaying(false)")
-    np.testing.assert_allclose(x, advance(opened, 400)[0][0], atol=FLOAT32)  # the same policy, from its weights
 
 
 def wait_for(browser, condition, seconds=20):

@@ -3,7 +3,6 @@
 import csv
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,11 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_train import jobs
 from ballbot_train.commands.certify import certify
-from ballbot_train.commands.train import train
 from ballbot_train.evaluation.benchmark import benchmark
 from ballbot_train.executors import Workers
 from ballbot_train.learning import tuning
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
-from ballbot_train.learning.learners import LEARNERS
 
 ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.slow
@@ -132,23 +129,3 @@ def test_a_search_runs_its_trials_on_the_nodes(cluster, tmp_path):
     assert ended[-1] == 3
     costs = [float(row["cost"]) for row in rows if row["state"] == "complete"]
     assert best["validation_cost"] == min(costs)
-
-
-def test_trainings_of_seeds_come_back_from_the_nodes_as_this_machine_makes_them(cluster, tmp_path, monkeypatch):
-    head, _ = cluster
-    settings = replace(
-        LEARNERS["ppo"].settings("turn"),
-        iterations=2,
-        num_envs=4,
-        num_steps=8,
-        batch_size=16,
-        hidden=(8,),
-        evaluations=1,
-    )
-    monkeypatch.chdir(tmp_path)
-    train("ppo", "turn", settings=settings, seeds="0:2", out=Path("here"))
-    train("ppo", "turn", settings=settings, seeds="0:2", out=Path("there"), workers=Workers(ray=head.address))
-    for seed in ("seed-0", "seed-1"):
-        here, there = (Path(out) / seed for out in ("here", "there"))
-        assert (here / "policy.safetensors").read_bytes() == (there / "policy.safetensors").read_bytes()
-        assert {path.name for path in here.iterdir()} == {path.name for path in there.iterdir()}

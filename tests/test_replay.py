@@ -19,7 +19,6 @@ from ballbot_train.report.replay import (
     certified_replay,
     file_replay,
     with_companions,
-    with_ghosts,
 )
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
@@ -104,28 +103,12 @@ def test_the_same_episode_starts_alike_under_every_controller():
     assert len(shown.markers) == 2  # the gate's posts
 
 
-def test_where_lqr_falls_the_ghost_goes_on_from_its_state_to_the_goal():
-    shown = certified_replay("stabilize", ["lqr"], FALLING)
-    (take,) = shown.takes
-    assert take.note == "fails at 0.40 s"
-    (take,) = with_ghosts(shown, "stabilize", FALLING, at=0.1, expert="trajopt", physics="bullet").takes
-    (ghost,) = take.ghosts
-    np.testing.assert_array_equal(ghost.trajectory.x[0], take.trajectory.state(0.1))
-    np.testing.assert_array_equal(ghost.state(0.1), ghost.trajectory.x[0])
-    assert ghost.state(0.08) is None
-    assert take.note.endswith("ghost from 0.10 s: at the goal")
-    assert np.hypot(*ghost.trajectory.x[-1, :2]) < 0.1
-    assert Replay("", (take,)).duration == pytest.approx(8.1)  # the ghost is watched to its end
-    seen, hidden = film_frames(shown, [0.4], width=320), film_frames(Replay("", (take,), shown.markers), [0.4], 320)
-    assert (next(seen) != next(hidden)).any()
-
-
 def test_ghosts_from_the_start_are_drawn_beside_every_take_but_their_own():
     shown = certified_replay("stabilize", ["lqr", "ppo"], FALLING, physics="rk4")
     lqr, ppo = with_companions(shown, Replay("", shown.takes[:1])).takes
     assert lqr.ghosts == ()
     (ghost,) = ppo.ghosts
-    assert (ghost.label, ghost.color, ghost.start) == ("LQR", lqr.color, 0.0)
+    assert (ghost.label, ghost.color) == ("LQR", lqr.color)
     together = replace(shown, takes=(lqr, ppo))
     beside, alone = together.drawing(ppo, 0.2), together.drawing(lqr, 0.2)
     assert [robot.alpha < 1 for robot in beside.robots] == [True, False]

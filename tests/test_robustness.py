@@ -8,7 +8,7 @@ from builders import stress_result as result
 
 from ballbot_gym.randomization import Randomization
 from ballbot_train.evaluation import benchmark, robustness
-from ballbot_train.evaluation.results import summarize
+from ballbot_train.evaluation.results import rows_of, summarize, write_results
 from ballbot_train.evaluation.robustness import NONE, STRESSES
 from ballbot_train.report import figures
 
@@ -27,7 +27,7 @@ def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
         {"stabilize": ["lqr"]}, robustness.conditions(["delay"]), 3, "rk4", tmp_path, 1, lambda name, count: None
     )
     plain = benchmark.benchmark({"stabilize": ["lqr"]}, 3, "rk4", tmp_path / "plain", 1, lambda name, count: None)
-    rows = robustness.rows_of(results)
+    rows = rows_of(results, robustness.StressRow, "stress", "level")
     assert [(row.stress, row.level) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == summarize(plain).cost_mean
     costs = [row.cost_mean for row in rows]
@@ -49,8 +49,8 @@ def test_the_same_seed_draws_the_same_pushes(tmp_path):
 def test_files_hold_the_rows_and_the_figure_is_drawn(tmp_path):
     failed = {"failure": True, "success": False}
     results = [result(NONE, 0.0), result("mass", -20.0), result("mass", 20.0, **failed), result("lag", 20.0)]
-    rows = robustness.rows_of(results)
-    robustness.write(rows, results, {"commit": "none"}, tmp_path)
+    rows = rows_of(results, robustness.StressRow, "stress", "level")
+    write_results("robustness", rows, results, {"commit": "none"}, tmp_path)
     document = json.loads((tmp_path / "robustness.json").read_text())
     assert [(row["stress"], row["level"]) for row in document["rows"]] == [(r.stress, r.level) for r in results]
     assert document["rows"][2]["regret_mean"] is None

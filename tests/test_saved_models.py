@@ -17,10 +17,8 @@ from gymnasium.wrappers import (
     NormalizeObservation,
     RescaleAction,
 )
-from rsl_rl.models import MLPModel
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from tensordict import TensorDict
 
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
@@ -97,25 +95,6 @@ def test_a_model_whose_statistics_are_missing_is_refused_with_how_to_write_them(
     _, path = normalized
     with pytest.raises(PolicyError, match=r"was trained with VecNormalize, and .*save_vecnormalize"):
         acts(path)
-
-
-def checkpoint(path, **options):
-    seen = TensorDict({"policy": torch.as_tensor(OBSERVATIONS)}, batch_size=[50])
-    model = MLPModel(seen, {"actor": ["policy"]}, "actor", 2, (16, 8), **options)
-    model.update_normalization(seen)
-    torch.save({"actor_state_dict": model.state_dict(), "iter": 3, "infos": None}, path)
-    model.eval()
-    return model(seen).detach().clamp(-1, 1).numpy()
-
-
-def test_a_checkpoint_of_rsl_rl_acts_as_its_actor(tmp_path):
-    gaussian = {"class_name": "rsl_rl.modules.distribution:GaussianDistribution", "init_std": 1.0}
-    path = tmp_path / "model_3.pt"
-    expected = checkpoint(path, activation="elu", obs_normalization=True, distribution_cfg=gaussian)
-    with pytest.raises(PolicyError, match=r'does not name its activation; write .*model_3.json with {"activation"'):
-        acts(path)
-    path.with_suffix(".json").write_text('{"activation": "elu"}')
-    np.testing.assert_allclose(acts(path), expected, atol=1e-5)
 
 
 def test_a_saved_model_is_evaluated_by_its_path(tmp_path):

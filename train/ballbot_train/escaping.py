@@ -1,9 +1,8 @@
-"""Names and messages that come from files are data: what keeps them so in a terminal, in Markdown and in Plotly's figures.
+"""Names and messages that come from files are data: what keeps them so in a terminal and in Markdown.
 
 The templates of the report escape HTML, `files.write_csv` what a spreadsheet takes for a formula.
 """
 
-import html
 import unicodedata
 from typing import Any
 
@@ -29,11 +28,6 @@ def printable(text: str) -> str:
 def markdown_text(text: str) -> str:
     """Text as Markdown shows it in a table or a line: no markup, link, HTML or expression of MDX."""
     return printable(text.translate(_MARKDOWN)).replace("](", "]&#40;")
-
-
-def plotly_text(text: str) -> str:
-    """Text for Plotly, which takes some HTML in names and titles for markup."""
-    return html.escape(text, quote=False)
 
 
 class PlainConsole(Console):

@@ -208,15 +208,20 @@ class _Processes:
 
 def _serve(connection: Connection, modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
     """Does the tasks that come through a pipe until it ends. Modules and robots are those that users registered."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which then ends its workers
-    Thread(target=_end_with_the_run, daemon=True).start()
-    registry.restore(modules, robots)
+    prepare_worker(modules, robots)
     try:
         while True:
             for message in _messages(*connection.recv()):
                 connection.send(message)
     except (EOFError, OSError):  # the run was killed, and may already go on in another process
         os._exit(1)
+
+
+def prepare_worker(modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
+    """Gives this process what users registered in the one that started it, and lets it end with that one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which then ends its workers
+    Thread(target=_end_with_the_run, daemon=True).start()
+    registry.restore(modules, robots)
 
 
 def _end_with_the_run() -> None:

@@ -188,7 +188,7 @@ class PolicyController(ActionController):
         """Args: network: a `PolicyNetwork`, or another from observations (..., no) to actions (..., 2)."""
         history = network.spec.history if isinstance(network, PolicyNetwork) else 0
         super().__init__(task, params, lambda observation, begins: self.predict(observation)[0], history)
-        self._network = network.eval()
+        self.network = network.eval()
 
     def predict(
         self,
@@ -200,7 +200,7 @@ class PolicyController(ActionController):
         """Actions (..., 2) for observations (..., no); the other arguments are SB3's and have no effect."""
         with own_precision(), torch.inference_mode():
             given = torch.as_tensor(np.array(observation), dtype=torch.float32, device="cpu")
-            return self._network(given).numpy(), state
+            return self.network(given).numpy(), state
 
 
 def save_policy(path: str | Path, network: PolicyNetwork, description: Mapping[str, Any]) -> Path:

@@ -1,13 +1,11 @@
-"""Saved models of Stable-Baselines3 and rsl_rl as policies: their weights alone are read, and nothing in them is executed.
+"""Saved models of Stable-Baselines3 as policies: their weights alone are read, and nothing in them is executed.
 
 | file | from | read are |
 |---|---|---|
 | MODEL.zip | `model.save` of Stable-Baselines3 | `policy.pth`, as tensors; from `data`, plain JSON values |
 | MODEL.vecnormalize.npz | `save_vecnormalize`, where observations were normalized | arrays of numbers |
-| MODEL.pt | `runner.save` of rsl_rl, of an actor that is an MLP | tensors |
-| MODEL.json beside a MODEL.pt | you: `{"activation": "elu"}`, because the checkpoint does not say | JSON |
 
-Of Stable-Baselines3 these are PPO, A2C, SAC, TD3 and DDPG with MlpPolicy, and of sb3_contrib TQC and TRPO.
+These are PPO, A2C, SAC, TD3 and DDPG with MlpPolicy, and of sb3_contrib TQC and TRPO.
 
 Pickles, such as `VecNormalize.save` writes, can execute code, and are not read.
 """
@@ -141,7 +139,7 @@ def fits(path: str | Path, task: Task, params: BallbotParams) -> bool:
 
 def digest(path: str | Path) -> str:
     """SHA-256 of a saved model and of the statistics beside it, as hexadecimal digits."""
-    beside = [other for other in (statistics_of(path), _description_of(path)) if other.exists()]
+    beside = [other for other in (statistics_of(path),) if other.exists()]
     return hashlib.sha256(b"".join(files.read(part) for part in (path, *beside))).hexdigest()
 
 
@@ -207,13 +205,10 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
     return SavedActor(torch.nn.Sequential(*parts[:-1]), output, normalization).eval()
 
 
-def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces | None]:
-    """Layers (weight, bias), activation, what happens to the output, statistics of observations, or None, and the spaces.
-
-    rsl_rl saves no spaces: its own env has none.
-    """
+def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces]:
+    """Layers (weight, bias), activation, what happens to the output, statistics of observations, or None, and the spaces."""
     try:
-        return _read_sb3(Path(path)) if Path(path).suffix == ".zip" else (*_read_rsl(Path(path)), None)
+        return _read_zip(Path(path))
     except PolicyError:
         raise
     except Exception as error:  # torch has dozens of ways to refuse a damaged file
@@ -221,7 +216,7 @@ def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str,
         raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {reason}") from error
 
 
-def _read_sb3(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces]:
+def _read_zip(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces]:
     members = files.unzipped(files.read(path), path)
     for name in ("data", "policy.pth"):
         if name not in members:
@@ -300,38 +295,6 @@ def _statistics(path: Path, data: Mapping[str, Any]) -> dict[str, Any] | None:
         ) from error
     scale = torch.sqrt(torch.from_numpy(variance + epsilon))
     return {"mean": torch.from_numpy(mean), "scale": scale, "limit": limit}
-
-
-def _read_rsl(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None]:
-    saved, described = saved_by_torch(files.read(path), path), _description_of(path)
-    if isinstance(saved.get("actor_state_dict"), dict):
-        weights, first, normalizer = saved["actor_state_dict"], "mlp.", "obs_normalizer."
-    elif isinstance(saved.get("model_state_dict"), dict):  # of versions before 4
-        weights, first, normalizer = saved["model_state_dict"], "actor.", "actor_obs_normalizer."
-    else:
-        raise PolicyError(f"{path} is no checkpoint of rsl_rl: it has {', '.join(list(saved)[:4]):.200}")
-    if not described.exists():
-        raise PolicyError(
-            f'{path}: a checkpoint of rsl_rl does not name its activation; write {described} with {{"activation": "elu"}}, '
-            f"or another of {', '.join(_ACTIVATIONS)}"
-        )
-    activation = files.read_json(described, _DATA_LIMIT)["activation"]
-    if activation not in _ACTIVATIONS:
-        raise PolicyError(f"{described} has the activation {activation!r:.100}; known: {', '.join(_ACTIVATIONS)}")
-    layers = _layers(path, weights, first)
-    statistics = None
-    if f"{normalizer}_mean" in weights:
-        parts = checked({name: weights[f"{normalizer}{name}"] for name in ("_mean", "_std")}, path).values()
-        mean, std = (part.flatten().double() for part in parts)
-        if mean.shape != std.shape or (std < 0).any():
-            raise PolicyError(f"{path} has a mean of {len(mean)} observations, and a deviation that does not fit it")
-        statistics = {"mean": mean, "scale": std + 1e-2, "limit": float("inf")}
-    return layers, activation, {}, statistics
-
-
-def _description_of(path: str | Path) -> Path:
-    """The file that says what a checkpoint of rsl_rl does not."""
-    return Path(path).with_suffix(".json")
 
 
 def _layers(path: Path, weights: Mapping[str, Any], *prefixes: str) -> list[Any]:

@@ -1,8 +1,6 @@
 """`ballbot benchmark`: controllers by their regret on the certified episodes."""
 
-import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from ballbot_gym import certified, files
@@ -11,12 +9,11 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, markdown, physics_or_default, print_table, progress_bars
-from ballbot_train.evaluation import basins, robustness, tracks
+from ballbot_train.evaluation import robustness, tracks
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
-from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard, write_results
 from ballbot_train.executors import Workers
-from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
 from ballbot_train.report.replay import certified_replay
@@ -30,7 +27,6 @@ def benchmark(
     quick: bool = False,
     physics: Physics | None = None,
     seed: int = 0,
-    runs: Path = Path("runs"),
     out: Path = Path("runs/benchmark"),
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
@@ -46,8 +42,6 @@ def benchmark(
         quick: only 8 episodes of each task.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of the bootstrap intervals, and of whatever an episode draws.
-        runs: folder where other commands left their results: the recovered share of `basins` joins the leaderboard, and
-            basins, robustness, transfer, training and the paper's figures join the report.
         out: folder of the results; an interrupted run continues here.
         workers: where the work is done; one process gives the cleanest times per control step.
         robot: whose episodes and controllers.
@@ -62,32 +56,19 @@ def benchmark(
     physics = physics_or_default(physics)
     episodes = checked_episodes(episodes, quick, few=8)
     facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
-    load_before = load()
     with progress_bars({task: episodes * len(group) for task, group in chosen.items()}) as bars:
         done = run_benchmark(chosen, episodes, physics, out, workers, bars.advance, seed, robot)
-    facts |= load_facts(load_before, workers)
-    busy = bool(facts["busy"])
-    recovered, damaged = basins.recovered_fractions(runs / "basins", robot)
-    if damaged:
-        console.print(f"skipped: {damaged}")
-    rows = [
-        replace(row, recovered=recovered.get((row.task, row.controller), row.recovered))
-        for row in leaderboard(done, seed)
-    ]
+    rows = leaderboard(done, seed)
     write_leaderboard(rows, done, facts, out)
-    figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
+    regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
-    table = [cells(row, busy) for row in rows]
-    files.write(out / "leaderboard.md", markdown(HEADER, table) + (f"\n{BUSY_NOTE}\n" if busy else ""))
-    sections = leaderboard_sections(
-        HEADER, table, done, chosen, pictures, physics, runs, BUSY_NOTE if busy else "", robot
-    )
+    table = [cells(row) for row in rows]
+    files.write(out / "leaderboard.md", markdown(HEADER, table))
+    sections = leaderboard_sections(HEADER, table, done, chosen, regrets, pictures, physics, robot)
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     page = write_report(title, sections, facts, out / "report.html")
     jobs.release(out)
     print_table(f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
-    if busy:
-        console.print(f"{BUSY_NOTE} Load {facts['load_start']} to {facts['load_end']} on {os.cpu_count()} cores.")
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")
@@ -115,7 +96,7 @@ def _benchmark_tracks(
     with progress_bars(robustness.episodes_to_run(chosen, wanted, episodes)) as bars:
         results = robustness.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
     rows = tracks.rows_of(results, robot, seed)
-    tracks.write(rows, results, facts, out)
+    write_results("tracks", rows, results, facts, out)
     table = [tracks.cells(row) for row in rows]
     files.write(out / "tracks.md", markdown(tracks.HEADER, table))
     jobs.release(out)

@@ -23,7 +23,7 @@ def compare(
     """Says for every task and controller whether B is better than A, worse, or that the episodes cannot tell.
 
     Args:
-        a: folder of a benchmark, its leaderboard.json or its episodes.csv; or the name of a row of the leaderboard, as lqr.
+        a: folder of a benchmark, or its leaderboard.json; or the name of a row of the leaderboard, as lqr.
         b: the other.
         match: a controller of A and one of B, to compare controllers of different names.
         margin: differences of success and regret up to this decide nothing; 0.001 is 0.1 %.
@@ -34,7 +34,7 @@ def compare(
     compared = comparison.compare(runs[0], runs[1], match, margin, training_margin)
     for key in sorted(runs[0][0].keys() & runs[1][0].keys()):
         first, second = (run[0].get(key) for run in runs)
-        if first != second and key not in ("policies", "load_start", "load_end"):
+        if first != second and key not in ("policies", "load"):
             console.print(f"{key}: {first} in A, {second} in B")
     header = ["task", "controller", "B is", "episodes", "success B − A", "regret B − A", "because"]
     print_table(f"A: {a}\nB: {b}", header, [_cells(entry) for entry in compared])

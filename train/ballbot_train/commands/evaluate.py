@@ -25,9 +25,9 @@ from ballbot_train.console import (
 )
 from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
 from ballbot_train.evaluation.controllers import is_expert, make_controller, task_name
-from ballbot_train.evaluation.results import BUSY_NOTE, HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
 from ballbot_train.executors import Workers
-from ballbot_train.provenance import load, load_facts, provenance
+from ballbot_train.provenance import provenance
 
 _FRESH = 10_000
 _WORST = 10
@@ -54,7 +54,7 @@ def evaluate(
     """Runs a policy on 10,000 fresh episodes: failures, success and cost by what makes episodes hard, the worst ten.
 
     Args:
-        policy: a policy file, a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt), or the name of a policy that comes
+        policy: a policy file, a model saved by Stable-Baselines3 (.zip), or the name of a policy that comes
             with the package; with --episodes also an expert. Statistics of VecNormalize are read from
             MODEL.vecnormalize.npz beside the model, which `ballbot_train.save_vecnormalize` writes.
         task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
@@ -214,15 +214,11 @@ def _certified(
     chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: Workers, robot: str
 ) -> None:
     facts = open_run(out, chosen, workers, physics, 0, robot, episodes=episodes)
-    load_before = load()
     with progress_bars(dict.fromkeys(chosen, episodes)) as bars:
         results = benchmark(chosen, episodes, physics, out, workers, bars.advance, robot=robot)
-    facts |= load_facts(load_before, workers)
     rows = leaderboard(results)
     write_leaderboard(rows, results, facts, out)
     jobs.release(out)
-    table = [cells(row, bool(facts["busy"])) for row in rows]
+    table = [cells(row) for row in rows]
     print_table(f"{episodes} certified episodes, physics={physics}", HEADER, table)
-    if facts["busy"]:
-        console.print(BUSY_NOTE)
     console.print(f"all episodes: {out / 'episodes.csv'}")

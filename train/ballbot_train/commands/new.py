@@ -71,6 +71,6 @@ def _leaderboard(name: str, out: Path, episodes: int) -> str:
     sys.path.append(os.path.abspath(out))
     import_module(module_of(name))
     physics = physics_or_default(None)
-    rows = [cells(evaluate(expert, name, episodes, physics), busy=False) for expert in _FIRST]
+    rows = [cells(evaluate(expert, name, episodes, physics)) for expert in _FIRST]
     command = f"ballbot benchmark --tasks {name} --controllers {' '.join(_FIRST)} --episodes {episodes}"
     return f"The first {episodes} episodes, physics={physics}: `{command}`\n\n{markdown(HEADER, rows)}"

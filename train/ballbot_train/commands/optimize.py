@@ -11,7 +11,6 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import RobotName, check_least, check_names, console, print_table
-from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
 
 _MOST_STEPS = 5000  # control steps of an episode; longer ones take hours and gigabytes
@@ -60,9 +59,7 @@ def optimize(
     env = BallbotEnv(problem, physics="rk4", params=params)
     options = {"constants": constants} | ({} if state is None else {"state": state})
     _, info = env.reset(seed=seed, options=options)
-    load_before = load()
     optimum = find_optimum(env.task, params, info["state"], info["constants"])
-    busy = bool(load_facts(load_before, 1)["busy"])
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
     circles = figures.marker_circles(env.task.markers(info["constants"]))
@@ -75,16 +72,9 @@ def optimize(
         ["peak force, N", f"{np.abs(trajectory.u).max():.1f}"],
         ["status", f"{optimum.status}; {optimum.solver}: {optimum.solver_status}, {optimum.iterations} iterations"],
         ["constraint violation", f"{optimum.violation:.1e}"],
-        *(
-            [name, f"{'~' if busy else ''}{seconds:.3f}"]
-            for name, seconds in (
-                ("solver time, s", optimum.solver_seconds),
-                ("set-up and compilation, s", optimum.setup_seconds),
-                ("whole search, s", optimum.seconds),
-            )
-        ),
+        ["solver time, s", f"{optimum.solver_seconds:.3f}"],
+        ["set-up and compilation, s", f"{optimum.setup_seconds:.3f}"],
+        ["whole search, s", f"{optimum.seconds:.3f}"],
     ]
     print_table(env.task.id, ["", ""], rows)
-    if busy:
-        console.print("~ The machine was busy, so these times are longer than they need be.")
     console.print(f"trajectory: {path}\nfigure: {picture}")

@@ -28,12 +28,12 @@ def play(
     out: Path = Path("runs/play"),
     randomization: str | None = None,
 ) -> None:
-    """Opens a page on which you push the robot, change it, drive it, and compare controllers.
+    """Opens a page on which you push the robot, change it, and compare controllers.
 
     Args:
         task: name of a task; default the one that the controller's file names or whose observations fit, or else stabilize.
-        controller: of the robot: an expert, a policy that comes with the package, a policy file, a model saved by
-            Stable-Baselines3 (.zip) or rsl_rl (.pt), "you" or "you (force)"; default, the best shipped policy.
+        controller: of the robot: an expert, a policy that comes with the package, a policy file, or a model saved
+            by Stable-Baselines3 (.zip); default, the best shipped policy.
         ghosts: controllers that get the same start and the same pushes beside it.
         policies: more policy files and saved models, which the page offers in the tasks that they are made for.
         episode: index of the certified episode it starts with, a random start, or at rest until a push that fells LQR;
@@ -61,6 +61,5 @@ def play(
     except KeyboardInterrupt:
         console.print("ended")
     finally:
-        page.close()
         viewer.close()
         playground.close()

@@ -3,12 +3,11 @@
 import math
 from pathlib import Path
 
-from ballbot_baselines import CONTROLLERS
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
-from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_companions, with_ghosts
+from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_companions
 
 _MOST_FRAMES = 100_000
 _WIDTHS = {"mp4": 1280, "gif": 640, "webp": 640}  # px
@@ -27,8 +26,6 @@ def replay(
     speed: float = 1.0,
     width: int | None = None,
     ghosts: tuple[str, ...] = (),
-    ghost_at: float | None = None,
-    ghost_by: str = "trajopt",
     out: Path = Path("runs/replay"),
     robot: RobotName = PAPER,
     frictions: tuple[float, ...] = (),
@@ -47,8 +44,6 @@ def replay(
         speed: seconds of the episode per second of film; 0.5 is slow motion.
         width: width of a film, px; default 1280 for mp4, 640 for gif and webp.
         ghosts: names of controllers or policy files; what they do from the same start is drawn translucent in every picture.
-        ghost_at: time from which a ghost shows what an expert would do, s.
-        ghost_by: name of that expert.
         out: folder of the file. The file is named after task, controllers and episode.
         robot: whose episode; a trajectory file is drawn with the paper's.
         frictions: coefficients of friction of floors, for a robot whose ball rolls: every controller is shown on each of
@@ -60,7 +55,7 @@ def replay(
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
     physics = physics_or_default(physics)
-    shown, name = _read(source, controllers, episode, physics, ghosts, ghost_at, ghost_by, robot, frictions)
+    shown, name = _read(source, controllers, episode, physics, ghosts, robot, frictions)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":
@@ -80,8 +75,6 @@ def _read(
     episode: int,
     physics: str,
     ghosts: tuple[str, ...],
-    ghost_at: float | None,
-    ghost_by: str,
     robot: str,
     frictions: tuple[float, ...],
 ) -> tuple[Replay, str]:
@@ -90,13 +83,11 @@ def _read(
         _check(bool(source), "give the name of a task, or trajectory files")
         _check(not ghosts, "trajectory files do not say which episode they are of: give the ghosts as files too")
         _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
-        _check(ghost_at is None, "a trajectory file does not say which task it is of, so it has no ghost")
         paths = [Path(entry) for entry in source]
         return file_replay(paths), "-".join(path.stem for path in paths)
     _check(len(source) == 1, f"give one task, or trajectory files ending in .npz, not {' '.join(source)}")
     task = source[0]
     check_names("task", [task], TASKS)
-    check_names("expert", [ghost_by], CONTROLLERS)
     _check(bool(controllers), "give at least one controller")
     shown = certified_replay(task, controllers, episode, physics, robot=robot, frictions=frictions)
     made = file_name(task, robot)
@@ -106,9 +97,7 @@ def _read(
     if ghosts:
         shown = with_companions(shown, certified_replay(task, ghosts, episode, physics, robot=robot))
         name = f"{name}-beside-{'-'.join(Path(ghost).stem for ghost in ghosts)}"
-    if ghost_at is None:
-        return shown, name
-    return with_ghosts(shown, task, episode, ghost_at, ghost_by, physics, robot), f"{name}-ghost"
+    return shown, name
 
 
 def _check(right: bool, message: str) -> None:

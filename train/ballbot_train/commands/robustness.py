@@ -1,7 +1,6 @@
 """`ballbot robustness`: the leaderboard under disturbances."""
 
 import math
-import os
 from pathlib import Path
 
 from ballbot_gym import files
@@ -21,13 +20,9 @@ from ballbot_train.console import (
 )
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
-from ballbot_train.provenance import load, load_facts
 from ballbot_train.report import figures
-
-_BUSY_NOTE = (
-    "~ The machine was busy, so plan_ms_median and step_us_median in robustness.csv are longer than they need be."
-)
 
 
 def robustness(
@@ -63,12 +58,12 @@ def robustness(
     check_some("stress", stresses, stressed.STRESSES)
     episodes = checked_episodes(episodes, quick, few=3)
     facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
-    load_before, wanted = load(), stressed.conditions(stresses)
+    wanted = stressed.conditions(stresses)
     with progress_bars(stressed.episodes_to_run(chosen, wanted, episodes)) as bars:
         results = stressed.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
-    facts |= load_facts(load_before, workers)
-    rows = stressed.rows_of(results, seed)
-    stressed.write(rows, results, facts, out)
+    rows = rows_of(results, stressed.StressRow, "stress", "level", seed=seed)
+    labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
+    write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:
         figures.save(figures.robustness_figure(rows, task), out / "figures" / f"robustness-{task}.png")
     table = [
@@ -78,11 +73,9 @@ def robustness(
         for controller in group
     ]
     header = ["task", "disturbance", "controller", "severity", "success, %", "falls, %", stressed.REGRET]
-    files.write(out / "robustness.md", markdown(header, table) + (f"\n{_BUSY_NOTE}\n" if facts["busy"] else ""))
+    files.write(out / "robustness.md", markdown(header, table))
     jobs.release(out)
     print_table(f"{episodes} certified episodes per task and severity, physics={physics}", header, table)
-    if facts["busy"]:
-        console.print(f"{_BUSY_NOTE} Load {facts['load_start']} to {facts['load_end']} on {os.cpu_count()} cores.")
     console.print(f"curves: {out / 'figures'}")
 
 

@@ -15,17 +15,16 @@ from ballbot_gym import certified
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import WorkersOption, meanings_of
+from ballbot_train.commands.options import meanings_of
 from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.learners import LEARNERS, check_settings
-from ballbot_train.policy_files import paths_of
 
 _MOST_THREADS = 1024
 _MOST_VALIDATION_EPISODES = 100_000
 
-_FIRST = ("task", "out", "seed", "iterations", "seeds", "workers", "ray", "resume")  # what newcomers need
+_FIRST = ("task", "out", "seed", "iterations", "seeds", "workers", "resume")  # what newcomers need
 _LAST = (
     "robot",
     "threads",
@@ -66,8 +65,8 @@ class Run:
     """Seed of all that is drawn."""
     seeds: str | None = None
     """Several, as 0:5 or 0,3,7: a queue of one-core runs."""
-    workers: WorkersOption = Workers()
-    """Who does the runs of --seeds."""
+    workers: int = 1
+    """How many runs of --seeds go on at once."""
     threads: int = 1
     """Threads of torch."""
     out: Path | None = None
@@ -83,6 +82,7 @@ class Run:
         """Raises a ValueError that names the first number out of its range."""
         for name, least, most in (
             ("threads", 1, _MOST_THREADS),
+            ("workers", 1, _MOST_THREADS),
             ("seed", 0, 2**32 - 1),
             ("test_episodes", 1, certified.EPISODES),
             ("validation_episodes", 1, _MOST_VALIDATION_EPISODES),
@@ -96,77 +96,30 @@ class Run:
         return self.demos is not None or self.start is not None
 
 
-def train(
-    learner: str,
-    /,
-    task: str = "stabilize",
-    demos: str | Path | None = None,
-    start: Path | None = None,
-    seed: int = 0,
-    settings: Any = None,
-    threads: int = 1,
-    out: Path | None = None,
-    test_episodes: int = certified.EPISODES,
-    validation_episodes: int = VALIDATION_EPISODES,
-    resume: bool = False,
-    command: str | None = None,
-    seeds: str | None = None,
-    workers: int | Workers = 1,
-    robot: RobotName = PAPER,
-    randomization: str | None = None,
-    history: int = 0,
-) -> None:
+def train(learner: str, run: Run = Run(), settings: Any = None, command: str | None = None) -> None:
     """Trains a policy on the batched model, and measures it in PyBullet on the certified episodes.
 
     Args:
         learner: name of a learner in `LEARNERS`.
-        task: name of a task.
-        demos: folder of a demonstration dataset, made by `ballbot demos`, or the URL of its shards.
-        start: policy file to train on from, for ppo, sac and shac; it may be of another robot.
-        seed: seed of everything that is drawn.
+        run: the options that every learner has.
         settings: the learner's settings; default, those tuned for the task.
-        threads: threads of torch. Another number changes the last digits; more than one is slower beside other work.
-        out: folder of the run; default runs/train/TASK-LEARNER.
-        test_episodes: on how many of the certified episodes the policy is measured in the end, from the first.
-        validation_episodes: on how many fresh episodes the policy is chosen that the run keeps.
-        resume: continue the run in this folder, if there is one.
         command: the command that was typed, for the record; default, one with all settings.
-        seeds: several seeds in place of one, as "0:5" or "0,3,7": a queue of one-core runs, each in a folder of its own.
-        workers: how many runs of `seeds` go on at once, or `Workers`.
-        robot: name of a robot.
-        randomization: name of the track on which the policy is trained and measured, for dagger, ppo and shac.
-        history: how many earlier observations and actions the policy sees, for dagger, ppo and shac.
     """
     check_names("learner", [learner], LEARNERS)
-    check_names("task", [task], TASKS)
-    LEARNERS[learner].check(demos, start)
-    run = Run(
-        task,
-        robot,
-        _text(demos),
-        start,
-        randomization,
-        history,
-        seed,
-        threads=threads,
-        out=Path("runs") / "train" / f"{file_name(task, robot)}-{learner}" if out is None else out,
-        test_episodes=test_episodes,
-        validation_episodes=validation_episodes,
-        resume=resume,
-    )
+    check_names("task", [run.task], TASKS)
+    LEARNERS[learner].check(run.demos, run.start)
     run.check()
-    settings = LEARNERS[learner].settings(task, run.warm) if settings is None else settings
+    if run.out is None:
+        run = replace(run, out=Path("runs") / "train" / f"{file_name(run.task, run.robot)}-{learner}")
+    settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
     check_settings(settings)
-    workers = Workers.of(workers)
-    if seeds is not None:
-        _train_seeds(learner, run, settings, seeds, workers)
-    elif workers.ray is not None:
-        raise ValueError("--ray does the runs of --seeds; a single training runs here")
+    if run.seeds is not None:
+        _train_seeds(learner, run, settings, run.seeds)
     else:
-        _train_one(learner, run, settings, command or command_with(learner, run, settings), workers)
+        _train_one(learner, run, settings, command or command_with(learner, run, settings))
 
 
-def _train_one(learner: str, run: Run, settings: Any, command: str, workers: Workers) -> None:
+def _train_one(learner: str, run: Run, settings: Any, command: str) -> None:
     """Trains on one seed, and prints what the policy reached."""
     import torch
 
@@ -180,7 +133,7 @@ def _train_one(learner: str, run: Run, settings: Any, command: str, workers: Wor
     problem, out, varied = make_task(run.task, run.robot), cast(Path, run.out), checked_randomization(run.randomization)
     config = _config(learner, run, settings, command)
     # by which it is scored while it learns
-    optima.known(problem, run.robot, workers=workers, randomization=varied)
+    optima.known(problem, run.robot, workers=Workers(), randomization=varied)
     start = None if run.start is None else load_network(run.start, problem, robot=None)
     world = None if run.randomization is None else varied
     given = settings, run.seed, run.demos, start, world, run.history
@@ -213,7 +166,7 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
         "seed": run.seed,
         "demos": run.demos,
         "settings": asdict(settings),
-        "start": _text(run.start),
+        "start": None if run.start is None else str(run.start),
         "command": " && ".join([*reversed(inputs), command]),
         **({"inputs": inputs} if inputs else {}),
         **robot_setting(run.robot),
@@ -223,7 +176,7 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
     }
 
 
-def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Workers) -> None:
+def _train_seeds(learner: str, run: Run, settings: Any, named: str) -> None:
     """Trains on several seeds, and prints what each reached."""
     from ballbot_train.learning import seeds as queue
 
@@ -233,13 +186,9 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Wor
         return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
 
     expected = {"learner": learner, "task": run.task, "settings": asdict(settings), **robot_setting(run.robot)}
-    inputs = [
-        *([Path(run.demos)] if run.demos and "://" not in run.demos else []),
-        *(paths_of(run.start) if run.start else []),
-    ]
     with progress_bar() as progress:
         bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
-        trained = queue.run(command_of, expected, seeds, out, workers, lambda seed: progress.advance(bar), inputs)
+        trained = queue.run(command_of, expected, seeds, out, run.workers, lambda seed: progress.advance(bar))
     header = ["seed", "", "success", "failures", "mean regret", "minutes"]
     rows = [_row(str(each.seed), vars(each)) for each in trained]
     middle, worst = queue.middle_and_worst(trained)
@@ -247,10 +196,6 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str, workers: Wor
         f"{learner} on {run.task}, certified episodes", header, [*rows, _row("median", middle), _row("worst", worst)]
     )
     console.print(f"learning curves: ballbot curves {shlex.quote(str(out))}")
-
-
-def _text(path: str | Path | None) -> str | None:
-    return None if path is None else str(path)
 
 
 def _row(name: str, values: Mapping[str, Any]) -> list[str]:
@@ -265,11 +210,7 @@ def _share(value: float) -> str:
 def command_line(arguments: Sequence[str]) -> None:
     """Runs what was typed after `ballbot train`."""
     words = ["ballbot", "train", *(word for word in arguments if word != "--resume")]
-
-    def start(learner: str, run: Run, settings: Any) -> None:
-        train(learner, settings=settings, command=shlex.join(words), **_shallow(run))
-
-    parse(arguments, start)
+    parse(arguments, lambda learner, run, settings: train(learner, run, settings, shlex.join(words)))
 
 
 def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> None:
@@ -339,7 +280,7 @@ def _described(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
         default = " ".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
         meaning = meanings[name] if value is None or value is False else f"{meanings[name]} [{default}]"
         if is_dataclass(value):
-            found |= _described(value, "" if name == "workers" else f"{name}.")
+            found |= _described(value, f"{name}.")
         elif isinstance(value, bool):
             found[name] = f"  --{typed}, --no-{typed}", meaning
         else:

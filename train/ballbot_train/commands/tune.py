@@ -10,8 +10,6 @@ from ballbot_train.console import RobotName, check_least, check_names, console, 
 from ballbot_train.executors import Workers
 from ballbot_train.learning.learners import LEARNERS
 
-_SHOWN = 8
-
 
 def tune(
     learner: str,
@@ -34,8 +32,8 @@ def tune(
         seeds: trainings per trial, with the seeds 0, 1, 2 ... What counts is their mean.
         env_steps: length of each training.
         evaluations: of each training; after each of them a trial may be pruned.
-        out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), trials.csv, importances.csv,
-            best.json and, for ppo and sac on the paper's robot, settings for rl-zoo3.
+        out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), trials.csv, best.json
+            and, for ppo and sac on the paper's robot, settings for rl-zoo3.
         workers: who runs trials.
         robot: name of a robot.
     """
@@ -61,9 +59,6 @@ def tune(
     ]
     header = ["seed", "validation cost", "success", "certified regret"]
     print_table(f"the best, trial {best['trial']}, of {learner} on {task}", header, rows)
-    shares = list(tuning.importances(tuning.open_study(search, out)).items())[:_SHOWN]
-    if shares:
-        print_table("", ["setting", "importance"], [[name, f"{share:.2f}"] for name, share in shares])
     console.print(
         f"trials: {out / 'trials.csv'}\nsettings: {out / 'best.json'}\n"
         f"train with them: {command_with(learner, Run(task=task, robot=robot), settings)}",

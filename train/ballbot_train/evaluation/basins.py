@@ -238,39 +238,5 @@ def _as_json(basin: BasinMap) -> dict[str, Any]:
     }
 
 
-def read(folder: Path) -> list[BasinMap]:
-    """The maps of a folder that `write` wrote."""
-    document = files.read_json(folder / "basins.json")
-    return [
-        BasinMap(
-            axis=entry["axis"],
-            **{name: np.array(entry[name], np.float64) for name in ("leans", "values", "boundary")},
-            recoverable=np.array(entry["recoverable"], bool),
-            recovered={name: np.array(cells, bool) for name, cells in entry["recovered"].items()},
-        )
-        for entry in document["maps"]
-    ]
-
-
-def recovered_fractions(folder: Path, robot: str = PAPER) -> tuple[dict[tuple[str, str], float], str]:
-    """The shares that a folder of `ballbot basins` holds of a robot.
-
-    Returns:
-        The shares by task and controller, none where the folder holds none of this robot; and why its file cannot
-        be read, or "".
-    """
-    path = folder / "basins.json"
-    if not path.exists():
-        return {}, ""
-    try:
-        document = files.read_json(path)
-        if document["about"].get("robot", PAPER) != robot:
-            return {}, ""
-        rows = document["rows"]
-        return {(str(row["task"]), str(row["controller"])): float(row["recovered"]) for row in rows}, ""
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        return {}, f"{path} is damaged: {error!r}"
-
-
 def _slug(text: str) -> str:
     return "".join(sign if sign.isalnum() else "-" for sign in text)[-60:]

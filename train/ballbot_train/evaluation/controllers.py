@@ -14,7 +14,6 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
 from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
 
-_SAVED_MODELS = (".zip", ".pt", ".pth")
 _BESIDE = (".json", ".safetensors", ".vecnormalize.npz")  # endings of files that belong to a policy or a saved model
 
 
@@ -34,8 +33,8 @@ def is_file(name: str) -> bool:
 
 
 def is_saved_model(name: str) -> bool:
-    """Whether a controller's name is the path of a model that Stable-Baselines3 or rsl_rl saved."""
-    return Path(name).suffix in _SAVED_MODELS
+    """Whether a controller's name is the path of a model that Stable-Baselines3 saved."""
+    return Path(name).suffix == ".zip"
 
 
 def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
@@ -152,7 +151,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
 
     Args:
         name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
-            or of a model that Stable-Baselines3 or rsl_rl saved; see `saved_models`.
+            or of a model that Stable-Baselines3 saved; see `saved_models`.
         task: what it is to do.
         params: the robot it believes to control.
 

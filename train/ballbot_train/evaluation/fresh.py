@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -27,13 +27,12 @@ from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import is_expert, is_file, is_saved_model
+from ballbot_train.evaluation.controllers import is_expert, is_saved_model, make_controller
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
-from ballbot_train.policy import load_network, read_description, shipped_policies
-from ballbot_train.saved_models import load_actor
+from ballbot_train.policy import PolicyController, read_description, shipped_policies
 from ballbot_train.weights import own_precision
 
 try:
@@ -300,19 +299,12 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         TypeError: it is none of these.
     """
     if isinstance(policy, str | Path):
-        name, shipped = str(policy), shipped_policies(task, robot, None)
-        if is_expert(name):
+        if is_expert(str(policy)):
             raise ValueError(
-                f"{name} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
+                f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
                 "policy, or run the expert on certified episodes with evaluate"
             )
-        if name not in shipped and not is_file(name):
-            raise ValueError(f"unknown policy {name!r}; {task.id} has {', '.join(shipped)}, or give a policy's .json")
-        network = (
-            load_actor(name, task, named_robot(robot))
-            if is_saved_model(name)
-            else load_network(shipped.get(name, name), task, robot)
-        ).eval()
+        network = cast(PolicyController, make_controller(str(policy), task, named_robot(robot))).network
 
         def act(observation: torch.Tensor) -> torch.Tensor:
             with own_precision():

@@ -1,12 +1,11 @@
 """What evaluation measures: episodes' results, rows of the leaderboard, and the files that hold them."""
 
-import csv
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -70,8 +69,6 @@ class Row(Displayed):
     """Mean of |F|, N."""
     plan_ms_median: float
     step_us_median: float
-    recovered: float = math.nan
-    """Share of the physically recoverable states from which it recovers, where `ballbot basins` measured it."""
 
     def facts(self) -> dict[str, str]:
         return {
@@ -162,26 +159,51 @@ def summarize(results: Sequence[Result], seed: int = 0) -> Row:
     )
 
 
+RowKind = TypeVar("RowKind", bound=Row)
+
+
+def rows_of(results: Sequence[Result], kind: type[RowKind], *keys: str, seed: int = 0) -> list[RowKind]:
+    """One row for each task, controller and values of other fields, in the order of the results.
+
+    Args:
+        results: episodes.
+        kind: of the rows, which have the same fields.
+        keys: names of those fields.
+        seed: of the bootstrap.
+    """
+    groups: dict[tuple[Any, ...], list[Result]] = {}
+    for result in results:
+        groups.setdefault(tuple(getattr(result, key) for key in ("task", "controller", *keys)), []).append(result)
+    return [
+        kind(**asdict(summarize(group, seed)), **dict(zip(keys, values, strict=True)))
+        for (_, _, *values), group in groups.items()
+    ]
+
+
 def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
     """One row per task and controller, in the order of the results; seed is of the bootstrap."""
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for result in results:
-        groups.setdefault((result.task, result.controller), []).append(result)
-    return [summarize(group, seed) for group in groups.values()]
+    return rows_of(results, Row, seed=seed)
+
+
+def write_results(
+    name: str, rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path, **more: Any
+) -> None:
+    """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", the rows, and more."""
+    for table, entries in ((name, rows), ("episodes", results)):
+        files.write_csv(out / f"{table}.csv", [asdict(entry) for entry in entries])
+    files.write(out / f"{name}.json", to_json({"about": facts, **more, "rows": rows}))
 
 
 def write_leaderboard(rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path) -> None:
-    """Writes leaderboard.csv, episodes.csv and leaderboard.json, which holds the facts as "about", rows and episodes."""
-    write_csv(out / "leaderboard.csv", rows)
-    write_csv(out / "episodes.csv", results)
-    files.write(out / "leaderboard.json", to_json({"about": facts, "rows": rows, "episodes": results}))
+    """Writes leaderboard.csv, episodes.csv and leaderboard.json, which `read_results` reads."""
+    write_results("leaderboard", rows, results, facts, out, episodes=results)
 
 
 def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
     """What a benchmark's facts and episodes were.
 
     Args:
-        path: its folder, its leaderboard.json or its episodes.csv, which holds no facts.
+        path: its folder or its leaderboard.json.
 
     Raises:
         ValueError: it is none of these, or damaged.
@@ -189,16 +211,11 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
     path = Path(path)
     path = path / "leaderboard.json" if path.is_dir() else path
     try:
-        if path.suffix == ".csv":
-            text = files.read(path).decode()
-            if not text.endswith("\n"):
-                raise ValueError("its last line is cut off")
-            return {}, [_checked(_from_csv(entry)) for entry in csv.DictReader(text.splitlines())]
         document = files.read_json(path)
         return dict(document["about"]), [_checked(_from_json(entry)) for entry in document["episodes"]]
     except files.FileError as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, csv.Error) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error!r}") from error
 
 
@@ -221,18 +238,6 @@ def _from_json(entry: Mapping[str, Any]) -> Result:
             raise TypeError(f"{field.name} of an episode is {value!r:.200}")
         values[field.name] = kind(value)  # a whole number that no float holds is an OverflowError
     return Result(**values)
-
-
-def _from_csv(entry: Mapping[str, str]) -> Result:
-    truths = {"True": True, "False": False}
-    read: dict[Any, Any] = {str: files.csv_text, int: int, float: float, bool: truths.__getitem__}
-    kinds = {field.name: read[field.type] for field in fields(Result)}
-    return Result(**{key: kinds[key](value) for key, value in entry.items()})
-
-
-def write_csv(path: Path, entries: Sequence[Any]) -> Path:
-    """Writes dataclass instances of one kind as CSV."""
-    return files.write_csv(path, [asdict(entry) for entry in entries])
 
 
 def to_json(document: Mapping[str, Any]) -> str:
@@ -263,14 +268,9 @@ HEADER = [
     "peak tilt",
     "settle",
     "mean force",
-    "recovered",
     "plan",
     "per step",
 ]
-
-
-BUSY_NOTE = "~ The machine was busy, so plan and per step are longer than they need be."
-"""What stands below a table of `cells` of a busy machine."""
 
 
 def shown(value: float, form: str, unit: str = "") -> str:
@@ -278,11 +278,8 @@ def shown(value: float, form: str, unit: str = "") -> str:
     return format(value, form) + unit if math.isfinite(value) else "–"
 
 
-def cells(row: Row, busy: bool = False) -> list[str]:
-    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash.
-
-    Times of a busy machine have a ~ in front.
-    """
+def cells(row: Row) -> list[str]:
+    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash."""
     ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
     return [
         row.task,
@@ -294,9 +291,6 @@ def cells(row: Row, busy: bool = False) -> list[str]:
         shown(row.peak_tilt_median, ".1f", "°"),
         shown(row.settle_time_median, ".2f", " s"),
         shown(row.effort_mean, ".0f", " N"),
-        shown(row.recovered, ".0%"),
-        *(
-            "~" * (busy and math.isfinite(value)) + shown(value, ".0f", unit)
-            for value, unit in ((row.plan_ms_median, " ms"), (row.step_us_median, " µs"))
-        ),
+        shown(row.plan_ms_median, ".0f", " ms"),
+        shown(row.step_us_median, ".0f", " µs"),
     ]

@@ -6,16 +6,14 @@ measured against the optimum of each episode's own robot. Every controller meets
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from ballbot_gym import files
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train import jobs
 from ballbot_train.evaluation.benchmark import CHUNK, episode_job
-from ballbot_train.evaluation.results import Result, Row, summarize, to_json, write_csv
+from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import track_in
 
@@ -189,26 +187,7 @@ def run(
     ]
 
 
-def rows_of(results: Sequence[StressResult], seed: int = 0) -> list[StressRow]:
-    """One row per condition, task and controller; seed is of the bootstrap."""
-    groups: dict[tuple[str, float, str, str], list[StressResult]] = {}
-    for result in results:
-        groups.setdefault((result.stress, result.level, result.task, result.controller), []).append(result)
-    return [
-        StressRow(**asdict(summarize(group, seed)), stress=stress, level=level)
-        for (stress, level, *_), group in groups.items()
-    ]
-
-
 def curve_of(rows: Sequence[StressRow], task: str, controller: str, stress: str) -> list[StressRow]:
     """The rows of one curve, by severity, the undisturbed among them."""
     chosen = [row for row in rows if (row.task, row.controller) == (task, controller) and row.stress in (stress, NONE)]
     return sorted(chosen, key=lambda row: row.level)
-
-
-def write(rows: Sequence[StressRow], results: Sequence[StressResult], facts: Mapping[str, Any], out: Path) -> None:
-    """Writes robustness.csv, episodes.csv and robustness.json, which holds the facts as "about", stresses and rows."""
-    labels = {name: stress.label for name, stress in STRESSES.items()}
-    write_csv(out / "robustness.csv", rows)
-    write_csv(out / "episodes.csv", results)
-    files.write(out / "robustness.json", to_json({"about": facts, "stresses": labels, "rows": rows}))

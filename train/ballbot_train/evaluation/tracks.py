@@ -12,17 +12,14 @@ What delay costs is told beside them, because no controller could avoid it: J le
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.randomization import TRACKS, checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.results import Row, shown, summarize, to_json, write_csv
+from ballbot_train.evaluation.results import Row, shown, summarize
 from ballbot_train.evaluation.robustness import Condition, StressResult
 from ballbot_train.executors import Workers
 
@@ -128,10 +125,3 @@ def cells(row: TrackRow) -> list[str]:
         percent(row.not_knowing_costs),
         percent(row.controller_loses),
     ]
-
-
-def write(rows: Sequence[TrackRow], results: Sequence[StressResult], facts: Mapping[str, Any], out: Path) -> None:
-    """Writes tracks.csv, episodes.csv and tracks.json, which holds the facts as "about", and rows."""
-    write_csv(out / "tracks.csv", rows)
-    write_csv(out / "episodes.csv", results)
-    files.write(out / "tracks.json", to_json({"about": facts, "rows": rows}))

@@ -17,7 +17,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import named_robot
 from ballbot_train import jobs
 from ballbot_train.evaluation import benchmark
-from ballbot_train.evaluation.results import Result, Row, shown, summarize, to_json
+from ballbot_train.evaluation.results import Result, Row, shown, to_json
 from ballbot_train.executors import Workers
 
 _CHUNK = 5  # episodes of a job
@@ -128,20 +128,6 @@ def run(
     return [TransferResult(**entry, **of) for (_, of), entries in zip(work, done, strict=True) for entry in entries]
 
 
-def rows_of(results: Sequence[TransferResult], seed: int = 0) -> list[TransferRow]:
-    """One row per task, controller, robot that it was made for, floor and physics; seed is of the bootstrap."""
-    groups: dict[tuple[str, str, str, str, float, str], list[TransferResult]] = {}
-    for result in results:
-        key = (result.task, result.made_for, result.controller, result.robot, result.friction, result.physics)
-        groups.setdefault(key, []).append(result)
-    return [
-        TransferRow(
-            **asdict(summarize(group, seed)), made_for=made_for, robot=robot, friction=friction, physics=physics
-        )
-        for (_, made_for, _, robot, friction, physics), group in groups.items()
-    ]
-
-
 def write(rows: Sequence[TransferRow], results: Sequence[TransferResult], facts: Mapping[str, Any], out: Path) -> None:
     """Writes transfer.csv, episodes.csv and transfer.json, which holds the facts as "about" and the rows."""
     for name, entries in (("transfer", rows), ("episodes", results)):
@@ -153,6 +139,8 @@ def write(rows: Sequence[TransferRow], results: Sequence[TransferResult], facts:
 REGRET = "regret over the optimum on the robot's own floor"
 """What tables and figures call it."""
 HEADER = ["task", "made for", "controller", "runs on", "friction", "physics", "success", "falls", REGRET, "peak tilt"]
+
+
 _NAMED = {
     name: f"{name}_on_own_floor" for name in ("regret_mean", "regret_low", "regret_high", "regret_median", "optimum")
 }

@@ -5,14 +5,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation.evaluate import Predictor
+from ballbot_train.evaluation.fresh import as_batch_policy
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.training import score_and_validate
 from ballbot_train.saved_models import save_vecnormalize
@@ -72,18 +71,10 @@ class RegretCallback(BaseCallback):
         self.best: dict[str, float] | None = None
         """Those of the best model."""
         self._robot = robot
-        self._params = named_robot(robot)
 
     def evaluate(self) -> dict[str, float]:
         """Measures the present model; returns the figures by name. Raises a PolicyError if it acts in other spaces."""
-        predict = Predictor(self.model, self.task, self._params)
-        begins = True
-
-        def policy(observations: torch.Tensor) -> torch.Tensor:
-            nonlocal begins
-            actions, begins = predict(observations.numpy(), begins), False
-            return torch.as_tensor(actions)
-
+        policy = as_batch_policy(self.model, self.task, self._robot)
         score, validation = score_and_validate(policy, self.task, self._robot, self.validation_episodes)
         figures = {f"certified/{name}": value for name, value in asdict(score).items()}
         return figures | {f"validation/{name}": value for name, value in asdict(validation).items()}

@@ -134,7 +134,7 @@ class CurriculumBatch(BallbotBatch):
         if short_episodes[0] and task.first_exit:
             raise ValueError(f"{task.id} pays at its goal for the time that is left, so short_episodes must be 0")
         super().__init__(task, num_envs, compile=False, params=params, randomization=randomization, history=history)
-        self.gamma, self._own, self._full = gamma, task, task if full is None else full
+        self.gamma, self.own_task, self._full = gamma, task, task if full is None else full
         self._short, self.backwards, self._pay = short_episodes, backwards, pay and not backwards
         self._goal_factor = _GOAL_FACTOR if backwards else 1.0
         ramps = {name: start for name, (start, _) in _RAMPS.items() if backwards and hasattr(task, name)}
@@ -260,20 +260,20 @@ class CurriculumBatch(BallbotBatch):
     def _count_starts(self, ended: torch.Tensor, success: torch.Tensor) -> None:
         """Counts the ended episodes that began on optima, and lets them begin earlier if enough of them succeeded."""
         enough = self._on_optima.add(ended, success) and self._on_optima.share >= _SUCCESS
-        if enough and self._reach < self._own.duration:
-            self._reach = min(self._reach + _REACH_STEP, self._own.duration)
+        if enough and self._reach < self.own_task.duration:
+            self._reach = min(self._reach + _REACH_STEP, self.own_task.duration)
             self._eligible = None
 
     @property
     def _optima_succeed(self) -> bool:
         """Whether episodes begin anywhere on optima, and enough of them succeed for a narrower goal."""
         longest = math.inf if self._starts is None else float(self._starts.left.max()) * self.task.control_dt
-        return self._reach >= min(longest, self._own.duration) and self._on_optima.share >= _OPTIMA_SUCCESS
+        return self._reach >= min(longest, self.own_task.duration) and self._on_optima.share >= _OPTIMA_SUCCESS
 
     @property
     def _is_easier(self) -> bool:
         """Whether the goal is wider than the task's own, or a field of `_RAMPS` another."""
-        return self._goal_factor > 1 or any(value != getattr(self._own, name) for name, value in self._ramp.items())
+        return self._goal_factor > 1 or any(value != getattr(self.own_task, name) for name, value in self._ramp.items())
 
     def _harden(self) -> None:
         """Takes a step towards the task itself: the goal first, then the fields."""
@@ -283,19 +283,19 @@ class CurriculumBatch(BallbotBatch):
             self._goal_factor = max(1.0, self._goal_factor * _GOAL_STEP)
         else:
             for name, reached in self._ramp.items():
-                self._ramp[name] = min(reached + _RAMPS[name][1], getattr(self._own, name))
+                self._ramp[name] = min(reached + _RAMPS[name][1], getattr(self.own_task, name))
         self._set_difficulty()
 
     def _set_difficulty(self) -> None:
         """Makes `task` what the curriculum has reached."""
         # a batch computes nothing from goal and ramp in advance
-        vars(self)["task"] = widened(replace(self._own, **self._ramp), self._goal_factor)
+        vars(self)["task"] = widened(replace(self.own_task, **self._ramp), self._goal_factor)
         self._eligible: torch.Tensor | None = None
 
     def _start_on_optima(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun into states along optima."""
         if self._starts is None:
-            self._starts = optimal_starts(self._full, self.params, _OPTIMA, self._own.steps, _RESERVE)
+            self._starts = optimal_starts(self._full, self.params, _OPTIMA, self.own_task.steps, _RESERVE)
         if self._eligible is None:  # states outside of the goal, which may be wide
             inside = self.task.goal(
                 self._starts.x.unbind(0), self.task.at(self._starts.c.unbind(0), self.task.duration)

@@ -254,7 +254,7 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progre
         on_progress(config.episodes)
         return out
     Workers.of(workers)
-    jobs.claim(unfinished, described | {"arrays": _ARRAYS})  # earlier versions kept them in files of their own
+    jobs.claim(unfinished, described)
     try:
         every = range(config.episodes)
         chunks = [tuple(every[start : start + _CHUNK]) for start in every[::_CHUNK]]

@@ -2,9 +2,6 @@
 
 Each seed has a run folder of its own, OUT/seed-K, and prints into OUT/seed-K.log. A queue that is killed goes on when it is
 started again: finished runs stay, and interrupted ones resume.
-
-On a Ray cluster each run works in an empty folder of its worker, and what it writes comes back every half minute. So a run
-whose node dies goes on elsewhere from its last checkpoint.
 """
 
 import math
@@ -13,21 +10,17 @@ import shlex
 import statistics
 import subprocess
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from ballbot_gym import files
 from ballbot_train import jobs
-from ballbot_train.executors import WorkerError, Workers, open_pool
 from ballbot_train.policy_files import PolicyError, read_description
 
 _MOST_SEEDS = 1000
-_SEND_SECONDS = 30.0  # how often a worker of a cluster sends what a run has written
 
 
 @dataclass(frozen=True)
@@ -75,9 +68,8 @@ def run(
     expected: Mapping[str, Any],
     seeds: Sequence[int],
     out: Path,
-    workers: int | Workers,
+    workers: int = 1,
     on_seed: Callable[[int], None] = lambda seed: None,
-    inputs: Sequence[Path] = (),
 ) -> list[Trained]:
     """Runs what is not finished.
 
@@ -86,9 +78,8 @@ def run(
         expected: what the record of a finished run must say besides its seed, by name.
         seeds: in this order.
         out: folder of all runs.
-        workers: how many run at once, each on one core, or `Workers`; one by default.
+        workers: how many run at once, each on one core.
         on_seed: called with a seed when its run is finished.
-        inputs: files and folders that a run reads. A cluster gets them, under the same relative paths.
 
     Returns:
         What each seed reached.
@@ -100,12 +91,7 @@ def run(
     for seed in seeds:
         if seed not in waiting:
             on_seed(seed)
-    workers = Workers.of(workers)
-    if workers.ray is not None:
-        failed = _run_on_cluster(command_of, waiting, out, workers, on_seed, inputs)
-    else:
-        failed = _run_here(command_of, waiting, out, workers.workers or 1, on_seed)
-    if failed:
+    if failed := _run(command_of, waiting, out, workers, on_seed):
         seed, status = min(failed)
         log = _log_of(out, seed)
         last = next((line for line in reversed(log.read_text(errors="replace").splitlines()) if line.strip()), "")
@@ -116,10 +102,10 @@ def run(
     return [_trained(folder_of(out, seed), seed) for seed in seeds]
 
 
-def _run_here(
+def _run(
     command_of: Callable[[int], str], waiting: Sequence[int], out: Path, workers: int, on_seed: Callable[[int], None]
 ) -> list[tuple[int, int]]:
-    """Runs seeds on this machine; gives those that failed with their exit status."""
+    """Runs seeds; gives those that failed with their exit status."""
 
     def one(seed: int) -> int:
         return _start(command_of(seed), _log_of(out, seed)).wait()
@@ -139,94 +125,6 @@ def _run_here(
     return failed
 
 
-def _run_on_cluster(
-    command_of: Callable[[int], str],
-    waiting: Sequence[int],
-    out: Path,
-    workers: Workers,
-    on_seed: Callable[[int], None],
-    inputs: Sequence[Path],
-) -> list[tuple[int, int]]:
-    """As `_run_here`, on a Ray cluster."""
-    for path in (out, *inputs):
-        if path.is_absolute() or ".." in path.parts:
-            raise ValueError(
-                f"with --ray give a path below the working folder, not {path}: it is the same on the workers, which have "
-                "folders of their own"
-            )
-    given, failed, queue = _packed(inputs), [], list(reversed(waiting))
-    deaths: Counter[int] = Counter()
-
-    with open_pool(workers, per_core=1) as pool:
-        running = 0
-        while queue or running:
-            while queue and pool.has_room():
-                seed = queue.pop()
-                held = _packed([folder_of(out, seed), _log_of(out, seed)])
-                pool.start(seed, _train_away, command_of(seed), given | held, out, _log_of(out, seed))
-                running += 1
-            for event in pool.events():
-                assert isinstance(event.key, int)
-                if event.kind == "yielded":
-                    status, made = event.value
-                    for name, content in made.items():
-                        files.write(out / name, content)
-                    if status == 0:
-                        on_seed(event.key)
-                    elif status is not None:
-                        failed.append((event.key, status))
-                    continue
-                running -= 1
-                if event.kind != "ended":
-                    deaths[event.key] += event.kind == "worker died"
-                    if deaths[event.key] > 1:
-                        raise WorkerError(
-                            f"the worker of seed {event.key} died twice, most likely out of memory; the same command goes on"
-                        )
-                    queue.append(event.key)
-    return failed
-
-
-def _packed(paths: Sequence[Path]) -> dict[str, bytes]:
-    """The files at some paths and in folders there, by their path; hidden ones are locks and temporary files."""
-    found = [each for path in paths for each in ([path] if path.is_file() else sorted(path.rglob("*")))]
-    return {str(path): path.read_bytes() for path in found if path.is_file() and not path.name.startswith(".")}
-
-
-def _train_away(
-    command: str, given: Mapping[str, bytes], out: Path, log: Path
-) -> Iterator[tuple[int | None, dict[str, bytes]]]:
-    """Runs a command in an empty folder with the given files.
-
-    Yields:
-        The exit status, None while it runs, and the files below `out` that have changed, by their path there.
-    """
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        for path, content in given.items():
-            files.write(folder / path, content)
-        sent: dict[str, int] = {}
-        process = _start(command, folder / log, folder)
-        try:
-            ended = False
-            while not ended:
-                try:
-                    process.wait(_SEND_SECONDS)
-                    ended = True
-                except subprocess.TimeoutExpired:
-                    pass
-                stamps = {
-                    str(path.relative_to(folder / out)): path.stat().st_mtime_ns
-                    for path in (folder / out).rglob("*")
-                    if path.is_file() and not path.name.startswith(".")
-                }
-                changed = [path for path, stamp in stamps.items() if sent.get(path) != stamp]
-                sent = stamps
-                yield process.poll() if ended else None, {path: (folder / out / path).read_bytes() for path in changed}
-        finally:
-            process.kill()
-
-
 def middle_and_worst(trained: Sequence[Trained]) -> tuple[dict[str, float], dict[str, float]]:
     """Median and worst of the seeds, of each quantity by its name in `Trained`. A regret of no episode counts as infinite."""
     names = ("success", "failures", "regret_mean", "minutes")
@@ -239,14 +137,14 @@ def middle_and_worst(trained: Sequence[Trained]) -> tuple[dict[str, float], dict
 _ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
-def _start(command: str, log: Path, folder: Path | None = None) -> "subprocess.Popen[bytes]":
-    """Starts a command of `ballbot` on one core, with this Python and the packages of this process, in another folder."""
+def _start(command: str, log: Path) -> "subprocess.Popen[bytes]":
+    """Starts a command of `ballbot` on one core, with this Python and the packages of this process."""
     words = [sys.executable, "-m", "ballbot_train.cli", *shlex.split(command)[1:]]
     packages = {"PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path if path)}
     environment = os.environ | _ONE_CORE | packages
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
-        return subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT, env=environment, cwd=folder)
+        return subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT, env=environment)
 
 
 def _is_finished(folder: Path, expected: Mapping[str, Any]) -> bool:

@@ -16,7 +16,6 @@ A search is a folder:
 | config.json | learner, task, seeds and budget; the folder belongs to one search |
 | study.db | Optuna's study, in SQLite: every finished trial. `optuna-dashboard sqlite:///…` shows it |
 | trials.csv | a line per trial: its state, its costs over the seeds, its settings |
-| importances.csv | how much each setting matters, by PED-ANOVA, from the finished trials |
 | best.json | all settings of the best trial, what each seed reached, and the command that trains with them |
 | ppo.yml or sac.yml | settings of the four ids in the format of rl-zoo3 |
 
@@ -354,13 +353,7 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
             }
         )
     files.write_csv(out / "trials.csv", rows)
-    finished = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
-    files.write_csv(
-        out / "importances.csv",
-        [{"setting": name, "importance": share} for name, share in importances(study).items()],
-        ("setting", "importance"),
-    )
-    if not finished:
+    if not study.get_trials(states=(optuna.trial.TrialState.COMPLETE,)):
         return {}
     trial = study.best_trial
     settings = settings_of(search, {name: _decoded(value) for name, value in trial.params.items()})
@@ -376,31 +369,9 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
     }
     files.write(out / "best.json", json.dumps(best, indent=1) + "\n")
     if search.robot == PAPER:  # the ids are the paper's robot
-        files.write(out / f"{search.learner}.yml", zoo_yaml(search.learner, _best_settings(search, settings, out)))
+        tuned = {task: LEARNERS[search.learner].settings(task) for task in TASKS}
+        files.write(out / f"{search.learner}.yml", zoo_yaml(search.learner, tuned | {search.task: settings}))
     return best
-
-
-def importances(study: "optuna.Study") -> dict[str, float]:
-    """How much each setting matters, the most important first; empty before there are enough finished trials."""
-    if len(study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))) < 4:
-        return {}
-    try:
-        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-        return optuna.importance.get_param_importances(study, evaluator=evaluator)
-    except (ValueError, RuntimeError):  # all trials alike
-        return {}
-
-
-def _best_settings(search: Search, found: Any, out: Path) -> dict[str, Any]:
-    """Settings by name of task: those found, those of searches in the folders beside, and the tuned ones of the others."""
-    settings = {task: LEARNERS[search.learner].settings(task) for task in TASKS}
-    for task in TASKS:
-        path = out.parent / f"{task}-{search.learner}" / "best.json"
-        if path.exists():
-            read = files.read_json(path)["settings"]
-            known = {name: tuple(value) if isinstance(value, list) else value for name, value in read.items()}
-            settings[task] = replace(settings[task], **known)
-    return settings | {search.task: found}
 
 
 def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:

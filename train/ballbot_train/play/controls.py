@@ -1,22 +1,15 @@
 """The controls of the live page. Each shows what holds in the playground, and changes it for the browser that drives."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ballbot_gym.drawing import PUSH_SCALE
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play import views
-from ballbot_train.play.driving import DRIVERS
 from ballbot_train.play.plots import MOST_GHOSTS
 from ballbot_train.play.simulation import AT_END, LARGEST_PUSH
-from ballbot_train.play.tunable import weight_names
 from ballbot_train.play.world import PLANT
 from ballbot_train.report import labels
 
@@ -26,27 +19,7 @@ if TYPE_CHECKING:
 SPEEDS = (0.1, 2.0)
 """Least and greatest simulated seconds per second."""
 
-_EXPONENTS = (-1.5, 1.5)  # of 10, by which a weight's slider multiplies the task's own
-_FILMS = {"Film (WebP)": ".webp", "Film (MP4)": ".mp4"}
-_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip) or rsl_rl (.pt), where the simulation runs"
-
-
-_IMPULSE_PER_METRE = 1 / PUSH_SCALE  # N·s of a push by dragging the robot, so that the arrow ends where the drag does
-_STICK_METRES = 1.0  # of a drag that puts the stick fully out
-_HELD = 0.25  # s, after which a button of the pad counts as let go
-_KEY_HELD = 0.6  # s, the same for a key: keyboards repeat a held key only after half a second
-_DRAG_HELD = 5.0  # s, the same for a drag
-_DIRECTIONS = {"forward": (1.0, 0.0), "left": (0.0, 1.0), "back": (-1.0, 0.0), "right": (0.0, -1.0)}
-_KEYS = {
-    "forward": ("W", "arrowup"),
-    "left": ("A", "arrowleft"),
-    "back": ("S", "arrowdown"),
-    "right": ("D", "arrowright"),
-}
-_LEAD = (
-    "Choose **you** as the controller. The stick then commands a speed, and the robot keeps its balance. "
-    "**you (force)** commands the force itself: how long can you balance? Try it at speed 0.3."
-)
+_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip), where the simulation runs"
 
 
 class Controls:
@@ -66,9 +39,7 @@ class Controls:
             self._build_push()
         with tabs.add_tab("Change"):
             self._build_plant()
-            self._weight_folder = self._gui.add_folder("Weights of the cost")
-        with tabs.add_tab("Drive"):
-            page.steering.build()
+        with tabs.add_tab("Scores"):
             self._scores = self._gui.add_markdown("")
         with tabs.add_tab("Save"):
             self._build_saving()
@@ -165,10 +136,6 @@ class Controls:
         saver = self._page.saver
         self._gui.add_markdown(f"Files are written to `{saver.out}`, and this page downloads them.")
         self._button("Trajectory file", saver.save_trajectory)
-        for label, ending in _FILMS.items():
-            self._button(label, lambda client, ending=ending: saver.save_film(client, ending))
-        self._button("Start for ballbot optimize", lambda _: self._show_optimize())
-        self._optimize_text = self._gui.add_markdown("", visible=False)
 
     def _build_task(self) -> None:
         """Controls that differ from task to task."""
@@ -179,23 +146,11 @@ class Controls:
         self._task_controls = []
         with self._ghost_folder:
             for option, name in self._options().items():
-                if name not in DRIVERS:
-                    self._task_controls.append(
-                        self._bind(
-                            gui.add_checkbox(option, False),
-                            lambda wanted, name=name: self._set_ghost(name, wanted),
-                            lambda name=name: name in playground.crew.ghosts,
-                        )
-                    )
-        with self._weight_folder:
-            for name in weight_names(playground.world.base):
-                label, own = name.removesuffix("_weight").replace("_", " "), getattr(playground.world.base, name)
-                hint = f"{name}: 0 is the task's own, {own:g}"
                 self._task_controls.append(
                     self._bind(
-                        gui.add_slider(f"{label} × 10^", *_EXPONENTS, 0.05, 0.0, hint=hint),
-                        lambda value, name=name, own=own: playground.set_weight(name, own * 10**value),
-                        lambda name=name, own=own: self._exponent(name, own),
+                        gui.add_checkbox(option, False),
+                        lambda wanted, name=name: self._set_ghost(name, wanted),
+                        lambda name=name: name in playground.crew.ghosts,
                     )
                 )
         self._episode.max = max(0, playground.world.episodes - 1)
@@ -236,9 +191,6 @@ class Controls:
             raise ValueError(f"at most {MOST_GHOSTS} ghosts")
         self._playground.set_ghosts([*others, name] if wanted else others)
 
-    def _exponent(self, name: str, own: float) -> float:
-        return round(20 * math.log10(self._playground.world.weights.get(name, own) / own)) / 20
-
     def _start_certified(self, episode: int) -> None:
         self._playground.start_certified(episode)
         self._episode_typed = episode
@@ -262,59 +214,3 @@ class Controls:
     def _reset_plant(self) -> None:
         for stress in PLANT:
             self._playground.set_plant(stress, 0.0)
-
-    def _show_optimize(self) -> None:
-        self._optimize_text.content = f"```\n{views.optimize_command(self._playground)}\n```"
-        self._optimize_text.visible = True
-
-
-class Steering:
-    """Moves the playground's stick for a page."""
-
-    def __init__(self, page: "PlayPage"):
-        self._page, self._playground = page, page.playground
-        self._until = 0.0
-        page.viewer.on_grab = self._grab
-
-    def build(self) -> None:
-        """Adds the buttons of the pad, and the keys."""
-        gui = self._page.viewer.server.gui
-        gui.add_markdown(_LEAD)
-        for direction, keys in _KEYS.items():
-            gui.add_button(direction.capitalize()).on_hold(self._steered(direction, _HELD), callback_hz=20.0)
-            for key in keys:
-                command = gui.add_command(f"drive {direction} ({key})", hotkey=key)  # pyright: ignore[reportArgumentType]
-                command.on_trigger(self._steered(direction, _KEY_HELD))
-        gui.add_markdown("Or hold W A S D or the arrow keys, or drag the robot.")
-
-    def let_go(self) -> None:
-        """Centres the stick when nothing holds it any more."""
-        if time.perf_counter() > self._until:
-            self._playground.stick.move(0.0, 0.0)
-
-    def _steered(self, direction: str, seconds: float) -> Any:
-        """Moves the stick as seen by the browser that asks, for a while."""
-
-        async def steered(event: Any) -> None:
-            camera = event.client.camera
-            ahead = np.array(camera.look_at, np.float64)[:2] - np.array(camera.position, np.float64)[:2]
-            length = float(np.hypot(*ahead))
-            cosine, sine = (ahead / length).tolist() if math.isfinite(length) and length > 0 else (1.0, 0.0)
-            x, y = _DIRECTIONS[direction]
-            self._page.ask(event.client_id, lambda: self._move(cosine * x - sine * y, sine * x + cosine * y, seconds))
-
-        return steered
-
-    def _move(self, x: float, y: float, seconds: float) -> None:
-        self._playground.stick.move(x, y)
-        self._until = time.perf_counter() + seconds
-
-    def _grab(self, client_id: int, phase: str, vector: np.ndarray) -> None:
-        """Dragging steers where a human drives, and pushes when it ends everywhere else."""
-        x, y = vector.tolist()
-        ended = phase == "end"
-        if self._playground.is_driven:
-            held = 0.0 if ended else _DRAG_HELD
-            self._page.ask(client_id, lambda: self._move(x / _STICK_METRES, y / _STICK_METRES, held))
-        elif ended:
-            self._page.ask(client_id, lambda: self._playground.push(_IMPULSE_PER_METRE * x, _IMPULSE_PER_METRE * y))

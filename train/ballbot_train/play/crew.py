@@ -12,11 +12,10 @@ from ballbot_gym.engines import State
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import Controller
+from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.controllers import is_expert, is_file, make_controller
 from ballbot_train.play.background import Background
-from ballbot_train.play.driving import DRIVERS, DriveController, Stick
 from ballbot_train.play.runner import Runner
-from ballbot_train.play.tunable import Tunable
 from ballbot_train.play.world import World
 from ballbot_train.report import labels
 
@@ -27,7 +26,7 @@ _FROM_ELSEWHERE = ("lqr", "trajopt")  # controllers that are data, so that they 
 class Crew:
     """Runners and who controls them. A robot waits for its first controller, and goes on while another one is made."""
 
-    def __init__(self, physics: str, stick: Stick, other_process: bool):
+    def __init__(self, physics: str, other_process: bool):
         """Starts the background, which has another process plan if it is told so."""
         self.runners: list[Runner] = []
         """The main robot, then the ghosts."""
@@ -35,7 +34,7 @@ class Crew:
         """Control steps since the playground was opened."""
         self.notice = ""
         """What went wrong last, in words."""
-        self._physics, self._stick, self.background = physics, stick, Background(other_process)
+        self._physics, self.background = physics, Background(other_process)
         self._randomization = Randomization()
         self._optimum: Future | None = None
 
@@ -114,7 +113,7 @@ class Crew:
     # --- time ---
 
     def begin(self, x: State, c: tuple[float, ...]) -> None:
-        """Places all robots in state x (8,) of an episode with constants c of the tunable task. They wait for controllers."""
+        """Places all robots in state x (8,) of an episode with constants c. They wait for controllers."""
         self._x, self._c = x, c
         for runner in self.runners:
             runner.begin(x)
@@ -151,22 +150,13 @@ class Crew:
                 runner.step(self.steps, command, push, outside, self._c, seconds_left)
         self.steps += 1
 
-    def weigh_again(self, c: tuple[float, ...]) -> None:
-        """Counts costs with other weights, and has the controllers that know of them made again."""
-        self._c = c
-        for runner in self.runners:
-            runner.weigh_again(c)
-            if is_expert(runner.wanted):
-                self.order(runner)
-        self._order_optimum()
-
     # --- controllers ---
 
     def order(self, runner: Runner, ahead: int = 0) -> None:
         """Asks for the controller that a robot wants, from now on or for an episode that begins some steps ahead."""
         name, step, compute = runner.wanted, self.steps + ahead, self.background.compute
         x = np.array(runner.expected(self.steps, ahead) if ahead else runner.x)
-        made = partial(_make, name, self.world.task, self.world.params, x, np.array(self._c), self._stick, compute)
+        made = partial(_make, name, self.world.task, self.world.params, x, np.array(self._c), compute)
         future = self.background.submit(lambda: (name, step, made()))
         _cancel(runner.following)
         if ahead:
@@ -230,36 +220,30 @@ def _cancel(*jobs: Future | None) -> None:
 
 def _make(
     name: str,
-    task: Tunable,
+    task: Task,
     params: BallbotParams,
     x: np.ndarray,
     c: np.ndarray,
-    stick: Stick,
     compute: Callable[..., Any],
 ) -> Controller:
-    """The controller of a name, at the start of an episode in state x (8,) with constants c (nc,) of the tunable task.
+    """The controller of a name, at the start of an episode in state x (8,) with constants c (nc,).
 
     What takes long is called by `compute`, that may have another process do it.
     """
-    if name in DRIVERS:
-        return DriveController(task, params, stick, DRIVERS[name])
     if name in _FROM_ELSEWHERE:
         return compute(_expert, name, task, params, x, c)
-    if not is_expert(name):
-        controller = make_controller(name, task.base, params)
-        controller.reset(0.0, x, c[: len(task.base.constant_names)])
-        return controller
-    from ballbot_baselines.nmpc import NmpcController, prepared_plan  # it imports CasADi
-
     controller = make_controller(name, task, params)
-    if isinstance(controller, NmpcController):  # its solver stays in this process
-        controller.start(0.0, c, compute(prepared_plan, task, params, x, c, controller.backoff))
-    else:
-        controller.reset(0.0, x, c)
+    if is_expert(name):
+        from ballbot_baselines.nmpc import NmpcController, prepared_plan  # it imports CasADi
+
+        if isinstance(controller, NmpcController):  # its solver stays in this process
+            controller.start(0.0, c, compute(prepared_plan, task, params, x, c, controller.backoff))
+            return controller
+    controller.reset(0.0, x, c)
     return controller
 
 
-def _optimum_costs(task: Tunable, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+def _optimum_costs(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> np.ndarray:
     """(n + 1,) what the optimum has cost after each control step."""
     from ballbot_baselines import find_optimum
 
@@ -268,7 +252,7 @@ def _optimum_costs(task: Tunable, params: BallbotParams, x: np.ndarray, c: np.nd
     return np.concatenate([[0.0], np.cumsum(rates * task.control_dt)])
 
 
-def _expert(name: str, task: Tunable, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> Controller:
+def _expert(name: str, task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> Controller:
     """An expert at the start of an episode."""
     controller = CONTROLLERS[name](task, params)
     controller.reset(0.0, x, c)

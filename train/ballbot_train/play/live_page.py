@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import dynamics
+from ballbot_gym.drawing import PUSH_SCALE
 from ballbot_gym.viewer import Viewer
 from ballbot_train.escaping import markdown_text
 from ballbot_train.play import views
 from ballbot_train.play.clock import Clock
-from ballbot_train.play.controls import Controls, Steering
+from ballbot_train.play.controls import Controls
 from ballbot_train.play.plots import Plots
 from ballbot_train.play.saving import Saver
 from ballbot_train.play.simulation import Playground
@@ -63,8 +64,8 @@ class PlayPage:
         self._role_button = gui.add_button("Take the controls", visible=False)
         self._role_button.on_click(self._take_over)
         self.saver = Saver(playground, out)
-        self.steering = Steering(self)
         self._controls, self._plots = Controls(self), Plots(playground, gui)
+        viewer.on_grab = self._grab
         viewer.server.on_client_connect(self._on_connect)
         viewer.server.on_client_disconnect(self._on_disconnect)
         viewer.centre_on(np.array(playground.main.x[:2]))
@@ -106,11 +107,6 @@ class PlayPage:
         """Has the loop do something between two steps; from any thread."""
         self._requests.put(action)
 
-    def close(self) -> None:
-        """Ends `run`, and gives up a film that is not finished."""
-        self.stop()
-        self.saver.close()
-
     def _collect_garbage(self) -> None:
         """Does it when the robot begins to move. A collection of everything that was imported would be a step too late."""
         gc.unfreeze()
@@ -125,7 +121,6 @@ class PlayPage:
             if self.single_steps > 0 and self.playground.step():
                 self.single_steps -= 1
             return False
-        self.steering.let_go()
         for _ in range(_MOST_STEPS):
             if not self.clock.take():
                 break
@@ -140,7 +135,7 @@ class PlayPage:
         with contextlib.suppress(queue.Empty):
             asked = [self._requests.get(timeout=patience)] if patience > 0 else []
         asked += [self._requests.get() for _ in range(self._requests.qsize())]
-        for action in [*asked, *[self._controls.refresh] * (len(asked) > 0), self.saver.poll]:
+        for action in [*asked, *[self._controls.refresh] * (len(asked) > 0)]:
             try:
                 action()
             except Exception as error:
@@ -170,6 +165,12 @@ class PlayPage:
         if self.driver is None:
             self.driver = client_id
         return self.driver == client_id
+
+    def _grab(self, client_id: int, phase: str, vector: np.ndarray) -> None:
+        """A drag pushes when it ends, so that the arrow ends where it did."""
+        if phase == "end":
+            x, y = (vector / PUSH_SCALE).tolist()
+            self.ask(client_id, lambda: self.playground.push(x, y))
 
     async def _on_connect(self, client: Any) -> None:
         self.visitors.add(client.client_id)

@@ -14,9 +14,9 @@ from ballbot_gym.env import GRIP
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Disturbance, Randomization
 from ballbot_gym.rollout import Controller
+from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.play.tunable import Tunable
 
 TRACE_STEPS = 400
 """Control steps that the trace on the floor and the plots go back."""
@@ -40,7 +40,7 @@ class Sample(NamedTuple):
 class Runner:
     """A ballbot under one controller. Its controller counts time from the step in which it was reset."""
 
-    def __init__(self, name: str, task: Tunable, params: BallbotParams, physics: str):
+    def __init__(self, name: str, task: Task, params: BallbotParams, physics: str):
         self.name = self.wanted = name
         """Under which controller it runs, and which it shall have as soon as that is made."""
         self.making: Future | None = None
@@ -164,7 +164,7 @@ class Runner:
             command: (2,) N.
             push: (2,) N·s, an impulse on the body's centre of mass.
             outside: (2,) N, a force on the ball during the step.
-            c: constants of the tunable task.
+            c: constants of the episode.
             seconds_left: s, of the episode after this step: what a failure costs.
         """
         task, dt = self._task, self._task.control_dt
@@ -195,14 +195,6 @@ class Runner:
             return False
         asked = dynamics.held_contact(self.true, self.x, total, self._task.control_dt)
         return not dynamics.keeps_grip(self.true, asked)
-
-    def weigh_again(self, c: tuple[float, ...]) -> None:
-        """Counts the cost so far with other weights."""
-        dt = self._task.control_dt
-        self.cost = sum(
-            self._task.cost(x, u, self._task.at(c, k * dt)) * dt
-            for k, (x, u) in enumerate(zip(self._states, self._forces, strict=False))
-        )
 
     def close(self) -> None:
         """Releases the simulator; may be called again."""

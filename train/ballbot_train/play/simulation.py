@@ -16,7 +16,6 @@ from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.play.crew import Crew
-from ballbot_train.play.driving import DRIVERS, Stick
 from ballbot_train.play.runner import Runner, failure_word
 from ballbot_train.play.world import PLANT, World, drawn_robot, randomization, severity
 from ballbot_train.report import labels
@@ -66,8 +65,8 @@ class Score(NamedTuple):
 class Playground:
     """A ballbot, its ghosts and their world. `step` moves everything by one control step; nothing here waits for real time.
 
-    Whatever asks for something unknown, or for a value outside of its bounds, gets a ValueError and changes nothing. Except
-    for `stick`, everything is for one thread.
+    Whatever asks for something unknown, or for a value outside of its bounds, gets a ValueError and changes nothing. It is
+    for one thread.
     """
 
     def __init__(
@@ -87,8 +86,8 @@ class Playground:
 
         Args:
             task: name of a task.
-            controller: of the main robot: an expert, a policy that comes with the package, the path of a policy file or of a
-                model that Stable-Baselines3 or rsl_rl saved, or one of `DRIVERS`; default, `World.best`.
+            controller: of the main robot: an expert, a policy that comes with the package, or the path of a policy file or
+                of a model that Stable-Baselines3 saved; default, `World.best`.
             ghosts: controllers of the ghosts.
             physics: "bullet", "mujoco" or "rk4"; default, as for environments.
             episode: index of a certified episode; "rest" for standing at the origin; None for a random start.
@@ -106,7 +105,6 @@ class Playground:
         world = World(task, robot, policies)
         controller = world.best if controller is None else controller
         world.check_controllers(controller, *ghosts)
-        self.stick = Stick()
         self.at_end: AtEnd = "go on"
         self.scores: list[Score] = []
         """Of the last episodes of the main robot."""
@@ -115,7 +113,7 @@ class Playground:
         self._rng = np.random.default_rng(seed)
         self._track = checked_randomization(randomization)
         self._randomization = Randomization()
-        self.crew = Crew(default_physics() if physics is None else physics, self.stick, other_process)
+        self.crew = Crew(default_physics() if physics is None else physics, other_process)
         self._open(world, controller, ghosts, episode)
 
     # --- what it is ---
@@ -139,11 +137,6 @@ class Playground:
     def ended(self) -> bool:
         """Whether the episode is over, and everything stands still."""
         return self._pause_left > 0
-
-    @property
-    def is_driven(self) -> bool:
-        """Whether a human drives the main robot."""
-        return self.main.name in DRIVERS
 
     @property
     def optimum_cost(self) -> float:
@@ -245,11 +238,6 @@ class Playground:
         self.world.check_controllers(*ghosts)
         self.crew.set_ghosts(ghosts)
 
-    def set_weight(self, name: str, value: float) -> None:
-        """Changes a weight of the cost; LQR, trajectory optimization and NMPC reckon with it as soon as they can."""
-        self.world.set_weight(name, value)
-        self.crew.weigh_again(self.world.constants(self.start[1]))
-
     def set_plant(self, stress: str, value: float) -> None:
         """Changes what the controllers do not know, for every robot. The value is a severity within its `Span`."""
         self.plant[stress] = severity(stress, value)
@@ -266,11 +254,11 @@ class Playground:
 
     def start_random(self) -> None:
         """Begins an episode with a random start."""
-        self._begin(self.world.base.sample(self._rng, self.world.params), None)
+        self._begin(self.world.task.sample(self._rng, self.world.params), None)
 
     def start_at_rest(self) -> None:
         """Begins an episode that stands at the origin until it is pushed, which happens by itself."""
-        self._begin((np.zeros(8), self.world.base.sample(self._rng, self.world.params)[1]), None, True)
+        self._begin((np.zeros(8), self.world.task.sample(self._rng, self.world.params)[1]), None, True)
 
     # --- inside ---
 
@@ -301,7 +289,7 @@ class Playground:
             self._randomization = drawn_robot(self._track, self._rng, self.world.task.control_dt)
             self.crew.set_plant(self._randomization)
         self._first_push_at = -1 if not at_rest else round(_FIRST_PUSH_AFTER / self.world.task.control_dt)
-        self.crew.begin(tuple(map(float, start[0])), self.world.constants(start[1]))
+        self.crew.begin(tuple(map(float, start[0])), tuple(map(float, start[1])))
 
     def _after_step(self) -> None:
         task, main = self.world.task, self.main

@@ -1,4 +1,4 @@
-"""What there is to see of a playground, and what is kept of it."""
+"""What there is to see of a playground."""
 
 import math
 from pathlib import Path
@@ -8,11 +8,9 @@ import numpy as np
 
 from ballbot_gym import dynamics
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
-from ballbot_train.play.driving import DRIVERS
 from ballbot_train.play.runner import Runner, Sample, failure_word
 from ballbot_train.play.simulation import Playground
 from ballbot_train.report import labels
-from ballbot_train.report.replay import Replay, Take
 
 _PLAN_POINTS = 60  # of a drawn plan
 
@@ -44,13 +42,13 @@ def drawing(playground: Playground) -> Drawing:
             paths.append(GroundPath(np.array(runner.trace), tint, name=name))
     if (planned := _plan(playground)) is not None:
         paths.append(GroundPath(planned, color(main, 0), dashed=True, name="plan"))
-    markers = tuple(playground.world.base.markers(playground.start[1]))
+    markers = tuple(playground.world.task.markers(playground.start[1]))
     return Drawing(playground.world.params, tuple(robots), tuple(paths), markers)
 
 
 def color(runner: Runner, i: int) -> str:
     """The colour of the `i`-th robot."""
-    return labels.YOU if runner.name in DRIVERS else labels.color(Path(runner.name).stem, i)
+    return labels.color(Path(runner.name).stem, i)
 
 
 def colors(playground: Playground) -> dict[str, str]:
@@ -87,38 +85,6 @@ def status(playground: Playground) -> str:
         return playground.scores[-1].text
     of = f"{playground.seconds:.1f} s of {playground.world.task.duration:g} s"
     return f"{labels.label(playground.main.name)}, {of}"
-
-
-def replay(playground: Playground) -> Replay:
-    """The episode so far, of every robot, as a film shows it.
-
-    Raises:
-        ValueError: it has not begun.
-    """
-    playground.trajectory()
-    takes = [
-        Take(
-            labels.label(runner.name),
-            runner.trajectory,
-            color(runner, i),
-            failure_word(runner.violated) or f"cost {runner.cost:.1f}",
-            runner.violated != "",
-        )
-        for i, runner in enumerate(playground.crew.runners)
-        if runner.trajectory is not None
-    ]
-    markers = tuple(playground.world.base.markers(playground.start[1]))
-    return Replay(f"{playground.world.task_name}, played", tuple(takes), markers, playground.world.params)
-
-
-def optimize_command(playground: Playground) -> str:
-    """The command that finds the optimum from where the main robot is."""
-    state = " ".join(f"{value:.9g}" for value in playground.main.x)
-    named = zip(playground.world.base.constant_names, playground.start[1], strict=True)
-    constants = " ".join(f"{name} {value:.9g}" for name, value in named)
-    return f"ballbot optimize {playground.world.task_name} --state {state}" + (
-        f" --constants {constants}" if constants else ""
-    )
 
 
 def _plan(playground: Playground) -> np.ndarray | None:

@@ -17,12 +17,7 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
 from ballbot_train.evaluation.controllers import is_expert, is_made_for, is_saved_model, made_for, names
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.driving import DRIVERS
-from ballbot_train.play.tunable import Tunable, weight_names
 from ballbot_train.policy_files import BEST, PolicyError, shipped_policies
-
-WEIGHT_FACTOR = 100.0
-"""How far a weight may be from the task's own, as a factor, up and down."""
 
 
 class Span(NamedTuple):
@@ -49,7 +44,7 @@ class World:
     """A task for a robot. Whatever is unknown or out of bounds is refused with a ValueError and changes nothing."""
 
     def __init__(self, task: str, robot: str, policies: Sequence[str] = ()):
-        """A task and a robot by name, with its own weights. `policies` are paths of files that can be chosen where they fit.
+        """A task and a robot by name. `policies` are paths of files that can be chosen where they fit.
 
         Raises:
             PolicyError: one of them is missing or damaged.
@@ -57,16 +52,13 @@ class World:
         check_names("task", [task], TASKS)
         check_names("robot", [robot], ROBOTS)
         self.task_name, self.robot, self.params = task, robot, named_robot(robot)
-        self.base: Task = make_task(task, robot)
-        self.task = Tunable.of(self.base)
-        self.weights: dict[str, float] = {}
-        """Those that differ from the task's own."""
+        self.task: Task = make_task(task, robot)
         self.policies: list[str] = []
         self.controllers: list[str] = []
         """What can be chosen, experts first."""
         self.certified: certified.EvaluationSet | None = None
         with contextlib.suppress(certified.CertificateError):
-            self.certified = certified.load(self.base, robot)
+            self.certified = certified.load(self.task, robot)
         for policy in policies:
             made_for(policy)  # whether it can be read
         self.offer(*policies)
@@ -80,7 +72,7 @@ class World:
     def best(self) -> str:
         """The controller to begin with: the shipped policy with the least regret, or else NMPC."""
         name = BEST.get(self.task_name, "")
-        return name if name in shipped_policies(self.base, self.robot) else "nmpc"
+        return name if name in shipped_policies(self.task, self.robot) else "nmpc"
 
     def offer(self, *policies: str) -> None:
         """Has more policy files be chosen, if they are made for the task and the robot."""
@@ -88,15 +80,14 @@ class World:
         own = []
         for policy in self.policies:
             with contextlib.suppress(PolicyError):  # a file that is gone by now
-                own += [policy] * is_made_for(policy, self.base, self.robot)
-        known = names(self.base, self.robot)
+                own += [policy] * is_made_for(policy, self.task, self.robot)
+        known = names(self.task, self.robot)
         experts = [name for name in known if is_expert(name)]
         self.controllers = [
             *experts,
             "nmpc-offset-free",
             *(name for name in known if name not in experts),
             *own,
-            *DRIVERS,
         ]
 
     def check_controllers(self, *wanted: str) -> None:
@@ -105,23 +96,9 @@ class World:
             readable = is_saved_model(name) or Path(name).suffix in (".json", ".safetensors")
             if name not in self.controllers and not (readable and Path(name).is_file()):
                 raise ValueError(
-                    f"unknown controller {name!r}; {self.base.id} has {', '.join(self.controllers)}, or give a policy's "
-                    ".json, or a model saved by Stable-Baselines3 (.zip) or rsl_rl (.pt)"
+                    f"unknown controller {name!r}; {self.task.id} has {', '.join(self.controllers)}, or give a policy's "
+                    ".json, or a model saved by Stable-Baselines3 (.zip)"
                 )
-
-    def set_weight(self, name: str, value: float) -> None:
-        """Changes a weight of the cost."""
-        check_names("weight", [name], weight_names(self.base))
-        own = getattr(self.base, name)
-        if not own / WEIGHT_FACTOR <= value <= own * WEIGHT_FACTOR:
-            raise ValueError(f"{name} must be {own / WEIGHT_FACTOR:g} to {own * WEIGHT_FACTOR:g}, not {value:g}")
-        self.weights[name] = value
-        if value == own:
-            del self.weights[name]
-
-    def constants(self, c: np.ndarray) -> tuple[float, ...]:
-        """The constants of the tunable task in an episode with constants c (nc,)."""
-        return tuple(self.task.constants(c, self.weights).tolist())
 
     def certified_start(self, episode: int) -> tuple[np.ndarray, np.ndarray]:
         """The state (8,) and the constants (nc,) with which a certified episode begins."""
@@ -132,8 +109,8 @@ class World:
         return self.certified.states[episode], self.certified.constants[episode]
 
     def certified_cost(self, episode: int | None) -> float:
-        """What the optimum of a certified episode costs with the task's own weights; NaN for other episodes or weights."""
-        if self.certified is None or episode is None or self.weights:
+        """What the optimum of a certified episode costs; NaN for other episodes."""
+        if self.certified is None or episode is None:
             return math.nan
         return float(self.certified.costs[episode])
 

@@ -108,27 +108,17 @@ def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Cir
     return figure
 
 
-def regret_curves(results: Sequence[Result], task: str) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """For each controller on a task: its name, its regrets (n,) in ascending order, %, and the share of episodes, %.
-
-    The k-th share is the share of episodes that end within the k-th regret.
-    """
-    curves = []
-    for controller in dict.fromkeys(result.controller for result in results if result.task == task):
-        group = [result for result in results if (result.task, result.controller) == (task, controller)]
-        # an episode that stands but misses its goal has no meaningful regret
-        regrets = np.sort([max(100 * result.regret, _LEAST_REGRET) for result in group if result.success])
-        curves.append((controller, regrets, 100 * np.arange(1, len(regrets) + 1) / len(group)))
-    return curves
-
-
 def regret_figure(results: Sequence[Result]) -> Figure:
     """For every task, the share of episodes that each controller finishes within a given regret."""
     tasks = list(dict.fromkeys(result.task for result in results))
     figure = Figure(figsize=(4.2 * len(tasks), 3.8), layout="constrained")
     axes = figure.subplots(1, len(tasks), squeeze=False)
     for axis, task in zip(axes[0], tasks, strict=True):
-        for i, (controller, regrets, share) in enumerate(regret_curves(results, task)):
+        for i, controller in enumerate(dict.fromkeys(result.controller for result in results if result.task == task)):
+            group = [result for result in results if (result.task, result.controller) == (task, controller)]
+            # an episode that stands but misses its goal has no meaningful regret
+            regrets = np.sort([max(100 * result.regret, _LEAST_REGRET) for result in group if result.success])
+            share = 100 * np.arange(1, len(regrets) + 1) / len(group)
             axis.step(regrets, share, where="post", lw=2, color=color(controller, i), label=label(controller))
         axis.set(
             xscale="log", xlim=(_LEAST_REGRET, 1000), ylim=(0, 102), title=task, xlabel="cost above the optimum, %"

@@ -18,7 +18,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from ballbot_gym import dynamics, files
-from ballbot_gym.drawing import GHOST, Drawing
+from ballbot_gym.drawing import Drawing
 from ballbot_gym.picture import picture
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
@@ -227,15 +227,11 @@ class _Film:
             self._stages.append(_Stage(view, tilt, note, end))
             self._moving += [view.image, tilt, note, end]
 
-    def _ghosts(self) -> list[tuple[str, Ghost]]:
-        """Every ghost once, with its colour in the traces: its own, or that of the take it goes on from."""
-        found = {id(ghost.trajectory): (take, ghost) for take in self._replay.takes for ghost in take.ghosts}
+    def _ghosts(self) -> list[Ghost]:
+        """Every ghost once that is no take."""
+        found = {id(ghost.trajectory): ghost for take in self._replay.takes for ghost in take.ghosts}
         shown = {id(take.trajectory) for take in self._replay.takes}
-        return [
-            (take.color if ghost.color == GHOST else ghost.color, ghost)
-            for key, (take, ghost) in found.items()
-            if key not in shown
-        ]
+        return [ghost for key, ghost in found.items() if key not in shown]
 
     def _add_traces(self, seconds: float) -> None:
         tilt, force, path = (
@@ -247,12 +243,11 @@ class _Film:
             tilt.plot(t, np.degrees(take.trajectory.tilt), color=take.color, lw=1.6)
             force.plot(t[: len(u)], np.hypot(*u.T), color=take.color, lw=1.2, drawstyle=_drawstyle(take.trajectory))
             path.plot(*take.trajectory.x[:, :2].T, color=take.color, lw=1.6)
-        for color, ghost in self._ghosts():
-            look = {"color": color, "lw": 1.2, "ls": "--", "alpha": 0.7}
-            later, force_style = ghost.start + ghost.trajectory.t, _drawstyle(ghost.trajectory)
-            u = ghost.trajectory.u
-            tilt.plot(later, np.degrees(ghost.trajectory.tilt), **look)
-            force.plot(later[: len(u)], np.hypot(*u.T), drawstyle=force_style, **look)
+        for ghost in self._ghosts():
+            look = {"color": ghost.color, "lw": 1.2, "ls": "--", "alpha": 0.7}
+            t, u = ghost.trajectory.t, ghost.trajectory.u
+            tilt.plot(t, np.degrees(ghost.trajectory.tilt), **look)
+            force.plot(t[: len(u)], np.hypot(*u.T), drawstyle=_drawstyle(ghost.trajectory), **look)
             path.plot(*ghost.trajectory.x[:, :2].T, **look)
         tilt.set(xlim=(0, seconds), xlabel="time, s", title="tilt, deg")
         force.set(xlim=(0, seconds), xlabel="time, s", title="force, N")

@@ -1,19 +1,15 @@
-"""One self-contained HTML page: tables that sort, figures, curves, and a replay in 3D.
+"""One self-contained HTML page: tables that sort, figures, and a replay in 3D.
 
-A page is a list of `Section`s. Everything is embedded, Plotly's JavaScript included, so the file opens offline and can be
-moved. The templates, scripts and styles are in `assets/`. The templates escape all text.
+A page is a list of `Section`s. Everything is embedded, so the file opens offline and can
+be moved. The templates, scripts and styles are in `assets/`. The templates escape all text.
 """
-
-from __future__ import annotations
 
 import base64
 import functools
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jinja2
 import numpy as np
@@ -21,14 +17,11 @@ from markupsafe import Markup
 
 from ballbot_gym import drawing, files
 from ballbot_gym.params import BallbotParams
-from ballbot_train.escaping import plotly_text
 from ballbot_train.report.replay import Replay, Take
-
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
 
 _ASSETS = Path(__file__).parent / "assets"
 _WORD_COLUMNS = 2  # of a table: the first columns hold words, the others hold numbers
+_REPLAY_SCRIPTS = ("scene.js", "replay.js")
 _REPLAY_DT = 0.02  # s, between the states in the page
 
 
@@ -42,33 +35,7 @@ class Section:
     lead: str = ""
     """One or two sentences above the body, plain text."""
     scripts: tuple[str, ...] = ()
-    """The scripts that the body needs: "plotly", and names of files in `assets/`."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """A curve over x (n,), with a band between `low` and `high` (n,) if given."""
-
-    label: str
-    x: Sequence[float] | np.ndarray
-    y: Sequence[float] | np.ndarray
-    color: str
-    low: Sequence[float] | np.ndarray | None = None
-    high: Sequence[float] | np.ndarray | None = None
-    steps: bool = False
-    """Whether y jumps at each x instead of running straight to the next."""
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Axes with curves."""
-
-    title: str
-    x_label: str
-    y_label: str
-    lines: Sequence[Line]
-    log_x: bool = False
-    log_y: bool = False
+    """The scripts that the body needs, by their names in `assets/`."""
 
 
 def write_report(title: str, sections: Iterable[Section | None], facts: Mapping[str, object], path: Path) -> Path:
@@ -85,42 +52,27 @@ def write_report(title: str, sections: Iterable[Section | None], facts: Mapping[
     """
     shown = [section for section in sections if section is not None]
     names = dict.fromkeys(name for section in shown for name in section.scripts)
-    page = _render(
+    page = render(
         "page.html.j2",
         title=title,
         sections=shown,
         facts=facts,
-        style=_asset("style.css"),
-        plotly=_plotly_script() if "plotly" in names else None,
-        scripts=[_asset(name) for name in names if name != "plotly"],
+        style=asset("style.css"),
+        scripts=[asset(name) for name in names],
     )
     return files.write(path, page)
 
 
 def table_section(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], lead: str = "") -> Section:
     """A table that the reader can sort by any column, and filter by the words of its first column."""
-    table = _render("table.html.j2", header=header, rows=rows, word_columns=_WORD_COLUMNS)
+    table = render("table.html.j2", header=header, rows=rows, word_columns=_WORD_COLUMNS)
     return Section(title, table, lead, ("table.js",))
 
 
 def pictures_section(title: str, pictures: Iterable[Path], lead: str = "") -> Section | None:
     """Embedded PNGs one under another, captioned with their names; None if there are none."""
     shown = [{"name": path.stem, "base64": base64.b64encode(files.read(path)).decode()} for path in pictures]
-    return Section(title, _render("pictures.html.j2", pictures=shown), lead) if shown else None
-
-
-def folder_section(title: str, folder: Path, lead: str = "") -> Section | None:
-    """The PNGs in a folder that another command has written; None if there are none."""
-    return pictures_section(title, sorted(folder.glob("*.png")), lead)
-
-
-def curves_section(title: str, panels: Sequence[Panel], lead: str = "") -> Section | None:
-    """Curves that the reader can zoom and read off, under one legend; None if there are no panels."""
-    if not panels:
-        return None
-    legend = dict.fromkeys((line.label, line.color) for panel in panels for line in panel.lines)
-    figures = [_panel(panel).to_plotly_json() for panel in panels]
-    return Section(title, _render("curves.html.j2", legend=legend, panels=figures), lead, ("plotly", "curves.js"))
+    return Section(title, render("pictures.html.j2", pictures=shown), lead) if shown else None
 
 
 def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Section | None:
@@ -128,24 +80,24 @@ def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Sec
     replays = [replay for replay in replays if replay.takes]
     if not replays:
         return None
-    return Section(title, _replays(replays, traces=True), lead, ("plotly", "scene.js", "replay.js"))
+    return Section(title, _replays(replays), lead, _REPLAY_SCRIPTS)
 
 
 def replay_page(replay: Replay) -> str:
-    """The same without traces and so without Plotly, as a page of its own of some 60 kB."""
-    page = _render(
+    """The same as a page of its own."""
+    page = render(
         "frame.html.j2",
         title=replay.title,
-        body=_replays([replay], traces=False),
-        style=_asset("style.css"),
-        scripts=[_asset(name) for name in ("scene.js", "replay.js")],
+        body=_replays([replay]),
+        style=asset("style.css"),
+        scripts=[asset(name) for name in _REPLAY_SCRIPTS],
     )
     return str(page)
 
 
-def _replays(replays: Sequence[Replay], traces: bool) -> Markup:
+def _replays(replays: Sequence[Replay]) -> Markup:
     data = scene_data(replays[0].params) | {"episodes": [_replay_data(replay) for replay in replays]}
-    return _render("replay.html.j2", data=data, traces=traces)
+    return render("replay.html.j2", data=data)
 
 
 def scene_data(params: BallbotParams) -> dict[str, object]:
@@ -168,74 +120,18 @@ def _templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.policies["json.dumps_function"] = _json
-    environment.policies["json.dumps_kwargs"] = {}
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False}
     return environment
 
 
-def _render(template: str, **values: object) -> Markup:
+def render(template: str, **values: object) -> Markup:
+    """A template of `assets/` with these values."""
     return Markup(_templates().get_template(template).render(values))
 
 
-def _asset(name: str) -> Markup:
+def asset(name: str) -> Markup:
     """The text of one of this package's own scripts or styles."""
     return Markup((_ASSETS / name).read_text(encoding="utf-8"))
-
-
-def _plotly_script() -> Markup:
-    import plotly.offline
-
-    return Markup(plotly.offline.get_plotlyjs())
-
-
-def _json(data: object) -> str:
-    """Compact JSON of figures and replays; the template's `tojson` escapes it afterwards."""
-    from plotly.utils import PlotlyJSONEncoder
-
-    return json.dumps(data, separators=(",", ":"), ensure_ascii=False, cls=PlotlyJSONEncoder)
-
-
-def _panel(panel: Panel) -> Figure:
-    from plotly.graph_objects import Figure
-
-    figure = Figure(layout_template="none")
-    for line in panel.lines:
-        if line.low is not None and line.high is not None:
-            outline = np.concatenate([line.x, np.asarray(line.x)[::-1]])
-            band = np.concatenate([line.high, np.asarray(line.low)[::-1]])
-            figure.add_scatter(
-                x=outline.tolist(),
-                y=band.tolist(),
-                fill="toself",
-                fillcolor=line.color,
-                opacity=0.15,
-                line={"width": 0},
-                mode="lines",
-                hoverinfo="skip",
-            )
-        figure.add_scatter(
-            x=np.asarray(line.x).tolist(),
-            y=np.asarray(line.y).tolist(),
-            name=plotly_text(line.label),
-            mode="lines",
-            line={"color": line.color, "width": 2, "shape": "hv" if line.steps else "linear"},
-        )
-    figure.update_layout(
-        title={"text": plotly_text(panel.title), "font": {"size": 14}, "x": 0.02, "y": 0.97},
-        plot_bgcolor="rgba(0,0,0,0)",
-        paper_bgcolor="rgba(0,0,0,0)",
-        margin={"l": 52, "r": 12, "t": 34, "b": 44},
-        showlegend=False,
-        height=300,
-        xaxis=_axis(panel.x_label, panel.log_x),
-        yaxis=_axis(panel.y_label, panel.log_y),
-    )
-    return figure
-
-
-def _axis(label: str, log: bool) -> dict[str, object]:
-    kind = {"type": "log", "dtick": 1} if log else {"type": "linear"}
-    return {"title": label, "linecolor": "#8a93a3", **kind}
 
 
 def _replay_data(replay: Replay) -> dict[str, object]:

@@ -1,5 +1,5 @@
 """The playground without Python: one HTML page in which a learned policy and LQR balance beside the optimum, and the reader
-pushes them, drives an episode, or drops a policy of their own.
+pushes them, or drives an episode.
 
 Everything is in the page: the closed-form model, the tasks' costs, limits and observations, LQR's gains and the policies'
 weights. The model and the tasks are printed as JavaScript from the lines that Python runs; see `printed`.
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import casadi
-import jinja2
 import numpy as np
 import safetensors.numpy
 from markupsafe import Markup
@@ -28,13 +27,11 @@ from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy_files import BEST, PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
-from ballbot_train.report.page import scene_data
+from ballbot_train.report.page import asset, render, scene_data
 from ballbot_train.report.printed import javascript_function
 
 LARGEST = 2_000_000
 """Bytes that the page may have."""
-
-_ASSETS = Path(__file__).parent / "assets"
 
 
 @dataclass(frozen=True)
@@ -108,16 +105,15 @@ def playground_page(policies: Sequence[str] = ()) -> str:
         PolicyError: a file is no policy.
         ValueError: a policy is of no registered task, two are of one task, or the page would be larger than `LARGEST`.
     """
-    loader = jinja2.FileSystemLoader(_ASSETS)
-    templates = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    page = templates.get_template("playground.html.j2").render(
-        style=_asset("playground.css"),
-        scripts=[Markup(engine_script(policies)), _asset("scene.js"), _asset("playground.js")],
+    page = render(
+        "playground.html.j2",
+        style=asset("playground.css"),
+        scripts=[Markup(engine_script(policies)), asset("scene.js"), asset("playground.js")],
     )
     size = len(page.encode())
     if size > LARGEST:
         raise ValueError(f"the page would have {size / 1e6:.2f} MB, and at most {LARGEST / 1e6:g} MB load at once")
-    return page
+    return str(page)
 
 
 def engine_script(policies: Sequence[str] = ()) -> str:
@@ -134,16 +130,12 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         "policies": _policies(policies),
         "you": {"label": "you", "color": labels.YOU},
         "best": {"label": "optimum", "color": labels.OPTIMUM},
-        "tasks": {
-            name: {"id": task.id, "observations": len(task.observation_scale)}
-            for name, task in ((name, make_task(name)) for name in BEST)
-        },
         "scenarios": [_scenario_data(episode, params) for scenario in SCENARIOS for episode in _episodes(scenario)],
     }
     # Within a script, "<" could end it.
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     specs = {name: policy["frame"] for name, policy in data["policies"].items()}
-    return "\n".join([_model_script(params, specs), f"const DATA = {text};", _asset("engine.js"), _asset("onnx.js")])
+    return "\n".join([_model_script(params, specs), f"const DATA = {text};", asset("engine.js")])
 
 
 def _episodes(scenario: Scenario) -> list[Scenario]:
@@ -287,8 +279,3 @@ def _task_script(name: str, task: Task, frame: str | None) -> tuple[str, str]:
 def _packed(numbers: np.ndarray, kind: type) -> str:
     """Numbers in base64, little-endian, as every browser's machine reads them."""
     return base64.b64encode(np.ascontiguousarray(numbers, np.dtype(kind).newbyteorder("<")).tobytes()).decode()
-
-
-def _asset(name: str) -> Markup:
-    """The text of one of this package's own scripts or styles."""
-    return Markup((_ASSETS / name).read_text(encoding="utf-8"))

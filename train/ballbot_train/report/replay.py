@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ballbot_baselines import CONTROLLERS
 from ballbot_gym import certified
-from ballbot_gym.drawing import GHOST, GHOST_OPACITY, Drawing, GroundPath, Robot
-from ballbot_gym.engines import PHYSICS_NAMES
+from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.robots import PAPER, named_robot
@@ -30,21 +28,11 @@ _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 @dataclass(frozen=True)
 class Ghost:
-    """Another controller's trajectory beside a take, from time `start` of the take on, s; its own times begin at 0."""
+    """Another controller's trajectory beside a take, from the same start."""
 
     label: str
     trajectory: Trajectory
-    color: str = GHOST
-    start: float = 0.0
-
-    @property
-    def end(self) -> float:
-        """The time of the take at which it has ended, s."""
-        return self.start + self.trajectory.duration
-
-    def state(self, t: float) -> np.ndarray | None:
-        """(8,) its state at time t of the take, s; None before it starts."""
-        return None if t < self.start else self.trajectory.state(t - self.start)
+    color: str
 
 
 @dataclass(frozen=True)
@@ -52,7 +40,7 @@ class Take:
     """One trajectory to watch.
 
     `note` says how it ended, and `failed` whether the robot fell or touched an obstacle. `ghosts` are drawn translucent
-    beside it: other controllers from the same start, or an expert that goes on from the middle.
+    beside it.
     """
 
     label: str
@@ -73,7 +61,7 @@ class Take:
     @property
     def end(self) -> float:
         """The time at which the trajectory and its ghosts have all ended, s."""
-        return max(self.trajectory.duration, *(ghost.end for ghost in self.ghosts), 0.0)
+        return max(self.trajectory.duration, *(ghost.trajectory.duration for ghost in self.ghosts), 0.0)
 
 
 @dataclass(frozen=True)
@@ -96,10 +84,9 @@ class Replay:
         robots, paths = [], [GroundPath(_driven_path(take.trajectory, t), take.color)]
         paths += [GroundPath(points, _SKID, name=f"skid {i}") for i, points in enumerate(_skids(take, t))]
         for i, ghost in enumerate(take.ghosts):
-            if (x := ghost.state(t)) is not None:
-                name = f"ghost {i}"
-                robots.append(Robot(x, ghost.color, alpha=GHOST_OPACITY, name=name))
-                paths.append(GroundPath(_driven_path(ghost.trajectory, t - ghost.start), ghost.color, True, name))
+            name = f"ghost {i}"
+            robots.append(Robot(ghost.trajectory.state(t), ghost.color, alpha=GHOST_OPACITY, name=name))
+            paths.append(GroundPath(_driven_path(ghost.trajectory, t), ghost.color, True, name))
         robots.append(Robot(take.trajectory.state(t), take.color, u))
         return Drawing(self.params, tuple(robots), tuple(paths), self.markers)
 
@@ -169,16 +156,6 @@ def certified_replay(
     return Replay(f"{task}, certified episode {episode}", tuple(takes), markers, params)
 
 
-def engines_replay(task: str, controller: str, episode: int, physics: Sequence[str], robot: str = PAPER) -> Replay:
-    """A certified episode under one controller in several physics, side by side. Args: as of `certified_replay`."""
-    shown = [certified_replay(task, [controller], episode, engine, robot=robot) for engine in physics]
-    takes = [
-        replace(replay.takes[0], label=f"{replay.takes[0].label} in {PHYSICS_NAMES[engine]}", color=labels.color("", i))
-        for i, (engine, replay) in enumerate(zip(physics, shown, strict=True))
-    ]
-    return replace(shown[0], takes=tuple(takes))
-
-
 def _take(
     env: BallbotEnv,
     controller: Controller,
@@ -226,46 +203,6 @@ def with_companions(replay: Replay, others: Replay) -> Replay:
         for take in replay.takes
     )
     return replace(replay, takes=takes)
-
-
-def with_ghosts(
-    replay: Replay, task: str, episode: int, at: float, expert: str, physics: str, robot: str = PAPER
-) -> Replay:
-    """Adds a ghost to every take of a certified episode: the expert's trajectory from the take's state at time `at`, s.
-
-    The ghost lasts a whole episode, under the same physics. A take from which the expert finds no plan gets no ghost, and
-    its note says so.
-
-    Raises:
-        ValueError: a take has ended before `at`, or the task does not allow its state.
-        PlanError: the expert finds no plan from any take.
-    """
-    env = BallbotEnv(task, physics=physics, robot=robot)
-    try:
-        c = optima.known(env.task, robot, [episode]).constants[episode]
-        controller = CONTROLLERS[expert](env.task, env.params)
-        takes = []
-        for take in replay.takes:
-            if not 0 <= at < take.trajectory.duration:
-                raise ValueError(
-                    f"{take.label} ends at {take.trajectory.duration:.2f} s: no ghost can start at {at:g} s"
-                )
-            start = round(at / env.task.control_dt) * env.task.control_dt
-            options = {"state": take.trajectory.state(start), "constants": c}
-            try:
-                run = rollout(env, controller, options=options)
-            except PlanError:
-                takes.append(replace(take, note=f"{take.note}; {expert} finds no way on from {start:.2f} s"))
-                continue
-            end = "fails" if run.failure else "at the goal" if run.success else "goes on"
-            note = f"{take.note}; ghost from {start:.2f} s: {end}"
-            ghost = Ghost(labels.label(expert), run.trajectory, start=start)
-            takes.append(replace(take, ghosts=(*take.ghosts, ghost), note=note))
-        if not any(ghost.color == GHOST for take in takes for ghost in take.ghosts):
-            raise PlanError(f"{expert} finds no way on from {at:g} s under {', '.join(take.label for take in takes)}")
-        return replace(replay, takes=tuple(takes))
-    finally:
-        env.close()
 
 
 def file_replay(paths: Sequence[Path]) -> Replay:

@@ -1,27 +1,13 @@
-"""What the leaderboard's page holds besides its table, each part where its data exist."""
+"""The parts of the leaderboard's page."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from markupsafe import Markup
 
-from ballbot_gym import files
 from ballbot_gym.robots import PAPER
-from ballbot_train.console import console
 from ballbot_train.evaluation.results import Result
-from ballbot_train.report import figures, labels
-from ballbot_train.report.page import (
-    Line,
-    Panel,
-    Section,
-    curves_section,
-    folder_section,
-    pictures_section,
-    replay_section,
-    table_section,
-)
+from ballbot_train.report.page import Section, pictures_section, replay_section, table_section
 from ballbot_train.report.playground import playground_page
 from ballbot_train.report.replay import Replay, certified_replay
 
@@ -31,10 +17,9 @@ def leaderboard_sections(
     table: Sequence[Sequence[str]],
     results: Sequence[Result],
     controllers: Mapping[str, Sequence[str]],
+    regrets: Path,
     pictures: Sequence[Path],
     physics: str,
-    runs: Path,
-    note: str = "",
     robot: str = PAPER,
 ) -> list[Section | None]:
     """The page of `ballbot benchmark`.
@@ -44,11 +29,10 @@ def leaderboard_sections(
         table: its cells.
         results: its episodes.
         controllers: by task.
+        regrets: picture of the regrets of all episodes.
         pictures: of certified episodes.
         physics: "bullet", "mujoco" or "rk4".
-        runs: folder in which other commands have left theirs: basins, robustness, transfer, paper, and any training.
-        note: about the leaderboard.
-        robot: by name; what other commands have left of other robots is left out.
+        robot: by name.
     """
     replays = [replay_of(task, names, results, physics, robot) for task, names in controllers.items()]
     return [
@@ -56,7 +40,7 @@ def leaderboard_sections(
             "Leaderboard",
             header,
             table,
-            f"Regret is cost / optimum − 1 over the episodes that did not fail. Press a column's head to sort by it. {note}",
+            "Regret is cost / optimum − 1 over the episodes that did not fail. Press a column's head to sort by it.",
         ),
         replay_section(
             "Watch an episode",
@@ -65,32 +49,13 @@ def leaderboard_sections(
             "the pink line is the force on the ball.",
         ),
         playground_section(),
-        regret_section(results),
         pictures_section(
-            "Basins of attraction",
-            [path for path in (runs / "basins" / "basins.png",) if path.exists() and _is_of(path, robot)],
-            "From where each controller recovers, within what the robot allows.",
+            "How close to the optimum",
+            [regrets],
+            "The higher and the farther left, the better. A curve ends at the share of episodes that succeed.",
         ),
-        folder_section("Robustness", runs / "robustness" / "figures", "The same episodes under growing disturbances.")
-        if _is_of(runs / "robustness" / "robustness.json", robot)
-        else None,
-        pictures_section(
-            "From one robot to another",
-            [path for path in (runs / "transfer" / "transfer.png",) if path.exists()],
-            "Controllers that plan for one robot, or learnt on it, on another and on its floors.",
-        ),
-        learning_section(runs, robot),
         pictures_section("One certified episode of each task", pictures),
-        folder_section("The paper's figures", runs / "paper", "High lean angle trajectory optimization, reproduced."),
     ]
-
-
-def _is_of(path: Path, robot: str) -> bool:
-    """Whether the results that a command left as PATH.json are of a robot, as far as they say."""
-    try:
-        return files.read_json(path.with_suffix(".json"))["about"].get("robot", PAPER) == robot
-    except (ValueError, KeyError, TypeError, AttributeError):  # missing or damaged: they do not say
-        return robot == PAPER
 
 
 def replay_of(
@@ -113,45 +78,3 @@ def playground_section() -> Section:
     )
     lead = "A learned policy and LQR, computed in this page. Push them."
     return Section("Push them yourself", frame.format(playground_page()), lead)
-
-
-def regret_section(results: Sequence[Result]) -> Section | None:
-    """For every task, the share of episodes that each controller finishes within a given regret."""
-    panels = []
-    for task in dict.fromkeys(result.task for result in results):
-        lines = []
-        for i, (name, regrets, share) in enumerate(figures.regret_curves(results, task)):
-            lines.append(Line(labels.label(name), regrets, share, labels.color(name, i), steps=True))
-        panels.append(Panel(task, "cost above the optimum, %", "episodes that succeed, %", lines, log_x=True))
-    lead = "The higher and the farther left, the better. A curve ends at the share of episodes that succeed."
-    return curves_section("How close to the optimum", panels, lead)
-
-
-def learning_section(runs: Path, robot: str = PAPER) -> Section | None:
-    """Regret against wall time of every training run of a robot below a folder."""
-    tasks: dict[str, list[Line]] = {}
-    for path in sorted(runs.rglob("evaluations.csv")):
-        config = path.with_name("config.json")
-        if not config.exists():
-            continue
-        try:
-            described = files.read_json(config)
-            if described.get("robot", PAPER) != robot:
-                continue
-            task, learner = str(described.get("task")), str(described.get("learner"))
-            rows = list(csv.DictReader(files.read(path).decode().splitlines()))
-            points = [(float(row["seconds"]), 100 * float(row["regret_mean"])) for row in rows]
-        except (ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
-            console.print(f"skipped: {config} or {path.name} beside it is damaged: {error!r}")
-            continue
-        lines = tasks.setdefault(task, [])
-        finite = np.array([point for point in points if np.isfinite(point).all()]).reshape(-1, 2)
-        again = any(line.label.startswith(f"{learner}:") for line in lines)
-        shade = labels.color("" if again else learner, len(lines))
-        lines.append(Line(f"{learner}: {path.parent.name}", finite[:, 0], finite[:, 1], shade))
-    panels = [
-        Panel(task, "training, s", "regret, %", [line for line in lines if len(line.x)], log_y=True)
-        for task, lines in tasks.items()
-        if any(len(line.x) for line in lines)
-    ]
-    return curves_section("Learning", panels, "Mean regret on certified episodes while training.")

@@ -120,20 +120,19 @@ class ModelFree(ABC):
         self._settled: float | None = None  # share of the iterations after which the curriculum was over
         self._clone_iterations = 0 if demos is None else _CLONE_ITERATIONS
         self.iterations, self.evaluations = config.iterations + self._clone_iterations, config.evaluations
-        self._env = TrainingEnv(
-            self._trained,
-            params,
+        batch = CurriculumBatch(
+            replace(self._trained, duration=config.episode_seconds),
             config.num_envs,
-            config.episode_seconds,
-            self._reward_scale,
+            params,
             self._gamma,
-            frame,
+            self._trained,
             config.short_episodes,
             backwards,
             self._pay,
             randomization,
             history,
         )
+        self._env = TrainingEnv(batch, self._reward_scale, frame)
 
     def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
@@ -306,47 +305,26 @@ class ModelFree(ABC):
 
 
 class TrainingEnv(VecEnvWrapper):
-    """A task's batched envs for learning: shorter episodes and scaled rewards.
+    """The envs of a batch for learning, with scaled rewards.
 
-    The optimal policy stays the same. An episode that runs out of time is truncated, and the learners bootstrap from the
-    value of its last state; so shorter episodes only leave out rest, which teaches little.
+    Their episodes may be shorter than the task's, and the optimal policy stays the same. An episode that runs out of time is
+    truncated, and the learners bootstrap from the value of its last state; so shorter episodes only leave out rest, which
+    teaches little.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        params: BallbotParams,
-        num_envs: int,
-        episode_seconds: float,
-        reward_scale: float,
-        gamma: float = 1.0,
-        frame: Frame | None = None,
-        short_episodes: tuple[float, float] = (0.0, 0.6),
-        backwards: bool = False,
-        pay: bool = True,
-        randomization: Randomization | None = None,
-        history: int = 0,
-    ):
-        """Makes the envs.
+    def __init__(self, batch: CurriculumBatch, reward_scale: float, frame: Frame | None = None):
+        """Takes the envs.
 
         Args:
-            task: the task.
-            params: the robot.
-            num_envs: how many.
-            episode_seconds: duration of an episode, s.
+            batch: the envs.
             reward_scale: factor of every reward.
-            gamma: the learner's discount factor, for shaping.
             frame: in which observations are shown and actions taken; default, the task's own.
-            short_episodes, backwards, pay, randomization, history: as of `CurriculumBatch`.
-
-        Raises:
-            ValueError: the task has not what these ask for.
         """
-        shorter = replace(task, duration=episode_seconds)
-        world: dict[str, Any] = {"randomization": randomization, "history": history}
-        self._vector = BallbotVectorEnv(num_envs, shorter, params=params, compile=False, engine="torch", **world)
-        self.batch = CurriculumBatch(shorter, num_envs, params, gamma, task, short_episodes, backwards, pay, **world)
-        self._vector.batch = self.batch
+        world: dict[str, Any] = {"randomization": batch.randomization, "history": batch.history}
+        self._vector = BallbotVectorEnv(
+            batch.num_envs, batch.own_task, params=batch.params, compile=False, engine="torch", **world
+        )
+        self._vector.batch = self.batch = batch
         self._scale = np.float32(reward_scale)
         self._frame, self._axes = frame, np.zeros(0)
         seen = None if frame is None else gymnasium.spaces.Box(-np.inf, np.inf, (frame.size,), np.float32)

@@ -237,8 +237,8 @@ class Driver {
 }
 
 /** The robots of a scenario: the policy's, then LQR's; where a human drives, the human's, then the policy's. */
-function robotsOf(scenario, policy = null, driver = null) {
-  const learned = policy ?? new Policy(DATA.policies[scenario.task], MODELS[scenario.task]);
+function robotsOf(scenario, driver = null) {
+  const learned = new Policy(DATA.policies[scenario.task], MODELS[scenario.task]);
   const controllers = driver ? [driver, learned] : [learned, new Lqr(scenario.lqr)];
   return controllers.map((controller) => new Robot(controller, scenario));
 }

@@ -1,4 +1,4 @@
-// The playground's page: scenarios, pushes and driving, policies of the reader's own, pictures and readouts.
+// The playground's page: scenarios, pushes and driving, pictures and readouts.
 "use strict";
 
 const find = (selector) => document.querySelector(selector);
@@ -9,7 +9,6 @@ const STRONGEST = 250; // N·s
 const NEAR = 3.6; // m: the camera's distance from robots that are together
 const GRAB = 60; // px: how far from a robot's axis a drag still pushes it
 const THUMB = 70; // px of a drag that holds the stick fully out
-const TILTED = 25; // degrees of a device that do the same
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], a: [-1, 0], d: [1, 0], w: [0, 1], s: [0, -1] };
 
 class Playground {
@@ -23,7 +22,6 @@ class Playground {
     [this.playing, this.last] = [true, null];
     [this.distance, this.zoom] = [NEAR, 1];
     this.wake();
-    this.own = {}; // policies of the reader's own, by task
     for (const title of new Set(DATA.scenarios.map((scenario) => scenario.title))) {
       const chip = document.createElement("button");
       chip.type = "button";
@@ -35,7 +33,6 @@ class Playground {
     find(".reset").onclick = () => this.open(this.index, this.driver !== null);
     find(".episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
     find(".drive").onclick = () => this.open(this.index, this.driver === null);
-    find(".tilt").onclick = () => this.askForTilt();
     find(".share").onclick = () => this.share();
     find(".theme").onclick = () => this.setTheme(!this.dark);
     const night = matchMedia("(prefers-color-scheme: dark)");
@@ -102,18 +99,16 @@ class Playground {
     find(".share").hidden = find(".link").hidden = true;
     find(".drive").setAttribute("aria-pressed", driven);
     find(".pushes").hidden = find(".strength").hidden = driven;
-    find(".tilt").hidden = !driven || typeof DeviceOrientationEvent === "undefined";
     find(".hint").textContent = driven ? "Drag anywhere: that is your stick." : "Drag a robot to push it. Drag the floor to look around.";
     find(".hint").hidden = false;
     this.driver = driven ? new Driver() : null;
     this.held = new Set(); // keys
-    const mine = this.own[task];
-    this.robots = robotsOf(this.scenario, mine?.policy, this.driver);
+    this.robots = robotsOf(this.scenario, this.driver);
     this.best = this.scenario.best && new Optimum(this.scenario);
     const { label, color } = DATA.policies[task];
-    const learned = { label: mine?.label ?? `${label} policy`, color: mine ? DATA.you.color : color, alpha: 1 };
+    const learned = { label: `${label} policy`, color, alpha: 1 };
     const ghost = DATA.ghost_opacity + 0.15;
-    this.looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, color, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
+    this.looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
     if (this.best) this.looks.push({ ...DATA.best, alpha: DATA.ghost_opacity });
     this.due = this.scenario.push; // the push that comes by itself
     this.restart(this.scenario.state);
@@ -422,15 +417,6 @@ class Playground {
     view.onblur = () => {
       if (this.held.size) this.steerByKeys(this.held.clear());
     };
-    find(".file").onchange = (event) => {
-      this.take(event.target.files[0]);
-      event.target.value = ""; // so that the same file can be chosen again
-    };
-    window.addEventListener("dragover", (event) => event.preventDefault());
-    window.addEventListener("drop", (event) => {
-      event.preventDefault();
-      this.take(event.dataTransfer.files[0]);
-    });
   }
 
   letGo() {
@@ -458,46 +444,6 @@ class Playground {
   steerByKeys() {
     const sum = [...this.held].map((key) => ARROWS[key]).reduce((total, along) => Vector.plus(total, along), [0, 0]);
     this.steer(...sum);
-  }
-
-  /** Lets the device be the stick. iOS asks the reader first, and only where a press asks for it. */
-  async askForTilt() {
-    try {
-      const answer = await (DeviceOrientationEvent.requestPermission?.() ?? "granted");
-      if (answer !== "granted") throw new Error("the browser was told not to");
-    } catch (error) {
-      return this.say(`This device does not tell how it is tilted: ${error.message}.`);
-    }
-    let level = null; // how it was held first
-    window.removeEventListener("deviceorientation", this.tilted); // of an earlier press
-    this.tilted = ({ beta, gamma }) => {
-      if (!Number.isFinite(beta) || !Number.isFinite(gamma) || this.drag) return;
-      const turn = ((screen.orientation?.angle ?? 0) * Math.PI) / 180; // of the screen in the device
-      level ??= [gamma, beta];
-      const [x, y] = [(gamma - level[0]) / TILTED, (level[1] - beta) / TILTED];
-      this.steer(x * Math.cos(turn) - y * Math.sin(turn), x * Math.sin(turn) + y * Math.cos(turn));
-    };
-    window.addEventListener("deviceorientation", this.tilted);
-    this.say("Hold the device as is comfortable: this is the stick's centre. Tilt it to lean.");
-  }
-
-  /** Takes a policy from an ONNX file, in the task that it is made for. */
-  async take(file) {
-    if (!file) return;
-    try {
-      if (file.size > LARGEST_FILE) throw new Error(`it is larger than ${LARGEST_FILE / 2 ** 20} MiB`);
-      const policy = new OnnxPolicy(new Uint8Array(await file.arrayBuffer()));
-      const fitting = Object.keys(DATA.tasks).filter((task) => DATA.tasks[task].observations === policy.observations);
-      const named = fitting.find((task) => DATA.tasks[task].id === policy.task);
-      const task = named ?? fitting.find((name) => name === this.scenario.task) ?? fitting[0];
-      if (!task) throw new Error(`it observes ${policy.observations} numbers, and the tasks give ${Object.entries(DATA.tasks).map(([name, { observations }]) => `${observations} (${name})`).join(", ")}`);
-      policy.model = MODELS[task];
-      this.own[task] = { policy, label: file.name.slice(0, 24) };
-      this.open(task === this.scenario.task ? this.index : DATA.scenarios.findIndex((scenario) => scenario.task === task), this.driver !== null);
-      this.say(`${file.name.slice(0, 60)} controls the robot in ${task}.`);
-    } catch (error) {
-      this.say(`${file.name.slice(0, 60)} cannot be used: ${error.message}.`);
-    }
   }
 
   /** The robot near a pixel of the canvas, or null. */

@@ -1,5 +1,4 @@
-// The same episode under several controllers: a scene each, by scene.js, and traces of tilt and force in step with them.
-// The data are states at 50 Hz.
+// The same episode under several controllers: a scene each, by scene.js. The data are states at 50 Hz.
 "use strict";
 
 const NEAR = 3.4; // m, of the camera from a robot that it follows
@@ -46,7 +45,7 @@ class Replay {
     this.find("follow").onchange = () => this.draw();
   }
 
-  async choose(index) {
+  choose(index) {
     this.pause();
     this.episode = this.data.episodes[index];
     [...this.find("episodes").children].forEach((chip, n) => chip.setAttribute("aria-pressed", n === index));
@@ -54,8 +53,7 @@ class Replay {
     this.end = dt * (Math.max(...takes.map((take) => take.x.length)) - 1);
     this.find("scrub").max = this.end;
     this.find("stages").replaceChildren(...takes.map((take, n) => this.stage(take, n)));
-    this.drawTraces();
-    await this.seek(this.episode.poster);
+    this.seek(this.episode.poster);
     this.root.dataset.ready = "true";
   }
 
@@ -102,34 +100,11 @@ class Replay {
     canvas.onpointerup = canvas.onpointercancel = () => (last = null);
   }
 
-  drawTraces() {
-    if (!this.find("panels")) return;
-    const { takes, dt } = this.episode;
-    const plot = (name, title, valuesOf) => {
-      const lines = takes.map((take) => {
-        const y = valuesOf(take);
-        return { x: y.map((_, n) => n * dt), y, mode: "lines", name: take.label.replaceAll("&", "&amp;").replaceAll("<", "&lt;"), line: { color: take.color, width: 2 } };
-      });
-      const layout = {
-        title: { text: title, font: { size: 13 }, x: 0.02, y: 0.97 }, margin: { l: 42, r: 10, t: 28, b: 36 }, showlegend: false,
-        xaxis: { title: { text: "time, s", standoff: 4 }, range: [0, this.end], fixedrange: true },
-        yaxis: { rangemode: "tozero", fixedrange: true }, hovermode: "x unified", paper_bgcolor: "#0000", plot_bgcolor: "#0000",
-        shapes: [{ type: "line", x0: 0, x1: 0, yref: "paper", y0: 0, y1: 1, line: { width: 1.5 } }],
-      };
-      return Plotly.react(this.find(name), lines, layout, { displayModeBar: false, responsive: true });
-    };
-    plot("tilts", "tilt, deg", (take) => take.gamma.map((gamma, n) => tiltOf(gamma, take.theta[n])));
-    plot("forces", "force, N", (take) => take.fx.map((fx, n) => Math.hypot(fx, take.fy[n])));
-  }
-
-  async seek(t) {
+  seek(t) {
     this.time = Math.min(t, this.end);
     this.find("scrub").value = this.time;
     this.find("clock").textContent = this.time.toFixed(2) + " s";
     this.draw();
-    if (!this.find("panels")) return;
-    const cursor = { "shapes[0].x0": this.time, "shapes[0].x1": this.time };
-    await Promise.all(["tilts", "forces"].map((name) => Plotly.relayout(this.find(name), cursor)));
   }
 
   draw() {
@@ -158,11 +133,11 @@ class Replay {
     this.playing = true;
     this.find("play").textContent = "Pause";
     let last = performance.now();
-    const tick = async (now) => {
+    const tick = (now) => {
       if (!this.playing) return;
       const step = Math.min((now - last) / 1000, 0.1) * Number(this.find("speed").value);
       last = now;
-      await this.seek(this.time + Math.max(0, step));
+      this.seek(this.time + Math.max(0, step));
       if (this.time >= this.end) this.pause();
       else requestAnimationFrame(tick);
     };
