@@ -1,9 +1,11 @@
 """`ballbot transfer`: controllers made for one robot, run on another, in one physics engine or in several."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from ballbot_gym import files
-from ballbot_gym.robots import PAPER, ROBOTS
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
@@ -18,13 +20,15 @@ from ballbot_train.console import (
     print_table,
     progress_bars,
 )
-from ballbot_train.evaluation import optima
+from ballbot_train.evaluation import agreement, optima
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import checked_episodes, policy_digests
 from ballbot_train.evaluation.results import rows_of
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 from ballbot_train.report import figures
+from ballbot_train.report.film import write_film
+from ballbot_train.report.replay import engines_replay
 
 
 def transfer(
@@ -42,6 +46,8 @@ def transfer(
 ) -> None:
     """Runs controllers that were made for one robot on another: success, falls and cost over that robot's optimum.
 
+    With several --physics it tells which of these figures depend on the engine.
+
     Args:
         tasks: names of tasks.
         controllers: names of experts and policies; default all that the robots have.
@@ -51,7 +57,7 @@ def transfer(
         episodes: how many of each task's certified episodes.
         quick: only 3 episodes of each task.
         physics: "bullet", "mujoco" or "rk4", with contact where the ball rolls except in the last; default, the first that is
-            installed. With several, each row is of one.
+            installed. With several, also where they disagree, and a film of the first episode that ends otherwise.
         seed: of the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
         workers: who does the work.
@@ -92,4 +98,56 @@ def transfer(
     figures.save(figures.transfer_figure(rows), out / "transfer.png")
     print_table(f"{episodes} certified episodes of {robot} per task", matrix.HEADER, table)
     console.print(f"matrix: {out / 'transfer.png'}, {out / 'transfer.csv'}")
+    if len(engines) > 1:
+        _compare(results, chosen, robot, episodes, engines, out)
     jobs.release(out)
+
+
+def _compare(
+    results: Sequence[matrix.TransferResult],
+    chosen: Mapping[str, Mapping[str, Sequence[str]]],
+    robot: str,
+    episodes: int,
+    engines: Sequence[str],
+    out: Path,
+) -> None:
+    """Tells where engines disagree, and films the first episode that ends otherwise."""
+    found = agreement.disagreements(results)
+    own = chosen.get(robot, {})
+    far = [d for task, names in own.items() for d in agreement.drifts(task, robot, names[0], engines, episodes)]
+    for name, entries in [("engines", found)] + [("drift", far)] * bool(far):
+        files.write_csv(out / f"{name}.csv", [asdict(entry) for entry in entries])
+    print_table(
+        "where engines disagree",
+        ["task", "made for", "controller", "friction", "engines", "ends otherwise", "regret apart"],
+        [
+            [d.task, d.made_for, d.controller, f"{d.friction:g}", f"{d.first}, {d.second}", f"{len(d.episodes)}/{d.of}",
+             f"{d.regret:+.2%}" if d.both else "–"]
+            for d in found
+        ],
+    )  # fmt: skip
+    if far:
+        print_table(
+            "distance of the same forces, which nothing corrects",
+            ["task", "engines", "after", "episodes", "median", "worst"],
+            [
+                [
+                    d.task,
+                    f"{d.first}, {d.second}",
+                    f"{d.seconds:g} s",
+                    str(d.episodes),
+                    f"{d.median:.2g} m",
+                    f"{d.worst:.2g} m",
+                ]
+                for d in far
+            ],
+        )
+    usual = named_robot(robot).friction
+    for one in found:
+        if one.episodes and one.made_for == robot and one.friction == usual:
+            shown = engines_replay(one.task, one.controller, one.episodes[0], (one.first, one.second), robot)
+            film = write_film(
+                shown, out / f"differs-{one.task}-{Path(one.controller).stem}.webp", shown.duration, width=800
+            )
+            console.print(f"film of the first episode that ends otherwise: {film}")
+            return

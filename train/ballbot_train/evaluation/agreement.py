@@ -1,0 +1,126 @@
+"""Where physics engines disagree: the same forces in each of them, and episodes that end otherwise."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballbot_gym import certified
+from ballbot_gym.engines import make_simulator
+from ballbot_gym.env import BallbotEnv
+from ballbot_gym.robots import named_robot
+from ballbot_gym.rollout import PlanError, rollout
+from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.transfer import TransferResult
+
+TIMES = (0.1, 0.25, 0.5, 1.0, 2.0)
+"""s, at which distances are measured."""
+_EPISODES = 20  # whose forces are played
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """The certified episodes of one controller in two physics.
+
+    `episodes` have another outcome: success, failure or neither. `regret` is the mean of the second's regret less the
+    first's, over those `both` that fail in neither.
+    """
+
+    task: str
+    made_for: str
+    controller: str
+    robot: str
+    friction: float
+    first: str
+    second: str
+    episodes: tuple[int, ...]
+    of: int
+    both: int
+    regret: float
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far the ball is from where the same forces bring it in the first physics, at a time, m.
+
+    Over the episodes that last so long in the first one. Nothing corrects it, and the robot is unstable: what differs grows
+    a thousandfold in a second.
+    """
+
+    task: str
+    robot: str
+    controller: str
+    first: str
+    second: str
+    seconds: float
+    episodes: int
+    median: float
+    worst: float
+
+
+def disagreements(results: Sequence[TransferResult]) -> list[Disagreement]:
+    """Every controller on every floor, in the first physics of the results and in each other one."""
+    runs: dict[tuple[str, str, str, str, float], dict[str, dict[int, TransferResult]]] = {}
+    for result in results:
+        key = (result.task, result.made_for, result.controller, result.robot, result.friction)
+        runs.setdefault(key, {}).setdefault(result.physics, {})[result.episode] = result
+    found = []
+    for key, by_physics in runs.items():
+        first, *others = by_physics
+        for second in others:
+            pairs = [(one, by_physics[second][episode]) for episode, one in by_physics[first].items()]
+            differ = tuple(a.episode for a, b in pairs if (a.success, a.failure) != (b.success, b.failure))
+            apart = [b.regret - a.regret for a, b in pairs if not (a.failure or b.failure)]
+            mean = float(np.mean(apart)) if apart else math.nan
+            found.append(Disagreement(*key, first, second, differ, len(pairs), len(apart), mean))
+    return found
+
+
+def drifts(task: str, robot: str, controller: str, physics: Sequence[str], episodes: int) -> list[Drift]:
+    """Plays a controller's forces of its first certified episodes in every physics.
+
+    Args:
+        task: by name.
+        robot: by name.
+        controller: whose forces they are, by name.
+        physics: that it runs in first, and the others.
+        episodes: how many, of which at most 20 are taken.
+    """
+    first, *others = physics
+    runs = list(_runs(task, robot, controller, first, min(episodes, _EPISODES)))
+    found = []
+    for second in others:
+        distances = [_distances(robot, second, states, forces, dt) for states, forces, dt in runs]
+        for seconds in TIMES:
+            far = [
+                float(d[k]) for d, (*_, dt) in zip(distances, runs, strict=True) if (k := round(seconds / dt)) < len(d)
+            ]
+            if far:
+                measured = len(far), float(np.median(far)), max(far)
+                found.append(Drift(task, robot, controller, first, second, seconds, *measured))
+    return found
+
+
+def _runs(
+    task: str, robot: str, controller: str, physics: str, episodes: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """States (n + 1, 8) and forces (n, 2) of certified episodes, and the control step, s."""
+    env = BallbotEnv(task, physics=physics, robot=robot)
+    made, known = make_controller(controller, env.task, env.params), certified.load(env.task, robot)
+    for episode in range(episodes):
+        try:
+            trajectory = rollout(env, made, options=known.options(episode)).trajectory
+        except PlanError:
+            continue
+        yield trajectory.x, trajectory.u, env.task.control_dt
+    env.close()
+
+
+def _distances(robot: str, physics: str, states: np.ndarray, forces: np.ndarray, dt: float) -> np.ndarray:
+    """(n + 1,) m, from every state to where the same forces bring the robot in another physics."""
+    simulator = make_simulator(physics, named_robot(robot), dt)
+    simulator.reset(tuple(states[0].tolist()))
+    there = [states[0], *(np.array(simulator.step(tuple(u.tolist()))) for u in forces)]
+    simulator.close()
+    return np.hypot(*(np.array(there) - states)[:, :2].T)
