@@ -9,6 +9,7 @@ import numpy as np
 
 from ballbot_gym import certified
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.robots import PAPER, named_robot
@@ -190,6 +191,16 @@ class _SlipRecorder:
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         self.slips.append(self._env.slip)
         return self._controller.act(t, x)
+
+
+def engines_replay(task: str, controller: str, episode: int, physics: Sequence[str], robot: str = PAPER) -> Replay:
+    """A certified episode under one controller in several physics, side by side. Args: as of `certified_replay`."""
+    shown = [certified_replay(task, [controller], episode, engine, robot=robot) for engine in physics]
+    takes = [
+        replace(replay.takes[0], label=f"{replay.takes[0].label} in {PHYSICS_NAMES[engine]}", color=labels.color("", i))
+        for i, (engine, replay) in enumerate(zip(physics, shown, strict=True))
+    ]
+    return replace(shown[0], takes=tuple(takes))
 
 
 def with_companions(replay: Replay, others: Replay) -> Replay:
