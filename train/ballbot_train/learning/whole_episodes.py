@@ -150,11 +150,12 @@ class WholeEpisodes:
         total = torch.zeros(config.num_envs)
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
         standing = alive  # an episode that has reached the goal goes on for a while, and may fail then
-        ends, patience, ahead = [], _PATIENCE, int(self._batch.randomization.is_noisy)  # noise changes with the steps
+        noisy = self._batch.randomization.is_noisy
+        ends, patience, ahead = [], _PATIENCE, int(noisy or task.clock)  # what noise and clock give changes with the steps
         for k in range(task.steps):
             step = self._step(state)
             total = total + torch.where(alive & standing, step.cost, 0.0)
-            if ahead and not task.first_exit and k >= task.steps - _RESTING:
+            if noisy and not task.first_exit and k >= task.steps - _RESTING:
                 total = total + torch.where(alive, _GOAL_PENALTY / _RESTING * step.lacking, 0.0)
             alive, standing = alive & ~(step.failed & ~reached), standing & ~step.failed
             if task.first_exit:
@@ -178,8 +179,9 @@ class WholeEpisodes:
         config, task = self.config, self.task
         new, result = self._batch.transition(state, self._trained(self._batch.observe(state)))
         before, force = state.x.unbind(0), result.force.unbind(0)
-        x, c = result.final_x.unbind(0), state.c.unbind(0)
-        cost = task.cost(before, force, c) * task.control_dt
+        x, time = result.final_x.unbind(0), state.steps * task.control_dt
+        cost = task.cost(before, force, task.at(state.c.unbind(0), time)) * task.control_dt
+        c = task.at(state.c.unbind(0), time + task.control_dt)
         if config.margin_penalty:
             for margin in task.margins(x, c):
                 cost = (

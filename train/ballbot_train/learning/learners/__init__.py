@@ -94,9 +94,10 @@ class Algorithm:
             ValueError: demonstrations or policy are missing, of another task or shape, or of no use to this learner.
         """
         self.check(demos, start)
-        if task.clock and self.name in ("dagger", "shac"):
+        if task.clock and (self.name == "dagger" or getattr(settings, "horizon", 0)):
             raise ValueError(
-                f"{self.name} does not know the time, on which cost and goal of {task.id} depend; train ppo or sac"
+                f"cost and goal of {task.id} depend on the time, which {self.name} does not know; train ppo or sac, and "
+                "from such a policy shac with --horizon 0"
             )
         given: dict[str, Any] = {"demos": demos, "start": start}
         if randomization is not None or history:
