@@ -212,7 +212,7 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> Path:
     """Writes one line for each row under a line of column names; columns default to the keys of the first row.
 
-    Text that a spreadsheet would compute as a formula gets an apostrophe in front; `csv_text` takes it off.
+    Text that a spreadsheet would compute as a formula gets an apostrophe in front.
     """
     text = io.StringIO()
     names = list(columns or (rows[0] if rows else ()))
@@ -220,11 +220,6 @@ def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]], columns: Sequ
     writer.writerow({name: _csv_cell(name) for name in names})
     writer.writerows({name: _csv_cell(value) for name, value in row.items()} for row in rows)
     return write(path, text.getvalue())
-
-
-def csv_text(cell: str) -> str:
-    """The text that `write_csv` wrote as this cell."""
-    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def _csv_cell(value: Any) -> Any:

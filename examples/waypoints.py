@@ -3,6 +3,7 @@
 ballbot optimize waypoints:waypoints, or any other command, from the folder of this file; see docs/own.md.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +30,7 @@ class Waypoints(Task):
     """How long a distance from a point counts around its time, s."""
 
     id = "BallbotWaypoints-v0"
-    observation_scale = (2.0, 2.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 5.0, 1.0, 1.0, 1.0)
+    observation_scale = (2.0, 2.0, 2.0, 2.0, 1.0, 1.0, 5.0, 5.0, 5.0, 5.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     constant_names = ("x1", "y1", "x2", "y2", "x3", "y3")
     constant_draws = 6
     state_draws = 2
@@ -67,9 +68,15 @@ class Waypoints(Task):
         return squared(*way) / 0.3**2 - 1, squared(vx, vy) / 0.5**2 - 1
 
     def observe(self, x: Vector, c: Vector) -> Vector:
-        ways = [part for way in self._ways(x, c) for part in way]
+        _, _, *motion = ops.components(x)
+        first, second, third = self._ways(x, c)
         time = ops.components(c)[-1]
-        return scaled((*ops.components(x), *ways, time, *self._weights(c)), self.observation_scale, like=x)
+        one, two, three = (1 / (1 + ops.exp(20.0 * (i * self.interval - time))) for i in (1, 2, 3))  # what is past
+        ahead = [a + one * (b - a) + two * (d - b) for a, b, d in zip(first, second, third, strict=True)]
+        after = [b + one * (d - b) for b, d in zip(second, third, strict=True)]
+        phase = 2 * math.pi * time / self.interval
+        clock = (ops.sin(phase), ops.cos(phase), one, two, three)
+        return scaled((*ahead, *after, *motion, *clock), self.observation_scale, like=x)
 
     def _path(self, start: np.ndarray, c: np.ndarray) -> np.ndarray:
         """(steps+1, 2) a smooth curve through the points."""

@@ -19,6 +19,8 @@ from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks.transition import outcome
+from ballbot_train.learning.learners import LEARNERS
+from ballbot_train.learning.learners.shac import ShacConfig
 
 STEPS = 16
 CLASSES = {"figure_eight": "FigureEight", "waypoints": "Waypoints"}
@@ -138,3 +140,20 @@ def test_an_optimum_may_start_later_in_the_episode(task, params):
 
 def test_batches_of_optima_leave_a_task_with_a_clock_to_find_optimum(task, params):
     assert not solves(task, params)
+
+
+def test_shac_through_whole_episodes_pays_what_the_episodes_cost(task, params):
+    with pytest.raises(ValueError, match="shac with --horizon 0"):
+        LEARNERS["shac"].make(task, params, ShacConfig(), 0)
+    settings = ShacConfig(horizon=0, iterations=2, num_envs=4, episode_seconds=0.4, hidden=(8,))
+    learner = LEARNERS["shac"].make(task, params, settings, 0)
+    batch, state = learner._batch, learner._batch.state
+    costs, _ = learner._episodes()
+    batch.state = state
+    observation = batch.reset()
+    total = torch.zeros(4)
+    for _ in range(learner.task.steps):
+        result = batch.step(learner.network(observation))
+        observation = result.observation
+        total += result.cost
+    torch.testing.assert_close(costs, total)
