@@ -63,12 +63,9 @@ def _films(entries: Sequence[Entry]) -> str:
     """The films of best and worst episodes, folded."""
     lines = []
     for entry in _ranked(entries):
-        films = [
-            (film(entry, episode), which, episode)
-            for which, episode in zip(("best", "worst"), extremes(entry), strict=True)
-        ]
-        if all((FILMS / name).exists() for name, *_ in films):
-            shown = (f"![{which}, {episode}](pictures/films/{name})" for name, which, episode in films)
+        films = {film(entry, episode): episode for episode in extremes(entry)}
+        if all((FILMS / name).exists() for name in films):
+            shown = (f"![{episode}](pictures/films/{name})" for name, episode in films.items())
             lines.append(f"| {entry.name} | {' | '.join(shown)} |\n")
     if not lines:
         return ""
