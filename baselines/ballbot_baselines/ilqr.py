@@ -25,7 +25,7 @@ import numpy as np
 from ballbot_baselines import righting
 from ballbot_baselines.compiled import LANES, SIMD
 from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
-from ballbot_baselines.shooting import shooting_ocp
+from ballbot_baselines.shooting import shooting_ocp, symbolic_robot
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -117,6 +117,9 @@ def rest(task: Task, params: BallbotParams) -> Rest | None:
     return Rest(end.x[0], *discrete_lqr(task, params, end.x[0], end.u[0], np.zeros(0)))
 
 
+_COMPILED: dict[tuple[Any, ...], tuple[ctypes.CDLL, int, dict[str, int]]] = {}
+
+
 class Ilqr:
     """The solver of a task and a robot. `rest` says where the task ends at rest.
 
@@ -128,11 +131,14 @@ class Ilqr:
     """
 
     def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
-        stage = _Stage(task, params, free_time)
-        name = f"{task.id}-ilqr{'-free' if free_time else ''}"
-        self._limit = params.force_limit
-        library = ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD)))
-        self.states, self.rest, self._sizes = stage.ns, stage.rest, stage.sizes
+        self._limit, self.rest = params.force_limit, None if free_time else rest(task, params)
+        # where LQR's cost-to-go is no part of it, the code serves all robots of a kind
+        kind = task, free_time, *((params.rolls, params.grips) if self.rest is None else (params,))
+        if kind not in _COMPILED:
+            stage = _Stage(task, params, free_time, self.rest)
+            name = f"{task.id}-ilqr{'-free' if free_time else ''}"
+            _COMPILED[kind] = ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD))), stage.ns, stage.sizes
+        library, self.states, self._sizes = _COMPILED[kind]
         self._solve, self._follow = library.solve, library.follow
         count, pointer = ctypes.c_int64, ctypes.c_void_p
         self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 12], None
@@ -233,15 +239,15 @@ def ilqr(task: Task, params: BallbotParams, free_time: bool = False) -> Ilqr:
 class _Stage:
     """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
 
-    def __init__(self, task: Task, params: BallbotParams, free_time: bool):
-        self._ocp, self._params = shooting_ocp(task, params), params
+    def __init__(self, task: Task, params: BallbotParams, free_time: bool, at_rest: Rest | None):
+        self._ocp = shooting_ocp(task, params)
         self._substeps = dynamics.substeps_for(task.control_dt)
-        self._free, self.ns = free_time, 9 if free_time else 8
-        self.rest = None if free_time else rest(task, params)
+        self._free, self.ns, self.rest = free_time, 9 if free_time else 8, at_rest
         symbol = casadi.SX.sym
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
-        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + (self.rest is not None))
+        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + (at_rest is not None))
         self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
+        self._robot, self._limit = symbolic_robot(params.rolls, params.grips, self._all)
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
         path, end = self._path(self._a), self._ocp.final_inequalities(self._x[:8], self._all)
@@ -268,7 +274,7 @@ class _Stage:
 
     def _after(self, x: casadi.SX, a: casadi.SX, substeps: int) -> casadi.SX:
         length = self._length(x)
-        after = dynamics.step(self._params, x[:8], self._params.force_limit * a, length, substeps)
+        after = dynamics.step(self._robot, x[:8], self._limit * a, length, substeps)
         return casadi.vertcat(after, length) if self._free else after
 
     def _path(self, a: casadi.SX) -> casadi.SX:
@@ -372,9 +378,9 @@ class _Stage:
         """The action of `righting.steering` along a path."""
         path, settings = casadi.SX.sym("path", 8), casadi.SX.sym("settings", 2)
         target, velocity, acceleration, aside = (tuple(casadi.vertsplit(path[i : i + 2])) for i in (0, 2, 4, 6))
-        limit, x = self._params.force_limit, tuple(casadi.vertsplit(self._x[:8]))
+        limit, x = self._limit, tuple(casadi.vertsplit(self._x[:8]))
         loops = settings[0], settings[1]
-        force = righting.steering(self._params, x, aside, *loops, target, limit, velocity, acceleration)
+        force = righting.steering(self._robot, x, aside, *loops, target, limit, velocity, acceleration)
         return _block("steer", (self._x, path, settings, self._p), (casadi.vertcat(*force) / limit,))
 
     def _feedback(self, off: casadi.SX) -> casadi.SX:
