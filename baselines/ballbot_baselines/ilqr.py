@@ -247,6 +247,7 @@ class _Stage:
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
         self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + (at_rest is not None))
         self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
+        self._limit: Any
         self._robot, self._limit = symbolic_robot(params.rolls, params.grips, self._all)
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
