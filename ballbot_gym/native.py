@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+import torch
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_finite, seeds_of
+from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, seeds_of
 from ballbot_gym.checks import check_num_envs
 from ballbot_gym.env import fixed
-from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.spares import Spares
@@ -326,13 +326,16 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
     code, dtype = _code(task, params, double), np.float64 if double else np.float32
     actions = np.asfortranarray([[0.1, -0.2], [-0.3, 0.4], [1.2, 0.5], [-0.6, -1.2]], dtype)
     found = []
-    for envs in (
-        BallbotNative(task, len(actions), dtype, params, code=code),
-        BallbotLoop(task, len(actions), dtype, params),
+    kind = torch.float64 if double else torch.float32
+    for envs, given in (
+        (BallbotNative(task, len(actions), dtype, params, code=code), (actions, None, True)),
+        (BallbotBatch(task, len(actions), dtype=kind, compile=False, params=params), (torch.from_numpy(actions),)),
     ):
         envs.state = envs.initial_state(seed=0)
         start = {"first observation": envs.observe(envs.state), "start": envs.state.x, "constants": envs.state.c}
-        found.append(start | envs.step(actions, None, False)._asdict())
+        with torch.no_grad():
+            found.append(start | envs.step(*given)._asdict())
+    found[1]["final_observation"] = found[1]["final_observation"][found[1]["terminated"] | found[1]["truncated"]]
     for name, expected in found[1].items():
         if not np.allclose(found[0][name], expected, rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NativeUnavailableError(f"{task.id} has another {name} with CasADi's symbols than with numbers")

@@ -1,4 +1,4 @@
-"""BallbotVectorEnv: Gymnasium's vector interface to machine code, to a `BallbotBatch` in torch, or to a `BallbotLoop`."""
+"""BallbotVectorEnv: Gymnasium's vector interface to machine code, or to a `BallbotBatch` in torch."""
 
 import logging
 from collections.abc import Sequence
@@ -40,17 +40,9 @@ except ImportError as error:
     ) from error
 
 from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, dtype_named, tilt_of
-from ballbot_gym.loop import BallbotLoop
 
 if TYPE_CHECKING:
     from ballbot_gym.native import BallbotNative
-
-LOOP_BELOW = 64
-"""Batch size below which engine="auto" loops over the envs on a CPU where there is no machine code. From there on a batch in
-torch is as fast or faster.
-
-Measured by `benchmarks/vector_engines.py` on one core.
-"""
 
 _DTYPES = {"reward": np.float64, "cost": np.float64, "observation": np.float32, "final_observation": np.float32}
 """Of arrays that do not have the batch's dtype."""
@@ -74,7 +66,7 @@ _INFO_KEYS = tuple(
 )
 """Keys of an info, each with that of its mask."""
 
-_ENGINES = ("auto", "native", "torch", "loop")
+_ENGINES = ("auto", "native", "torch")
 
 _log = logging.getLogger(__name__)
 
@@ -105,8 +97,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     The episodes are the same in all three. The entries of `final_info` and the rows of `final_obs`, a float32 array (B, no),
     are valid only for the envs that the masks `_…` mark. Returned arrays never change later; `state`, `constants` and
     `violated` in `infos` may share memory and are read-only. Observations and states are in Fortran order, component by
-    component, like those of Gymnasium's own batched CartPole, and actions in that order are not copied. engine="loop" has C
-    order.
+    component, like those of Gymnasium's own batched CartPole, and actions in that order are not copied.
 
     `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
     """
@@ -141,10 +132,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
                 once per task and machine; it needs CasADi and no gradients, and knows no `Randomization` and no history.
-                "torch" computes them in torch, and `compile` says whether that is compiled. "loop" computes one after the
-                other in float64, whatever dtype is returned. "auto" takes "native" where it can on a CPU, unless compile is
-                True or False; else "loop" for fewer than `LOOP_BELOW` envs on a CPU, unless compile is True; else "torch".
-                All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotLoop`.
+                "torch" computes them in torch, and `compile` says whether that is compiled. "auto" takes "native" where it
+                can on a CPU, unless compile is True or False; else "torch". Both run the same episodes, to rounding. `batch`
+                is a `BallbotNative` or a `BallbotBatch`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -160,7 +150,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         task = make_task(task, params, **task_fields)
         _check_physics(physics, task, num_envs)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        if engine in ("native", "loop") and torch.device(device).type != "cpu":
+        if engine == "native" and torch.device(device).type != "cpu":
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         real: torch.dtype = dtype_named(dtype)
         self._dtype = np.float32 if real == torch.float32 else np.float64
@@ -376,21 +366,17 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         Returns:
             As `BallbotNative.step_with_infos`.
         """
-        if not isinstance(self.batch, BallbotBatch | BallbotLoop):
+        if not isinstance(self.batch, BallbotBatch):
             return self.batch.step_with_infos(actions, waiting, restart)
         check_finite(actions)
         actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
         constants, drawn = self._x_and_c()[1], self._drawn()
-        if isinstance(self.batch, BallbotLoop):
-            result: Any = self.batch.step(actions, waiting, restart)
-        else:
-            with torch.no_grad():
-                result = _advance(self.batch, self._to_batch(actions), waiting, restart)
-            arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
-            result = result._replace(**arrays)
-        ended = (result.terminated | result.truncated).nonzero()[0]
-        if isinstance(self.batch, BallbotBatch):
-            result = result._replace(final_observation=result.final_observation[ended])
+        with torch.no_grad():
+            result: Any = _advance(self.batch, self._to_batch(actions), waiting, restart)
+        arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
+        ended = (arrays["terminated"] | arrays["truncated"]).nonzero()[0]
+        arrays["final_observation"] = arrays["final_observation"][ended]
+        result = result._replace(**arrays)
         return result, *self._step_infos(result, constants, drawn, ended, waiting, restart), ended
 
     def _cut(
@@ -446,8 +432,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
         """(8, B) states and (nc, B) constants."""
-        if isinstance(self.batch, BallbotLoop):
-            return self.batch.x_and_c()
         state: Any = self.batch.state
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
@@ -522,28 +506,23 @@ def _batch(
     randomization: Randomization | str | None,
     engine: str,
     history: int,
-) -> "BallbotBatch | BallbotLoop | BallbotNative":
+) -> "BallbotBatch | BallbotNative":
     """The envs of an engine; see `BallbotVectorEnv`."""
     numbers = np.float32 if dtype == torch.float32 else np.float64
-    on_cpu = torch.device(device).type == "cpu"
-    if engine == "native" or (engine == "auto" and on_cpu and compile == "auto"):
+    if engine == "native" or (engine == "auto" and torch.device(device).type == "cpu" and compile == "auto"):
         # made in any case, because it checks the arguments; it allocates nothing
         checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization, history=history)
         native = _native(checked, numbers, must=engine == "native")
         if native is not None:
             return native
-    batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, history=history)
-    small = engine == "auto" and on_cpu and batch.num_envs < LOOP_BELOW and compile is not True
-    if engine == "loop" or small:
-        return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization, batch.history)
-    return batch
+    return BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, history=history)
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
     """The envs of a batch in machine code. Where that is not possible: None, or an error if it must be."""
     if batch.randomization != Randomization() or batch.history:
         if must:
-            raise ValueError('engine="native" knows no Randomization and no history; take engine="torch" or "loop"')
+            raise ValueError('engine="native" knows no Randomization and no history; take engine="torch"')
         return None
     try:
         from ballbot_gym.native import BallbotNative, NativeUnavailableError
