@@ -1,12 +1,9 @@
 """BallbotEnv: Gymnasium's interface to a task and a simulator."""
 
 import dataclasses
-import enum
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
-from operator import attrgetter
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -14,14 +11,21 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
-from ballbot_gym.checks import finite_array, real_array, reset_options
+from ballbot_gym.checks import (
+    check_constant_names,
+    check_history,
+    finite_array,
+    fixed,
+    real_array,
+    reset_options,
+)
 from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import YAW, PictureScene
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
-from ballbot_gym.registry import name_of, named_task
-from ballbot_gym.robots import PAPER, checked_robot, named_robot, own_fields
+from ballbot_gym.registry import named_task, spec_of
+from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.scene import Window, check_render_mode, usable_render_modes, window_trouble
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
@@ -31,35 +35,6 @@ from ballbot_gym.viewer import PageScene
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
-_LONGEST_HISTORY = 1000  # control steps
-
-
-_Kind = TypeVar("_Kind", bound=type)
-
-
-def fixed(*names: str) -> Callable[[_Kind], _Kind]:
-    """Makes attributes of the decorated class read-only once they are set: what is computed from them would not follow."""
-
-    def decorate(kind: _Kind) -> _Kind:
-        for name in names:
-            setter = partial(_set_once, name=name)
-            # read in C, because an env reads some in every step
-            setattr(kind, name, property(attrgetter(f"_{name}"), setter))
-        return kind
-
-    return decorate
-
-
-def _set_once(instance: Any, value: Any, name: str) -> None:
-    if hasattr(instance, f"_{name}"):
-        raise fixed_error(instance, name)
-    setattr(instance, f"_{name}", value)
-
-
-def fixed_error(instance: Any, name: str) -> AttributeError:
-    """What setting an attribute raises that is fixed."""
-    instead = "take a wrapper" if name.endswith("_space") else f"make a new {type(instance).__name__}"
-    return AttributeError(f"{name!r} cannot be set: {instead} instead")
 
 
 class EnvState(NamedTuple):
@@ -572,56 +547,11 @@ GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
 
 
-def check_history(history: Any) -> int:
-    """history, or a ValueError."""
-    if isinstance(history, bool) or not isinstance(history, int | np.integer) or not 0 <= history <= _LONGEST_HISTORY:
-        raise ValueError(f"history must be a whole number of control steps, 0 to {_LONGEST_HISTORY}, not {history!r}")
-    return int(history)
-
-
 def observation_space(task: Task, params: BallbotParams, history: int = 0) -> spaces.Box:
     """What a robot can observe in a task, with so many earlier observations and actions."""
     own = task.observation_bounds(params)
     bounds = np.array((*own, *(history * (*own, 1.0, 1.0))), np.float32)
     return spaces.Box(-bounds, bounds, dtype=np.float32)
-
-
-def spec_of(
-    spec: EnvSpec | None, task: Task, params: BallbotParams, randomization: Randomization, steps: int | None = None
-) -> EnvSpec | None:
-    """A registered spec as tools shall read it of an env: with the env's own number of control steps, whatever duration
-    was asked for, and without a reward threshold where another problem, robot or pay makes it meaningless.
-
-    Its keywords are such that `to_json` can write them and the env can be made of them again, unless the task is an object
-    of a class that is not in `TASKS`.
-
-    Episodes are truncated by the envs themselves, so no `TimeLimit` is registered: it would cut longer durations.
-    """
-    if spec is None:
-        return None
-    kind = type(task)()
-    usual = task.problem() == kind.problem() and task.survival_reward == kind.survival_reward
-    usual = usual and params == named_robot(PAPER) and not randomization.active
-    keywords = {name: _plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
-    if isinstance(keywords.get("task"), Task):
-        name = name_of(task)
-        keywords |= {} if name is None else {"task": name, **dataclasses.asdict(task)}
-    return dataclasses.replace(
-        spec,
-        max_episode_steps=task.steps if steps is None else steps,
-        reward_threshold=spec.reward_threshold if usual else None,
-        kwargs=keywords,
-    )
-
-
-def _plain(value: Any) -> Any:
-    """A keyword as JSON knows it, of those that envs take as words or numbers too."""
-    if isinstance(value, enum.Enum):
-        return value.value
-    if isinstance(value, np.generic):
-        return value.item()
-    is_torchs = type(value).__module__ == "torch" and type(value).__name__ in ("device", "dtype")
-    return str(value).removeprefix("torch.") if is_torchs else value
 
 
 def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:
@@ -651,19 +581,6 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
         # Python's own words, because clients such as torchrl look for them.
         raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; it has {', '.join(known)}")
     return TASKS[task](**(own_fields(robot, task) | task_fields))
-
-
-def check_constant_names(task: Task, named: dict[str, Any]) -> None:
-    """Raises a ValueError that says which constants a task has, where others are given by name."""
-    unknown = sorted(set(named) - set(task.constant_names), key=repr)
-    if not unknown:
-        return
-    if not task.constant_names:
-        raise ValueError(
-            f'{task.id} has no constants {unknown}; its episodes have none: leave options["constants"] out, or set '
-            'the start with options={"state": x}'
-        )
-    raise ValueError(f"{task.id} has no constants {unknown}; it has {list(task.constant_names)}")
 
 
 def _floats(vector: Sequence[Any] | np.ndarray) -> State:

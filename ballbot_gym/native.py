@@ -18,11 +18,12 @@ import numpy as np
 import torch
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, seeds_of
-from ballbot_gym.checks import check_num_envs
-from ballbot_gym.env import fixed
+from ballbot_gym.autoreset import StepInfo
+from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep
+from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.seeding import seeds_of
 from ballbot_gym.spares import Spares
 from ballbot_gym.tasks import Task
 
@@ -149,7 +150,7 @@ class BallbotNative:
         return self._seen(state)[1]
 
     def step(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> BatchStep:
-        """Holds forces for one control step; see `vector._advance`.
+        """Holds forces for one control step; see `autoreset.advance`.
 
         `final_observation` has the rows of ended episodes alone.
         """

@@ -12,21 +12,21 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ballbot_gym import dynamics
-from ballbot_gym.checks import finite_array, real_array, reset_options
-from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
-from ballbot_gym.env import (
-    REWARD_PARTS,
+from ballbot_gym.checks import (
     check_constant_names,
+    check_finite,
+    finite_array,
     fixed,
-    limit_names,
-    make_task,
-    observation_space,
-    spec_of,
+    real_array,
+    reset_options,
 )
+from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
+from ballbot_gym.env import REWARD_PARTS, limit_names, make_task, observation_space
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import PictureScene
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.registry import spec_of
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
@@ -39,7 +39,8 @@ except ImportError as error:
         'vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, dtype_named, tilt_of
+from ballbot_gym.autoreset import StepInfo, advance, begun
+from ballbot_gym.batch import BallbotBatch, BatchState, dtype_named, tilt_of
 
 if TYPE_CHECKING:
     from ballbot_gym.native import BallbotNative
@@ -361,7 +362,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     def _advance(
         self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
     ) -> tuple[Any, StepInfo, StepInfo, np.ndarray]:
-        """`_advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone.
+        """`advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone.
 
         Returns:
             As `BallbotNative.step_with_infos`.
@@ -372,7 +373,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
         constants, drawn = self._x_and_c()[1], self._drawn()
         with torch.no_grad():
-            result: Any = _advance(self.batch, self._to_batch(actions), waiting, restart)
+            result: Any = advance(self.batch, self._to_batch(actions), waiting, restart)
         arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
         ended = (arrays["terminated"] | arrays["truncated"]).nonzero()[0]
         arrays["final_observation"] = arrays["final_observation"][ended]
@@ -397,7 +398,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             observation[cut] = self._array(self.batch.observe(self.batch.state), np.float32)[cut]
         x, c = self._x_and_c()
         tilt[cut] = dynamics.tilt(tuple(x[:, cut]))
-        now, ended = _begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
+        now, ended = begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
         result = result._replace(observation=observation, final_observation=final[ended])
         return result, now._replace(x=x, c=c, tilt=tilt, drawn=self._drawn()), end, ended
 
@@ -428,7 +429,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if not (restart and ended.size):
             return now, now
         end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants, drawn=drawn)
-        return _begun(now, ended), end
+        return begun(now, ended), end
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
         """(8, B) states and (nc, B) constants."""
@@ -539,54 +540,6 @@ def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "Ballb
         return None
 
 
-def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None, restart: bool) -> BatchStep:
-    """One control step of a batch.
-
-    Args:
-        batch: which goes on.
-        actions: (B, 2).
-        waiting: (B,) bool, the envs that ignore their action and begin their next episode; None where there are none.
-        restart: whether episodes that end are followed by the next ones at once. Else the batch stays at their ends, and
-            `observation` and `tilt` are those of the end.
-    """
-    if batch.state is None:
-        raise gymnasium.error.ResetNeeded("step() before reset()")
-    wait = None if waiting is None else torch.from_numpy(waiting).to(batch.device)
-    if wait is not None:
-        batch.state = batch.initial_state(None, wait)
-    before = batch.state
-    result = batch.step(actions)
-    after = batch.state
-    if restart or after is None:
-        return result
-    ended = result.terminated | result.truncated
-    if wait is not None:
-        ended = ended & ~wait
-        no = ~wait
-        result = result._replace(
-            reward=result.reward * no,
-            cost=result.cost * no,
-            terminated=result.terminated & no,
-            truncated=result.truncated & no,
-            success=result.success & no,
-            failure=result.failure & no,
-            violated=torch.where(wait, -1, result.violated),
-            force=result.force * no,
-            clipped=result.clipped & no,
-            grip=torch.where(no, result.grip, 0.0),
-        )
-    held = ended if wait is None else ended | wait
-    if not held.any():
-        return result
-    x = torch.where(ended, result.final_x, before.x)
-    old = before._replace(x=x, steps=before.steps + ended)
-    batch.state = BatchState(*(torch.where(held, a, b) for a, b in zip(old, after, strict=True)))
-    observation = torch.where(ended[:, None], result.final_observation, result.observation)
-    if wait is not None:
-        observation = torch.where(wait[:, None], batch.observe(batch.state), observation)
-    return result._replace(observation=observation, tilt=tilt_of(batch.state.x.unbind(0)))
-
-
 def _most_steps(max_episode_steps: int | None, task: Task) -> int:
     """Control steps in the longest episode; −1 stands for None, as for `gymnasium.make`."""
     if max_episode_steps is None or max_episode_steps == -1:
@@ -629,17 +582,3 @@ def _reset_mask(mask: Any, num_envs: int) -> np.ndarray:
     if not mask.any():
         raise ValueError("options['reset_mask'] must be True somewhere")
     return mask.copy()
-
-
-def _begun(now: StepInfo, begun: np.ndarray) -> StepInfo:
-    """What infos say where episodes have begun in place of ended ones, as after `reset`."""
-    cleared = ("cost", "reward_parts", "force", "success", "failure", "clipped", "grip")
-    return now._replace(**{name: _without(getattr(now, name), begun) for name in cleared})
-
-
-def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """A copy of (B,) or (n, B) numbers with 0 in some columns."""
-    copied = rows.copy(order="K")
-    for row in np.atleast_2d(copied):  # one after the other, which NumPy does three times as fast
-        row[indices] = 0
-    return copied

@@ -1,7 +1,7 @@
 """Control steps per second of vector environments by batch size: Gymnasium's sync, machine code and torch.
 
-Sync is left out from 1024 envs on, which take it seconds. Every figure is the median of several runs, whose order alternates. Time is that of the processor, so that a busy
-machine does not spoil it; run it with OMP_NUM_THREADS=1.
+Sync is left out from 1024 envs on, which take it seconds. Every figure is the median of several runs, whose order
+alternates. Time is that of the processor, so that a busy machine does not spoil it; run it with OMP_NUM_THREADS=1.
 """
 
 import math
