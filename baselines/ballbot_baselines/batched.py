@@ -295,7 +295,6 @@ class _Batch:
             np.concatenate([found.slopes, rest.slopes(x[:, :-1])], axis=1),
             found.costs - expected + costs,
             found.solved,
-            found.iterations,
         )
         exact = np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
         again = _Guesses(guesses.of, whole.x, whole.a, guesses.steps + left)
