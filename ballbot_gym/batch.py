@@ -7,11 +7,10 @@ Eager batches give bit-identical results for the same seed and actions, and so d
 and compiled batches agree to rounding. So does a compiled batch of one env, which computes sines with another library.
 """
 
-import itertools
 import logging
 import shutil
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -25,11 +24,12 @@ except ImportError as error:
     raise ImportError(f"batches of environments need torch: {install('train')}") from error
 
 from ballbot_gym import counter_rng, dynamics
-from ballbot_gym.checks import LARGEST, check_num_envs, shown
-from ballbot_gym.env import check_history, fixed_error, limit_names, make_task
+from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
+from ballbot_gym.env import limit_names, make_task
 from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
+from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import first_violated, outcome
 
@@ -127,35 +127,6 @@ class BatchStep(NamedTuple):
     where friction is unlimited. It carries no gradient."""
 
 
-class StepInfo(NamedTuple):
-    """What an info says of B environments, in NumPy arrays: of the step, or of the start of an episode."""
-
-    x: np.ndarray
-    """(8, B) states."""
-    cost: np.ndarray
-    """(B,) float64, of the step."""
-    reward_parts: np.ndarray
-    """(3, B) float64, `env.REWARD_PARTS`; their sum is the reward."""
-    tilt: np.ndarray
-    """(B,) rad."""
-    force: np.ndarray
-    """(2, B) N."""
-    success: np.ndarray
-    """(B,) bool."""
-    failure: np.ndarray
-    """(B,) bool."""
-    violated: np.ndarray
-    """(B,) int64, as of `BatchStep`, where `failure` holds."""
-    clipped: np.ndarray
-    """(B,) bool."""
-    c: np.ndarray
-    """(nc, B) constants."""
-    grip: np.ndarray
-    """(4, B), as of `BatchStep`; (0, B) where friction is unlimited."""
-    drawn: np.ndarray = np.zeros((0, 0))
-    """(6 or 14, B), as of `BatchState`; (0, B) where nothing is drawn."""
-
-
 class BatchEpisodes(NamedTuple):
     """One episode of each of B environments."""
 
@@ -242,7 +213,7 @@ class BallbotBatch:
         self._proven = not wanted
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # not by `env.fixed`, through which torch.compile cannot see
+        # not by `checks.fixed`, through which torch.compile cannot see
         if name in _FIXED and name in vars(self):
             raise fixed_error(self, name)
         super().__setattr__(name, value)
@@ -622,32 +593,3 @@ def _described(value: Any) -> str:
 def dtype_named(dtype: Any) -> Any:
     """A dtype that may be given by its name, as in a spec that was JSON."""
     return {"float32": torch.float32, "float64": torch.float64}.get(dtype, dtype) if isinstance(dtype, str) else dtype
-
-
-def check_finite(actions: np.ndarray) -> None:
-    """Raises a ValueError that names the envs whose actions (B, 2) are not finite."""
-    # for one env, all() and any() take several times as long as counting
-    if np.count_nonzero(np.isfinite(actions)) < actions.size:
-        bad = np.flatnonzero(~np.isfinite(actions).all(1))
-        raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
-
-
-def seeds_of(seed: int | Sequence[int | None], num_envs: int) -> list[int | None]:
-    """One seed per env."""
-    if isinstance(seed, bool | str | bytes | Mapping | Set) or not isinstance(seed, int | np.integer | Iterable):
-        raise TypeError(f"seed must be a whole number, or one or None for each env, not {shown(seed)}")
-    if isinstance(seed, Iterable):
-        seeds: list[Any] = list(itertools.islice(seed, num_envs + 1))  # it may have no end
-    else:
-        seeds = [int(seed) + i for i in range(num_envs)]
-    if len(seeds) != num_envs:
-        found = f"more than {num_envs}" if len(seeds) > num_envs else len(seeds)
-        raise ValueError(f"seed has {found} entries for {num_envs} envs")
-    for value in seeds:
-        if value is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | np.integer):
-            raise TypeError(f"seeds must be whole numbers, not {shown(value)}")
-        if not 0 <= value < 2**63:
-            raise ValueError(f"seeds must be in [0, 2^63), not {shown(value)}")
-    return [None if value is None else int(value) for value in seeds]

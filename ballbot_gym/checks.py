@@ -1,8 +1,11 @@
-"""Checks of what users hand in: numbers, options and how many environments."""
+"""Checks of what users hand in: numbers, options, how many environments, and what may be set."""
 
 import dataclasses
 import reprlib
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from operator import attrgetter
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -11,6 +14,7 @@ LARGEST = 1e6
 MOST_ENVS = 2**20
 """Environments in a batch. Machine code takes about 1 kB for each, and seeds are listed in Python."""
 
+_LONGEST_HISTORY = 1000  # control steps
 _FLOATS = (np.dtype(np.float64), np.dtype(np.float32))
 
 
@@ -92,3 +96,59 @@ def from_fields(kind: type, value: Any) -> Any:
     if isinstance(value, dict) and value.keys() == {field.name for field in dataclasses.fields(kind)}:
         return kind(**value)
     return value
+
+
+def check_finite(actions: np.ndarray) -> None:
+    """Raises a ValueError that names the envs whose actions (B, 2) are not finite."""
+    # for one env, all() and any() take several times as long as counting
+    if np.count_nonzero(np.isfinite(actions)) < actions.size:
+        bad = np.flatnonzero(~np.isfinite(actions).all(1))
+        raise ValueError(f"actions must be finite; those of envs {bad[:8].tolist()} are not")
+
+
+def check_history(history: Any) -> int:
+    """history, or a ValueError."""
+    if isinstance(history, bool) or not isinstance(history, int | np.integer) or not 0 <= history <= _LONGEST_HISTORY:
+        raise ValueError(f"history must be a whole number of control steps, 0 to {_LONGEST_HISTORY}, not {history!r}")
+    return int(history)
+
+
+def check_constant_names(task: Any, named: dict[str, Any]) -> None:
+    """Raises a ValueError that says which constants a task has, where others are given by name."""
+    unknown = sorted(set(named) - set(task.constant_names), key=repr)
+    if not unknown:
+        return
+    if not task.constant_names:
+        raise ValueError(
+            f'{task.id} has no constants {unknown}; its episodes have none: leave options["constants"] out, or set '
+            'the start with options={"state": x}'
+        )
+    raise ValueError(f"{task.id} has no constants {unknown}; it has {list(task.constant_names)}")
+
+
+_Kind = TypeVar("_Kind", bound=type)
+
+
+def fixed(*names: str) -> Callable[[_Kind], _Kind]:
+    """Makes attributes of the decorated class read-only once they are set: what is computed from them would not follow."""
+
+    def decorate(kind: _Kind) -> _Kind:
+        for name in names:
+            setter = partial(_set_once, name=name)
+            # read in C, because an env reads some in every step
+            setattr(kind, name, property(attrgetter(f"_{name}"), setter))
+        return kind
+
+    return decorate
+
+
+def _set_once(instance: Any, value: Any, name: str) -> None:
+    if hasattr(instance, f"_{name}"):
+        raise fixed_error(instance, name)
+    setattr(instance, f"_{name}", value)
+
+
+def fixed_error(instance: Any, name: str) -> AttributeError:
+    """What setting an attribute raises that is fixed."""
+    instead = "take a wrapper" if name.endswith("_space") else f"make a new {type(instance).__name__}"
+    return AttributeError(f"{name!r} cannot be set: {instead} instead")

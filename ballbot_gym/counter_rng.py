@@ -1,7 +1,7 @@
 """Random numbers for batches: a hash of (the env's seed, the episode's number, the step, an index), in torch.
 
 An env's random numbers therefore do not depend on the batch or on its position in it, and the starts of new episodes are
-drawn without a loop. `key` and `floats` give the same numbers for one env, in plain Python.
+drawn without a loop.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -21,11 +21,6 @@ def uniforms(key: "torch.Tensor", count: int, dtype: "torch.dtype") -> "tuple[to
     """`count` tensors (B,) of uniform numbers in [0, 1), multiples of 2⁻²⁴ and so the same in both dtypes."""
     words = (_mix((key + 0x9E3779B9 * i) & _WORD) for i in range(1, count + 1))
     return tuple((word >> 8).to(dtype) * 2.0**-24 for word in words)
-
-
-def floats(key: int, count: int) -> tuple[float, ...]:
-    """What `uniforms` gives for one env."""
-    return tuple((_mix((key + 0x9E3779B9 * i) & _WORD) >> 8) * 2.0**-24 for i in range(1, count + 1))
 
 
 def _mix(word: Any) -> Any:

@@ -42,9 +42,6 @@ STATE = (
 )
 """Name and unit of each state component, in order."""
 
-INPUT = (("Fx", "N"), ("Fy", "N"))
-"""Name and unit of each input component, in order."""
-
 LEAST_NORMAL_FORCE = 0.02
 """Least normal force of a robot that has to grip, as a fraction of its weight."""
 

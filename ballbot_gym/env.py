@@ -1,12 +1,10 @@
 """BallbotEnv: Gymnasium's interface to a task and a simulator."""
 
 import dataclasses
-import enum
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
-from operator import attrgetter
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -14,52 +12,29 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from ballbot_gym import dynamics
-from ballbot_gym.checks import finite_array, real_array, reset_options
+from ballbot_gym.checks import (
+    check_constant_names,
+    check_history,
+    finite_array,
+    fixed,
+    real_array,
+    reset_options,
+)
 from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import YAW, PictureScene
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
-from ballbot_gym.registry import name_of, named_task
-from ballbot_gym.robots import PAPER, checked_robot, named_robot, own_fields
-from ballbot_gym.scene import Window, check_render_mode, usable_render_modes, window_trouble
+from ballbot_gym.registry import named_task, spec_of
+from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import outcome
-from ballbot_gym.viewer import PageScene
+from ballbot_gym.viewer import PageScene, import_viser
 
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
-_LONGEST_HISTORY = 1000  # control steps
-
-
-_Kind = TypeVar("_Kind", bound=type)
-
-
-def fixed(*names: str) -> Callable[[_Kind], _Kind]:
-    """Makes attributes of the decorated class read-only once they are set: what is computed from them would not follow."""
-
-    def decorate(kind: _Kind) -> _Kind:
-        for name in names:
-            setter = partial(_set_once, name=name)
-            # read in C, because an env reads some in every step
-            setattr(kind, name, property(attrgetter(f"_{name}"), setter))
-        return kind
-
-    return decorate
-
-
-def _set_once(instance: Any, value: Any, name: str) -> None:
-    if hasattr(instance, f"_{name}"):
-        raise fixed_error(instance, name)
-    setattr(instance, f"_{name}", value)
-
-
-def fixed_error(instance: Any, name: str) -> AttributeError:
-    """What setting an attribute raises that is fixed."""
-    instead = "take a wrapper" if name.endswith("_space") else f"make a new {type(instance).__name__}"
-    return AttributeError(f"{name!r} cannot be set: {instead} instead")
 
 
 class EnvState(NamedTuple):
@@ -120,7 +95,7 @@ class BallbotEnv(gymnasium.Env):
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
     `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
-    copy of a Bullet env has a physics client of its own. The window is not copied.
+    copy of a Bullet env has a physics client of its own. The page is not copied.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
@@ -143,8 +118,8 @@ class BallbotEnv(gymnasium.Env):
             task: a name in `TASKS`, or a Task.
             physics: "bullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the closed-form model.
                 Default, the first of these that is installed; "rk4" comes with a warning.
-            render_mode: None; "rgb_array", which needs no display; or "human": PyBullet's window, or a page in the
-                browser where none can open.
+            render_mode: None; "rgb_array", which needs no display; or "human": a page in the browser, whose address is
+                printed.
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
                 10 ms for rk4.
@@ -159,23 +134,28 @@ class BallbotEnv(gymnasium.Env):
             ValueError: an unknown task, physics or render mode, or a task field out of its range.
             TypeError: a keyword that is no field of the task.
             ImportError: physics="bullet" without a usable PyBullet, or "mujoco" without MuJoCo.
-            RuntimeError: render_mode="human" where neither a window nor a page can open.
+            RuntimeError: render_mode="human" without viser.
         """
         self._spec: EnvSpec | None = None
-        self._scene: PictureScene | Window | PageScene | None = None
+        self._scene: PictureScene | PageScene | None = None
         self._state: State = ()  # until the first reset
         physics = default_physics() if physics is None else physics
         if not isinstance(physics, str) or physics not in PHYSICS:
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
-        check_render_mode(render_mode)
+        if render_mode == "human":
+            try:
+                import_viser()
+            except ImportError as error:
+                raise RuntimeError(f'{error}. Or take render_mode="rgb_array", which needs no page') from error
         self.params = checked_robot(robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
         self.render_mode = render_mode
         fps = round(1 / self.task.control_dt)
-        self.metadata = {**self.metadata, "render_modes": usable_render_modes(), "render_fps": fps}
+        modes = ["rgb_array"] if find_spec("viser") is None else ["human", "rgb_array"]
+        self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.randomization = checked_randomization(randomization)
         self._disturbance = (
@@ -322,7 +302,7 @@ class BallbotEnv(gymnasium.Env):
         return math.hypot(*self._simulator.slip())
 
     def render(self) -> np.ndarray | None:
-        """The current state as an image (height, width, 3), uint8, or in the window of render_mode="human"."""
+        """The current state as an image (height, width, 3), uint8, or in the page of render_mode="human"."""
         self._check_open()
         if self.render_mode is None:
             gymnasium.logger.warn('render() without a render mode; make the environment with render_mode="rgb_array"')
@@ -334,7 +314,8 @@ class BallbotEnv(gymnasium.Env):
     def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
         """Draws any state x (8,) with this episode's markers, for instance one of a recorded trajectory."""
         if self._scene is None:
-            self._scene = self._make_scene()
+            human = self.render_mode == "human"
+            self._scene = PageScene(self.params, self.task.control_dt) if human else PictureScene(self.params)
             self._scene.set_markers(self.task.markers(self._constants_array))
         return self._scene.draw(tuple(map(float, x)))
 
@@ -409,21 +390,13 @@ class BallbotEnv(gymnasium.Env):
             self._restore_simulator(memory)
 
     def close(self) -> None:
-        """Releases the physics client and the window; may be called again."""
+        """Releases the physics client and the page; may be called again."""
         self._closed = True
         self._steps_left = 0
         self._simulator.close()
         if self._scene is not None:
             self._scene.close()
             self._scene = None
-
-    def _make_scene(self) -> PictureScene | Window | PageScene:
-        """A picture, a window, or a page in the browser where no window can open."""
-        if self.render_mode != "human":
-            return PictureScene(self.params)
-        if reason := window_trouble():
-            return PageScene(self.params, self.task.control_dt, reason)
-        return Window(self.params)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -572,56 +545,11 @@ GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
 
 
-def check_history(history: Any) -> int:
-    """history, or a ValueError."""
-    if isinstance(history, bool) or not isinstance(history, int | np.integer) or not 0 <= history <= _LONGEST_HISTORY:
-        raise ValueError(f"history must be a whole number of control steps, 0 to {_LONGEST_HISTORY}, not {history!r}")
-    return int(history)
-
-
 def observation_space(task: Task, params: BallbotParams, history: int = 0) -> spaces.Box:
     """What a robot can observe in a task, with so many earlier observations and actions."""
     own = task.observation_bounds(params)
     bounds = np.array((*own, *(history * (*own, 1.0, 1.0))), np.float32)
     return spaces.Box(-bounds, bounds, dtype=np.float32)
-
-
-def spec_of(
-    spec: EnvSpec | None, task: Task, params: BallbotParams, randomization: Randomization, steps: int | None = None
-) -> EnvSpec | None:
-    """A registered spec as tools shall read it of an env: with the env's own number of control steps, whatever duration
-    was asked for, and without a reward threshold where another problem, robot or pay makes it meaningless.
-
-    Its keywords are such that `to_json` can write them and the env can be made of them again, unless the task is an object
-    of a class that is not in `TASKS`.
-
-    Episodes are truncated by the envs themselves, so no `TimeLimit` is registered: it would cut longer durations.
-    """
-    if spec is None:
-        return None
-    kind = type(task)()
-    usual = task.problem() == kind.problem() and task.survival_reward == kind.survival_reward
-    usual = usual and params == named_robot(PAPER) and not randomization.active
-    keywords = {name: _plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
-    if isinstance(keywords.get("task"), Task):
-        name = name_of(task)
-        keywords |= {} if name is None else {"task": name, **dataclasses.asdict(task)}
-    return dataclasses.replace(
-        spec,
-        max_episode_steps=task.steps if steps is None else steps,
-        reward_threshold=spec.reward_threshold if usual else None,
-        kwargs=keywords,
-    )
-
-
-def _plain(value: Any) -> Any:
-    """A keyword as JSON knows it, of those that envs take as words or numbers too."""
-    if isinstance(value, enum.Enum):
-        return value.value
-    if isinstance(value, np.generic):
-        return value.item()
-    is_torchs = type(value).__module__ == "torch" and type(value).__name__ in ("device", "dtype")
-    return str(value).removeprefix("torch.") if is_torchs else value
 
 
 def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:
@@ -651,19 +579,6 @@ def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fi
         # Python's own words, because clients such as torchrl look for them.
         raise TypeError(f"{TASKS[task].id} got an unexpected keyword argument {name!r}; it has {', '.join(known)}")
     return TASKS[task](**(own_fields(robot, task) | task_fields))
-
-
-def check_constant_names(task: Task, named: dict[str, Any]) -> None:
-    """Raises a ValueError that says which constants a task has, where others are given by name."""
-    unknown = sorted(set(named) - set(task.constant_names), key=repr)
-    if not unknown:
-        return
-    if not task.constant_names:
-        raise ValueError(
-            f'{task.id} has no constants {unknown}; its episodes have none: leave options["constants"] out, or set '
-            'the start with options={"state": x}'
-        )
-    raise ValueError(f"{task.id} has no constants {unknown}; it has {list(task.constant_names)}")
 
 
 def _floats(vector: Sequence[Any] | np.ndarray) -> State:

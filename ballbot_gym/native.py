@@ -15,14 +15,15 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+import torch
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.batch import BatchState, BatchStep, StepInfo, check_finite, seeds_of
-from ballbot_gym.checks import check_num_envs
-from ballbot_gym.env import fixed
-from ballbot_gym.loop import BallbotLoop
+from ballbot_gym.autoreset import StepInfo
+from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep
+from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.seeding import seeds_of
 from ballbot_gym.spares import Spares
 from ballbot_gym.tasks import Task
 
@@ -149,7 +150,7 @@ class BallbotNative:
         return self._seen(state)[1]
 
     def step(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> BatchStep:
-        """Holds forces for one control step; see `vector._advance`.
+        """Holds forces for one control step; see `autoreset.advance`.
 
         `final_observation` has the rows of ended episodes alone.
         """
@@ -325,16 +326,19 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
     """
     code, dtype = _code(task, params, double), np.float64 if double else np.float32
     actions = np.asfortranarray([[0.1, -0.2], [-0.3, 0.4], [1.2, 0.5], [-0.6, -1.2]], dtype)
-    found = []
-    for envs in (
-        BallbotNative(task, len(actions), dtype, params, code=code),
-        BallbotLoop(task, len(actions), dtype, params),
-    ):
-        envs.state = envs.initial_state(seed=0)
-        start = {"first observation": envs.observe(envs.state), "start": envs.state.x, "constants": envs.state.c}
-        found.append(start | envs.step(actions, None, False)._asdict())
-    for name, expected in found[1].items():
-        if not np.allclose(found[0][name], expected, rtol=1e-3, atol=1e-3, equal_nan=True):
+    own = BallbotNative(task, len(actions), dtype, params, code=code)
+    kind = torch.float64 if double else torch.float32
+    batch = BallbotBatch(task, len(actions), dtype=kind, compile=False, params=params)
+    own.state = first = own.initial_state(seed=0)
+    batch.state = start = batch.initial_state(seed=0)
+    found = {"first observation": own.observe(first), "start": first.x, "constants": first.c}
+    expected = {"first observation": batch.observe(start), "start": start.x, "constants": start.c}
+    with torch.no_grad():
+        step = batch.step(torch.from_numpy(actions))
+    step = step._replace(final_observation=step.final_observation[step.terminated | step.truncated])
+    found |= own.step(actions, None, True)._asdict()
+    for name, value in (expected | step._asdict()).items():
+        if not np.allclose(found[name], value, rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NativeUnavailableError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
     return code
 

@@ -4,18 +4,23 @@
 names its module, `MODULE:NAME`, which whoever makes the environment imports. Processes that we start get `registered()`.
 """
 
+import enum
 import inspect
 import re
 import sys
 import warnings
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, asdict, fields, replace
 from importlib import import_module, metadata
 from typing import Any
 
 import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym.robots import ROBOTS, Robot, check_name, register_robot, short_name
+from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import PAPER, ROBOTS, Robot, check_name, named_robot, register_robot, short_name
 from ballbot_gym.tasks import SHIPPED, TASKS, Task
 
 TASKS_GROUP, ROBOTS_GROUP = "ballbot_gym.tasks", "ballbot_gym.robots"
@@ -88,6 +93,44 @@ def named_task(name: Any) -> str:
 def name_of(task: Task) -> str | None:
     """The name in `TASKS` of a task's class; None where it has none."""
     return next((name for name, kind in TASKS.items() if type(task) is kind), None)
+
+
+def spec_of(
+    spec: EnvSpec | None, task: Task, params: BallbotParams, randomization: Randomization, steps: int | None = None
+) -> EnvSpec | None:
+    """A registered spec as tools shall read it of an env: with the env's own number of control steps, whatever duration
+    was asked for, and without a reward threshold where another problem, robot or pay makes it meaningless.
+
+    Its keywords are such that `to_json` can write them and the env can be made of them again, unless the task is an object
+    of a class that is not in `TASKS`.
+
+    Episodes are truncated by the envs themselves, so no `TimeLimit` is registered: it would cut longer durations.
+    """
+    if spec is None:
+        return None
+    kind = type(task)()
+    usual = task.problem() == kind.problem() and task.survival_reward == kind.survival_reward
+    usual = usual and params == named_robot(PAPER) and not randomization.active
+    keywords = {name: _plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
+    if isinstance(keywords.get("task"), Task):
+        name = name_of(task)
+        keywords |= {} if name is None else {"task": name, **asdict(task)}
+    return replace(
+        spec,
+        max_episode_steps=task.steps if steps is None else steps,
+        reward_threshold=spec.reward_threshold if usual else None,
+        kwargs=keywords,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """A keyword as JSON knows it, of those that envs take as words or numbers too."""
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, np.generic):
+        return value.item()
+    is_torchs = type(value).__module__ == "torch" and type(value).__name__ in ("device", "dtype")
+    return str(value).removeprefix("torch.") if is_torchs else value
 
 
 def _is_same(kind: type, other: type) -> bool:

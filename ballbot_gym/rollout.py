@@ -35,34 +35,6 @@ class Controller(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class FunctionController:
-    """A plain function u = f(t, x) as a Controller."""
-
-    function: Callable[[float, np.ndarray], np.ndarray]
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        pass
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        return np.asarray(self.function(t, x), np.float64)
-
-
-class DelayedController:
-    """Another controller whose forces are applied some control steps late, like those of a slow computer; at first 0."""
-
-    def __init__(self, controller: Controller, steps: int):
-        self._controller, self._steps = controller, steps
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._pending = [np.zeros(2)] * self._steps
-        self._controller.reset(t, x, c)
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        self._pending.append(self._controller.act(t, x))
-        return self._pending.pop(0)
-
-
 class ActionController:
     """A function from observation to action as a Controller. It gets the observations that the env would show.
 

@@ -26,96 +26,41 @@ class Number:
         expression = form.format(self.name, *(_name(other) for other in others))
         return Number(self.lines.setdefault(expression, f"v{len(self.lines)}"), self.lines)
 
-    def __add__(self, other: Any) -> "Number":
-        return self.made("{0} + {1}", other)
-
-    def __radd__(self, other: Any) -> "Number":
-        return self.made("{1} + {0}", other)
-
-    def __sub__(self, other: Any) -> "Number":
-        return self.made("{0} - {1}", other)
-
-    def __rsub__(self, other: Any) -> "Number":
-        return self.made("{1} - {0}", other)
-
-    def __mul__(self, other: Any) -> "Number":
-        return self.made("{0} * {1}", other)
-
-    def __rmul__(self, other: Any) -> "Number":
-        return self.made("{1} * {0}", other)
-
-    def __truediv__(self, other: Any) -> "Number":
-        return self.made("{0} / {1}", other)
-
-    def __rtruediv__(self, other: Any) -> "Number":
-        return self.made("{1} / {0}", other)
-
-    def __pow__(self, other: Any) -> "Number":
-        return self.made("pow({0}, {1})", other)
-
-    def __neg__(self) -> "Number":
-        return self.made("-{0}")
-
-    def __abs__(self) -> "Number":
-        return self.made("fabs({0})")
-
-    def __lt__(self, other: Any) -> "Number":
-        return self.made("{0} < {1}", other)
-
-    def __le__(self, other: Any) -> "Number":
-        return self.made("{0} <= {1}", other)
-
-    def __gt__(self, other: Any) -> "Number":
-        return self.made("{0} > {1}", other)
-
-    def __ge__(self, other: Any) -> "Number":
-        return self.made("{0} >= {1}", other)
-
-    def __eq__(self, other: Any) -> Any:
-        return self.made("{0} == {1}", other)
-
-    def __ne__(self, other: Any) -> Any:
-        return self.made("{0} != {1}", other)
-
     __hash__: Any = None
 
     def __bool__(self) -> bool:
         raise TypeError("a traced number is neither true nor false; take ops.where")
 
 
-def sin(a: Number) -> Number:
-    """Sine."""
-    return a.made("sin({0})")
+def _operation(form: str) -> Callable[..., Number]:
+    return lambda number, *others: number.made(form, *others)
 
 
-def cos(a: Number) -> Number:
-    """Cosine."""
-    return a.made("cos({0})")
+_OPERATORS = {
+    "add": "{0} + {1}",
+    "radd": "{1} + {0}",
+    "sub": "{0} - {1}",
+    "rsub": "{1} - {0}",
+    "mul": "{0} * {1}",
+    "rmul": "{1} * {0}",
+    "truediv": "{0} / {1}",
+    "rtruediv": "{1} / {0}",
+    "pow": "pow({0}, {1})",
+    "neg": "-{0}",
+    "abs": "fabs({0})",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "gt": "{0} > {1}",
+    "ge": "{0} >= {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+}
+for _name_of, _form in _OPERATORS.items():
+    setattr(Number, f"__{_name_of}__", _operation(_form))
 
-
-def sqrt(a: Number) -> Number:
-    """Square root."""
-    return a.made("sqrt({0})")
-
-
-def exp(a: Number) -> Number:
-    """Exponential."""
-    return a.made("exp({0})")
-
-
-def log(a: Number) -> Number:
-    """Natural logarithm."""
-    return a.made("log({0})")
-
-
-def arccos(a: Number) -> Number:
-    """Arc cosine."""
-    return a.made("acos({0})")
-
-
-def arctan(a: Number) -> Number:
-    """Arc tangent."""
-    return a.made("atan({0})")
+# the functions of `ops` under their names
+_FUNCTIONS = ("sin({0})", "cos({0})", "sqrt({0})", "exp({0})", "log({0})", "acos({0})", "atan({0})")
+sin, cos, sqrt, exp, log, arccos, arctan = map(_operation, _FUNCTIONS)
 
 
 def where(condition: Number, a: Any, b: Any) -> Number:

@@ -1,4 +1,4 @@
-"""BallbotVectorEnv: Gymnasium's vector interface to machine code, to a `BallbotBatch` in torch, or to a `BallbotLoop`."""
+"""BallbotVectorEnv: Gymnasium's vector interface to machine code, or to a `BallbotBatch` in torch."""
 
 import logging
 from collections.abc import Sequence
@@ -12,21 +12,21 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ballbot_gym import dynamics
-from ballbot_gym.checks import finite_array, real_array, reset_options
-from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
-from ballbot_gym.env import (
-    REWARD_PARTS,
+from ballbot_gym.checks import (
     check_constant_names,
+    check_finite,
+    finite_array,
     fixed,
-    limit_names,
-    make_task,
-    observation_space,
-    spec_of,
+    real_array,
+    reset_options,
 )
+from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
+from ballbot_gym.env import REWARD_PARTS, limit_names, make_task, observation_space
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import PictureScene
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.registry import spec_of
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
@@ -39,18 +39,11 @@ except ImportError as error:
         'vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, StepInfo, check_finite, dtype_named, tilt_of
-from ballbot_gym.loop import BallbotLoop
+from ballbot_gym.autoreset import StepInfo, advance, begun
+from ballbot_gym.batch import BallbotBatch, BatchState, dtype_named, tilt_of
 
 if TYPE_CHECKING:
     from ballbot_gym.native import BallbotNative
-
-LOOP_BELOW = 64
-"""Batch size below which engine="auto" loops over the envs on a CPU where there is no machine code. From there on a batch in
-torch is as fast or faster.
-
-Measured by `benchmarks/vector_engines.py` on one core.
-"""
 
 _DTYPES = {"reward": np.float64, "cost": np.float64, "observation": np.float32, "final_observation": np.float32}
 """Of arrays that do not have the batch's dtype."""
@@ -74,7 +67,7 @@ _INFO_KEYS = tuple(
 )
 """Keys of an info, each with that of its mask."""
 
-_ENGINES = ("auto", "native", "torch", "loop")
+_ENGINES = ("auto", "native", "torch")
 
 _log = logging.getLogger(__name__)
 
@@ -105,8 +98,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     The episodes are the same in all three. The entries of `final_info` and the rows of `final_obs`, a float32 array (B, no),
     are valid only for the envs that the masks `_…` mark. Returned arrays never change later; `state`, `constants` and
     `violated` in `infos` may share memory and are read-only. Observations and states are in Fortran order, component by
-    component, like those of Gymnasium's own batched CartPole, and actions in that order are not copied. engine="loop" has C
-    order.
+    component, like those of Gymnasium's own batched CartPole, and actions in that order are not copied.
 
     `copy.deepcopy` and `pickle` make independent envs in the same state, which go on bit-identically.
     """
@@ -141,10 +133,9 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
                 once per task and machine; it needs CasADi and no gradients, and knows no `Randomization` and no history.
-                "torch" computes them in torch, and `compile` says whether that is compiled. "loop" computes one after the
-                other in float64, whatever dtype is returned. "auto" takes "native" where it can on a CPU, unless compile is
-                True or False; else "loop" for fewer than `LOOP_BELOW` envs on a CPU, unless compile is True; else "torch".
-                All run the same episodes, to rounding. `batch` is a `BallbotNative`, a `BallbotBatch` or a `BallbotLoop`.
+                "torch" computes them in torch, and `compile` says whether that is compiled. "auto" takes "native" where it
+                can on a CPU, unless compile is True or False; else "torch". Both run the same episodes, to rounding. `batch`
+                is a `BallbotNative` or a `BallbotBatch`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -160,7 +151,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         task = make_task(task, params, **task_fields)
         _check_physics(physics, task, num_envs)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        if engine in ("native", "loop") and torch.device(device).type != "cpu":
+        if engine == "native" and torch.device(device).type != "cpu":
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         real: torch.dtype = dtype_named(dtype)
         self._dtype = np.float32 if real == torch.float32 else np.float64
@@ -371,26 +362,22 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     def _advance(
         self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
     ) -> tuple[Any, StepInfo, StepInfo, np.ndarray]:
-        """`_advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone.
+        """`advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone.
 
         Returns:
             As `BallbotNative.step_with_infos`.
         """
-        if not isinstance(self.batch, BallbotBatch | BallbotLoop):
+        if not isinstance(self.batch, BallbotBatch):
             return self.batch.step_with_infos(actions, waiting, restart)
         check_finite(actions)
         actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
         constants, drawn = self._x_and_c()[1], self._drawn()
-        if isinstance(self.batch, BallbotLoop):
-            result: Any = self.batch.step(actions, waiting, restart)
-        else:
-            with torch.no_grad():
-                result = _advance(self.batch, self._to_batch(actions), waiting, restart)
-            arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
-            result = result._replace(**arrays)
-        ended = (result.terminated | result.truncated).nonzero()[0]
-        if isinstance(self.batch, BallbotBatch):
-            result = result._replace(final_observation=result.final_observation[ended])
+        with torch.no_grad():
+            result: Any = advance(self.batch, self._to_batch(actions), waiting, restart)
+        arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
+        ended = (arrays["terminated"] | arrays["truncated"]).nonzero()[0]
+        arrays["final_observation"] = arrays["final_observation"][ended]
+        result = result._replace(**arrays)
         return result, *self._step_infos(result, constants, drawn, ended, waiting, restart), ended
 
     def _cut(
@@ -411,7 +398,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             observation[cut] = self._array(self.batch.observe(self.batch.state), np.float32)[cut]
         x, c = self._x_and_c()
         tilt[cut] = dynamics.tilt(tuple(x[:, cut]))
-        now, ended = _begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
+        now, ended = begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
         result = result._replace(observation=observation, final_observation=final[ended])
         return result, now._replace(x=x, c=c, tilt=tilt, drawn=self._drawn()), end, ended
 
@@ -442,12 +429,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         if not (restart and ended.size):
             return now, now
         end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants, drawn=drawn)
-        return _begun(now, ended), end
+        return begun(now, ended), end
 
     def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
         """(8, B) states and (nc, B) constants."""
-        if isinstance(self.batch, BallbotLoop):
-            return self.batch.x_and_c()
         state: Any = self.batch.state
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
@@ -522,28 +507,23 @@ def _batch(
     randomization: Randomization | str | None,
     engine: str,
     history: int,
-) -> "BallbotBatch | BallbotLoop | BallbotNative":
+) -> "BallbotBatch | BallbotNative":
     """The envs of an engine; see `BallbotVectorEnv`."""
     numbers = np.float32 if dtype == torch.float32 else np.float64
-    on_cpu = torch.device(device).type == "cpu"
-    if engine == "native" or (engine == "auto" and on_cpu and compile == "auto"):
+    if engine == "native" or (engine == "auto" and torch.device(device).type == "cpu" and compile == "auto"):
         # made in any case, because it checks the arguments; it allocates nothing
         checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization, history=history)
         native = _native(checked, numbers, must=engine == "native")
         if native is not None:
             return native
-    batch = BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, history=history)
-    small = engine == "auto" and on_cpu and batch.num_envs < LOOP_BELOW and compile is not True
-    if engine == "loop" or small:
-        return BallbotLoop(batch.task, batch.num_envs, numbers, batch.params, batch.randomization, batch.history)
-    return batch
+    return BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, history=history)
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
     """The envs of a batch in machine code. Where that is not possible: None, or an error if it must be."""
     if batch.randomization != Randomization() or batch.history:
         if must:
-            raise ValueError('engine="native" knows no Randomization and no history; take engine="torch" or "loop"')
+            raise ValueError('engine="native" knows no Randomization and no history; take engine="torch"')
         return None
     try:
         from ballbot_gym.native import BallbotNative, NativeUnavailableError
@@ -558,54 +538,6 @@ def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "Ballb
             raise
         _log.warning("no machine code, so the envs are slower: %s", error)
         return None
-
-
-def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None, restart: bool) -> BatchStep:
-    """One control step of a batch.
-
-    Args:
-        batch: which goes on.
-        actions: (B, 2).
-        waiting: (B,) bool, the envs that ignore their action and begin their next episode; None where there are none.
-        restart: whether episodes that end are followed by the next ones at once. Else the batch stays at their ends, and
-            `observation` and `tilt` are those of the end.
-    """
-    if batch.state is None:
-        raise gymnasium.error.ResetNeeded("step() before reset()")
-    wait = None if waiting is None else torch.from_numpy(waiting).to(batch.device)
-    if wait is not None:
-        batch.state = batch.initial_state(None, wait)
-    before = batch.state
-    result = batch.step(actions)
-    after = batch.state
-    if restart or after is None:
-        return result
-    ended = result.terminated | result.truncated
-    if wait is not None:
-        ended = ended & ~wait
-        no = ~wait
-        result = result._replace(
-            reward=result.reward * no,
-            cost=result.cost * no,
-            terminated=result.terminated & no,
-            truncated=result.truncated & no,
-            success=result.success & no,
-            failure=result.failure & no,
-            violated=torch.where(wait, -1, result.violated),
-            force=result.force * no,
-            clipped=result.clipped & no,
-            grip=torch.where(no, result.grip, 0.0),
-        )
-    held = ended if wait is None else ended | wait
-    if not held.any():
-        return result
-    x = torch.where(ended, result.final_x, before.x)
-    old = before._replace(x=x, steps=before.steps + ended)
-    batch.state = BatchState(*(torch.where(held, a, b) for a, b in zip(old, after, strict=True)))
-    observation = torch.where(ended[:, None], result.final_observation, result.observation)
-    if wait is not None:
-        observation = torch.where(wait[:, None], batch.observe(batch.state), observation)
-    return result._replace(observation=observation, tilt=tilt_of(batch.state.x.unbind(0)))
 
 
 def _most_steps(max_episode_steps: int | None, task: Task) -> int:
@@ -650,17 +582,3 @@ def _reset_mask(mask: Any, num_envs: int) -> np.ndarray:
     if not mask.any():
         raise ValueError("options['reset_mask'] must be True somewhere")
     return mask.copy()
-
-
-def _begun(now: StepInfo, begun: np.ndarray) -> StepInfo:
-    """What infos say where episodes have begun in place of ended ones, as after `reset`."""
-    cleared = ("cost", "reward_parts", "force", "success", "failure", "clipped", "grip")
-    return now._replace(**{name: _without(getattr(now, name), begun) for name in cleared})
-
-
-def _without(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """A copy of (B,) or (n, B) numbers with 0 in some columns."""
-    copied = rows.copy(order="K")
-    for row in np.atleast_2d(copied):  # one after the other, which NumPy does three times as fast
-        row[indices] = 0
-    return copied

@@ -83,7 +83,7 @@ SECTIONS = (
         "Environments by number",
         "vector_engines",
         ("envs",),
-        dict.fromkeys(("native", "torch", "sync", "loop"), "steps/s"),
+        dict.fromkeys(("native", "torch", "sync"), "steps/s"),
         quick=("--sizes", "1", "64", "1024", "--runs", "1"),
     ),
     Section(

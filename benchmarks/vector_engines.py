@@ -1,8 +1,7 @@
-"""Control steps per second of vector environments by batch size: Gymnasium's sync, machine code, the loop and torch.
+"""Control steps per second of vector environments by batch size: Gymnasium's sync, machine code and torch.
 
-`ballbot_gym.vector.LOOP_BELOW` follows from this table. Sync and loop are left out from 1024 envs on, which take them
-seconds. Every figure is the median of several runs, whose order alternates. Time is that of the processor, so that a busy
-machine does not spoil it; run it with OMP_NUM_THREADS=1.
+Sync is left out from 1024 envs on, which take it seconds. Every figure is the median of several runs, whose order
+alternates. Time is that of the processor, so that a busy machine does not spoil it; run it with OMP_NUM_THREADS=1.
 """
 
 import math
@@ -36,14 +35,14 @@ def main(
         out: folder of the result.
     """
     rows = []
-    print(f"{'envs':>5} {'native':>12} {'torch':>12} {'sync':>12} {'loop':>12}   steps/s, median of {runs} runs")
+    print(f"{'envs':>5} {'native':>12} {'torch':>12} {'sync':>12}   steps/s, median of {runs} runs")
     for size in sizes:
         kinds: dict[str, dict[str, Any]] = {
             "native": {"engine": "native"},
             "torch": {"engine": "torch", "compile": False},
         }
         if size < 1024:
-            kinds |= {"sync": {"vectorization_mode": "sync", "physics": "rk4"}, "loop": {"engine": "loop"}}
+            kinds |= {"sync": {"vectorization_mode": "sync", "physics": "rk4"}}
         envs = {name: gymnasium.make_vec(TASKS[task].id, num_envs=size, **kind) for name, kind in kinds.items()}
         speeds: dict[str, list[float]] = {name: [] for name in envs}
         for _ in range(runs):
@@ -51,9 +50,7 @@ def main(
                 speeds[name].append(speed(env, seconds))
         medians = {name: statistics.median(values) for name, values in speeds.items()}
         print(f"{size:5}", *(f"{value:12,.0f}" for value in medians.values()), flush=True)
-        rows.append(
-            {"envs": size, **{name: medians.get(name, math.nan) for name in ("native", "torch", "sync", "loop")}}
-        )
+        rows.append({"envs": size, **{name: medians.get(name, math.nan) for name in ("native", "torch", "sync")}})
         for env in envs.values():
             env.close()
     files.write_csv(out / "vector_engines.csv", rows)

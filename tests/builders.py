@@ -1,4 +1,8 @@
-"""Results as an evaluation would have made them, for tests of what is done with results."""
+"""Results as an evaluation would have made them, and plain controllers, for tests of what is done with them."""
+
+from dataclasses import dataclass
+
+import numpy as np
 
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.robustness import StressResult
@@ -28,3 +32,31 @@ def result(**changes):
 def stress_result(stress, level, **changes):
     """The same under a disturbance."""
     return StressResult(**(_FIELDS | {"stress": stress, "level": level} | changes))
+
+
+@dataclass(frozen=True)
+class FunctionController:
+    """A plain function u = f(t, x) as a Controller."""
+
+    function: object
+
+    def reset(self, t, x, c):
+        pass
+
+    def act(self, t, x):
+        return np.asarray(self.function(t, x), np.float64)
+
+
+class DelayedController:
+    """Another controller whose forces are applied some control steps late, like those of a slow computer; at first 0."""
+
+    def __init__(self, controller, steps):
+        self._controller, self._steps = controller, steps
+
+    def reset(self, t, x, c):
+        self._pending = [np.zeros(2)] * self._steps
+        self._controller.reset(t, x, c)
+
+    def act(self, t, x):
+        self._pending.append(self._controller.act(t, x))
+        return self._pending.pop(0)

@@ -119,7 +119,7 @@ NO_REAL_NUMBERS = {
 @pytest.mark.parametrize("given", NO_REAL_NUMBERS.values(), ids=NO_REAL_NUMBERS)
 def test_single_and_vector_envs_refuse_the_same_numbers_as_actions_states_and_constants(given):
     single, action = env(task="orbit"), given([0.0, 0.0])
-    for envs in (single, *(BallbotVectorEnv(1, "orbit", engine=engine, compile=False) for engine in ("loop", "torch"))):
+    for envs in (single, BallbotVectorEnv(1, "orbit", engine="torch", compile=False)):
         envs.reset(seed=0)
         with pytest.raises(ValueError, match=r"^actions? must be (real numbers|finite)"):
             envs.step(action if envs is single else action[None] if isinstance(action, np.ndarray) else [action])
@@ -136,7 +136,7 @@ def test_single_and_vector_envs_clip_the_same_actions(huge):
     expected = single.step([huge, -huge])[-1]
     assert expected["clipped"]
     for dtype in (torch.float32, torch.float64):
-        for engine in ("native", "loop", "torch"):
+        for engine in ("native", "torch"):
             envs = BallbotVectorEnv(1, engine=engine, dtype=dtype, compile=False)
             envs.reset(seed=0, options={"state": np.zeros(8)})
             infos = envs.step([[huge, -huge]])[-1]
@@ -481,13 +481,13 @@ BATCHES = [
     (lambda f: BallbotVectorEnv(2, compile="yes"), "compile"),
     (lambda f: BallbotVectorEnv(2, physics="bullet"), 'num_envs=2, vectorization_mode="sync", physics="bullet"'),
     (lambda f: BallbotVectorEnv(2, autoreset_mode="never"), "unknown autoreset_mode 'never'; known: 'NextStep'"),
-    (lambda f: BallbotVectorEnv(2, engine="numpy"), "unknown engine 'numpy'; known: 'auto', 'native', 'torch', 'loop'"),
+    (lambda f: BallbotVectorEnv(2, engine="numpy"), "unknown engine 'numpy'; known: 'auto', 'native', 'torch'"),
     (lambda f: BallbotVectorEnv(2, max_episode_steps=0), "max_episode_steps must be a positive whole number"),
     (vector(num_envs=2, reset_mask=np.ma.masked_array([True, False], [True, False])), "must be a NumPy array of bool"),
     (lambda f: BallbotVectorEnv(2, dtype="float16"), "dtype must be torch.float32 or torch.float64, not float16"),
     *(
         case
-        for envs in (3, 80)  # a loop and a batch
+        for envs in (3, 80)
         for case in (
             (vector(num_envs=envs, state=[1e200] + [0.0] * 7), "state must be numbers within ±1e+06, not [1e+200"),
             (vector(num_envs=envs, state=[math.nan] * 8), "state must be finite numbers that broadcast to"),

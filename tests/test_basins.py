@@ -3,12 +3,13 @@ import math
 
 import numpy as np
 import pytest
+from builders import FunctionController
 
 from ballbot_baselines.optimum import find_optimum
 from ballbot_baselines.recovery import largest_leans
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import ROBOTS, named_robot
-from ballbot_gym.rollout import FunctionController, rollout
+from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_train.evaluation import basins
 from ballbot_train.report import figures

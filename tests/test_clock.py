@@ -14,7 +14,6 @@ from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import BallbotEnv
 from ballbot_gym.batch import BallbotBatch
-from ballbot_gym.loop import BallbotLoop
 from ballbot_gym.native import BallbotNative
 from ballbot_gym.rollout import rollout
 from ballbot_gym.step_code import Judge
@@ -36,7 +35,6 @@ def test_env_and_every_kind_of_batch_agree_on_rewards_and_observations(task, par
     actions = np.random.default_rng(0).uniform(-0.1, 0.1, (STEPS, 2, 2))
     batches = {
         "torch": BallbotBatch(task, 2, dtype="float64", compile=False, params=params),
-        "loop": BallbotLoop(task, 2, np.float64, params),
         "native": BallbotNative(task, 2, np.float64, params),
     }
     found = {}
@@ -52,13 +50,12 @@ def test_env_and_every_kind_of_batch_agree_on_rewards_and_observations(task, par
             paid.append(np.asarray(step.reward))
         found[name] = np.array(seen), np.array(paid)
         state = batch.state
-    for name in ("loop", "native"):
-        for mine, theirs in zip(found[name], found["torch"], strict=True):
-            np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-5)
+    for mine, theirs in zip(found["native"], found["torch"], strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-5)
     assert np.asarray(state.steps).tolist() == [STEPS // 2, STEPS]
 
     env = BallbotEnv(task, physics="rk4", params=params)
-    first = BallbotLoop(task, 2, np.float64, params)
+    first = BallbotNative(task, 2, np.float64, params)
     start = first.initial_state(seed=3)
     observation, _ = env.reset(options={"state": start.x[:, 1], "constants": start.c[:, 1]})
     np.testing.assert_allclose(observation, found["torch"][0][0][1], atol=1e-5)

@@ -110,7 +110,7 @@ def test_bad_states_are_refused():
         env.set_state(np.zeros(8))
 
 
-@pytest.mark.parametrize("engine", ["native", "loop", "torch"])
+@pytest.mark.parametrize("engine", ["native", "torch"])
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
 def test_vector_envs_copy_pickle_and_go_back(engine, mode):
     pytest.importorskip("torch")

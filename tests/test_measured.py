@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from builders import FunctionController
 
 from ballbot_baselines import find_optimum, regret
 from ballbot_gym import BallbotEnv, certified, dynamics, named_robot
-from ballbot_gym.rollout import FunctionController, rollout
+from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.controllers import make_controller

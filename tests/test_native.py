@@ -17,11 +17,10 @@ import casadi  # noqa: E402
 from ballbot_gym import Randomization, codegen, machine_code, native  # noqa: E402
 from ballbot_gym.batch import BallbotBatch  # noqa: E402
 from ballbot_gym.env import make_task  # noqa: E402
-from ballbot_gym.loop import BallbotLoop  # noqa: E402
 from ballbot_gym.robots import named_robot  # noqa: E402
 from ballbot_gym.tasks import TASKS  # noqa: E402
 from ballbot_gym.tasks.stabilize import Stabilize  # noqa: E402
-from ballbot_gym.vector import LOOP_BELOW, BallbotVectorEnv  # noqa: E402
+from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
 
 needs_compiler = pytest.mark.skipif(machine_code._compiler() is None, reason="no C compiler")
 
@@ -214,10 +213,9 @@ def test_a_state_of_another_shape_is_refused_before_machine_code_reads_it():
 def test_auto_takes_machine_code_unless_something_speaks_against_it():
     assert isinstance(BallbotVectorEnv(1).batch, native.BallbotNative)
     assert isinstance(BallbotVectorEnv(2000).batch, native.BallbotNative)
-    assert isinstance(BallbotVectorEnv(LOOP_BELOW, compile=False).batch, BallbotBatch)
-    assert isinstance(BallbotVectorEnv(LOOP_BELOW - 1, compile=False).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(2, compile=False).batch, BallbotBatch)
     assert isinstance(BallbotVectorEnv(2, compile=True).batch, BallbotBatch)
-    assert isinstance(BallbotVectorEnv(2, randomization=Randomization(body_mass=(0.9, 1.1))).batch, BallbotLoop)
+    assert isinstance(BallbotVectorEnv(2, randomization=Randomization(body_mass=(0.9, 1.1))).batch, BallbotBatch)
     with pytest.raises(ValueError, match='"native" knows no Randomization and no history; take'):
         BallbotVectorEnv(2, engine="native", randomization=Randomization(body_mass=(0.9, 1.1)))
     with pytest.raises(ValueError, match="engine='native' runs on the CPU, not on cuda"):
@@ -244,14 +242,14 @@ def test_a_task_that_cannot_be_traced_runs_in_torch_with_a_word_in_the_log(caplo
         BallbotVectorEnv(100, Branching(), engine="native")
 
 
-def test_without_a_compiler_envs_run_in_python_or_torch(monkeypatch, caplog):
+def test_without_a_compiler_envs_run_in_torch(monkeypatch, caplog):
     def refuse(*args):
         raise machine_code.NoMachineCodeError("cc failed: no such instruction")
 
     monkeypatch.setattr(machine_code, "library", refuse)
     native._code.cache_clear(), native._checked_code.cache_clear()
     with caplog.at_level(logging.WARNING):
-        assert isinstance(BallbotVectorEnv(2).batch, BallbotLoop)
+        assert isinstance(BallbotVectorEnv(2).batch, BallbotBatch)
     assert "no such instruction" in caplog.text
     with pytest.raises(native.NativeUnavailableError, match="no such instruction"):
         BallbotVectorEnv(2, engine="native")

@@ -3,12 +3,14 @@ import pytest
 
 pytest.importorskip("casadi")
 
+from builders import DelayedController
+
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
 from ballbot_baselines.disturbance import DisturbanceEstimator
 from ballbot_baselines.horizon import HorizonQp
 from ballbot_gym import certified, dynamics
 from ballbot_gym.randomization import Randomization
-from ballbot_gym.rollout import DelayedController, rollout, simulate
+from ballbot_gym.rollout import rollout, simulate
 from ballbot_gym.tasks.stabilize import Stabilize
 from ballbot_gym.tasks.turn import Turn
 from ballbot_gym.tasks.weave import Weave

@@ -210,11 +210,9 @@ def test_track_is_the_same_for_all_kinds_of_envs(track, make_env):
     """The same name, what it draws in info under one key, and the same motion for the same draw."""
     env = make_env(physics="rk4", randomization=track)
     many = BallbotVectorEnv(3, engine="torch", compile=False, dtype="float64", randomization=track)
-    one_by_one = BallbotVectorEnv(3, engine="loop", randomization=track)
-    assert env.randomization == many.randomization == one_by_one.randomization == TRACKS[track]
-    (_, infos), (_, looped) = many.reset(seed=5), one_by_one.reset(seed=5)
+    assert env.randomization == many.randomization == TRACKS[track]
+    _, infos = many.reset(seed=5)
     assert len(infos["drawn"][0]) == TRACKS[track].episode_draws
-    np.testing.assert_allclose(looped["drawn"], infos["drawn"], rtol=1e-6)
     assert len(np.unique(infos["drawn"], axis=0)) == (3 if track != "late" else len(np.unique(infos["drawn"][:, 5])))
     options = {"state": infos["state"][1], "drawn": infos["drawn"][1]}
     np.testing.assert_array_equal(env.reset(options=options)[1]["drawn"], infos["drawn"][1])
@@ -262,8 +260,7 @@ def test_history_shows_the_last_observations_with_their_actions_in_every_kind_of
     own = plain.observation_space.shape[0]
     assert env.observation_space.shape == (own + 2 * (own + 2),)
     many = BallbotVectorEnv(2, task, engine="torch", compile=False, dtype="float64", history=2)
-    looped = BallbotVectorEnv(2, task, engine="loop", history=2)
-    (_, infos), _ = many.reset(seed=0), looped.reset(seed=0)
+    _, infos = many.reset(seed=0)
     options = {"state": infos["state"][0], "constants": infos["constants"][0]}
     observed, actions = [plain.reset(options=options)[0]], []
     first = np.append(observed[0], np.zeros(2, np.float32))
@@ -278,8 +275,7 @@ def test_history_shows_the_last_observations_with_their_actions_in_every_kind_of
         np.testing.assert_array_equal(env.step(action)[0], wanted)
         env.set_state(kept)
         np.testing.assert_array_equal(env.step(action)[0], wanted)
-        for vector in (many, looped):
-            np.testing.assert_allclose(vector.step(np.tile(action, (2, 1)))[0][0], wanted, atol=1e-5)
+        np.testing.assert_allclose(many.step(np.tile(action, (2, 1)))[0][0], wanted, atol=1e-5)
 
 
 def test_history_of_an_ended_episode_is_forgotten(make_env):

@@ -148,11 +148,9 @@ def test_standing_scores_far_better_than_falling(task):
     assert played["upright"].returns.mean() > played["random"].returns.mean() + 200
 
 
-def test_policies_that_play_anything_stay_in_the_spaces_and_the_bounds_of_reward(task, params):
-    low, high = task.reward_bounds(params)
+def test_policies_that_play_anything_stay_in_the_spaces(task):
     for name, played in play(task).items():
         assert played.observed.max() <= 1, name
-        assert low <= played.rewards.min() <= played.rewards.max() <= high, name
 
 
 def test_driving_away_ends_at_the_arena(task):

@@ -239,7 +239,7 @@ def test_slipping_is_no_failure_in_bullet():
     env.close()
 
 
-@pytest.mark.parametrize("engine", ["torch", "loop"])
+@pytest.mark.parametrize("engine", ["torch", "native"])
 def test_batches_lose_grip_as_single_envs_do(engine):
     torch = pytest.importorskip("torch")
     from ballbot_gym.vector import BallbotVectorEnv

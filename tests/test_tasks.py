@@ -84,8 +84,8 @@ def test_every_margin_has_the_tilt_limit_first(task, params):
 
 def test_state_that_is_not_finite_is_unsafe(task, params):
     x, c = draw(task, params, 1)
-    assert task.is_safe(tuple(x[0]), tuple(c[0]))
-    assert not task.is_safe((math.nan,) * 8, tuple(c[0]))
+    assert not task.violated(tuple(x[0]), tuple(c[0]))
+    assert task.violated((math.nan,) * 8, tuple(c[0]))
 
 
 def test_stabilize_costs_what_its_docstring_says():
@@ -154,7 +154,7 @@ def test_steady_orbit_is_orbits_goal_and_nearly_free(params):
 
 def test_sampled_starts_are_safe(task, params):
     x, c = draw(task, params, 500)
-    unsafe = [i for i in range(500) if not task.is_safe(tuple(x[i]), tuple(c[i]))]
+    unsafe = [i for i in range(500) if task.violated(tuple(x[i]), tuple(c[i]))]
     assert unsafe == []
 
 

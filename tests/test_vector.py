@@ -25,7 +25,7 @@ INFO = (
 )
 
 
-@pytest.fixture(params=["native", "torch", "loop"])
+@pytest.fixture(params=["native", "torch"])
 def make_vec(request):
     """Makes vector envs that are closed after the test; float64 and eager unless said otherwise."""
     envs = []

@@ -61,9 +61,6 @@ class MujocoSimulator(Simulator):
         self._mj_step(self._model, self._data, self._substeps)
         return (*self._positions.tolist(), *self._velocities.tolist())
 
-    def close(self) -> None:
-        pass
-
     def _make(self, params: BallbotParams) -> None:
         self._params = params
         mujoco, spec = self._mujoco, self._mujoco.MjSpec()

@@ -89,7 +89,7 @@ class Task(ABC):
     """Whether cost, goal, margins, arena and observation depend on the episode's time."""
 
     LARGEST_CONSTANT: ClassVar[float] = 100.0
-    """Bounds of observations and rewards hold while no constant of the episode exceeds this, m or m/s."""
+    """Bounds of observations hold while no constant of the episode exceeds this, m or m/s."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -277,18 +277,6 @@ class Task(ABC):
         """
         return (1e6,) * len(self.observation_scale)
 
-    def reward_bounds(self, params: BallbotParams) -> tuple[float, float]:
-        """Least and greatest reward of a step; they hold as `state_bounds` do."""
-        most = self.survival_pay if self.first_exit else self.survival_reward * self.control_dt
-        return (self.survival_reward - self.greatest_cost(params)) * self.control_dt, most
-
-    def greatest_cost(self, params: BallbotParams) -> float:
-        """Bound of the cost rate, 1/s; it holds as `state_bounds` do."""
-        distance, lean, speed, rate = self.state_bounds(params)
-        x = (distance, distance, lean, lean, speed, speed, rate, rate)
-        force = (2 * params.force_limit,) * 2  # twice, for randomized actuators
-        return float(np.max(self.cost(x, force, self._always((0.0,) * len(self.constant_names)))))
-
     def _always(self, c: tuple[float, ...]) -> tuple[Any, ...]:
         """Constants at all times of an episode."""
         return self.at(c, self.control_dt * np.arange(self.steps + 1))
@@ -304,10 +292,6 @@ class Task(ABC):
     def markers(self, c: np.ndarray) -> list[Marker]:
         """What to draw besides the robot."""
         return []
-
-    def is_safe(self, x: Vector, c: Vector) -> bool:
-        """Whether one state violates no limit; a state that is not finite does."""
-        return not self.violated(x, c)
 
     def is_goal(self, x: Vector, c: Vector) -> bool:
         """Whether one state is in the goal."""

@@ -173,16 +173,6 @@ class Orbit(Task):
         )
         return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
 
-    def greatest_cost(self, params: BallbotParams) -> float:
-        *_, rate = self.state_bounds(params)
-        radius_error, *velocity_error = self._error_bounds(params)
-        return (
-            self.radius_weight * squared(radius_error)
-            + self.velocity_weight * squared(*velocity_error)
-            + self.lean_rate_weight * squared(rate, rate)
-            + self.effort_weight * 2 * squared(2 * params.force_limit)
-        )
-
     def _error_bounds(self, params: BallbotParams) -> tuple[float, float, float]:
         """Of the radius error, m, and of both velocity errors, m/s, for every radius that `check_constants` allows."""
         _, _, speed, _ = self.state_bounds(params)

@@ -68,7 +68,6 @@ class BatchOptima:
     | forces | (B, n, 2) | N |
     | gains | (B, n, 2, 8) | K of the feedback u − K (x' − x) about the optimum, N per unit of the state |
     | slopes | (B, n, 8) | of the remaining cost with respect to each state but the last |
-    | iterations | (B,) | of the last search |
     """
 
     costs: np.ndarray
@@ -78,7 +77,6 @@ class BatchOptima:
     forces: np.ndarray
     gains: np.ndarray
     slopes: np.ndarray
-    iterations: np.ndarray
 
 
 def solves(task: Task, params: BallbotParams) -> bool:
@@ -131,7 +129,6 @@ def find_optima(
         forces=np.zeros((count, n, 2)),
         gains=np.zeros((count, n, 2, 8)),
         slopes=np.zeros((count, n, 8)),
-        iterations=np.zeros(count, int),
     )
     for first in range(0, count, _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
@@ -263,7 +260,7 @@ class _Batch:
             row, steps = guesses.of[i], guesses.steps[i]
             if not found.solved[i] or found.costs[i] >= optima.costs[row]:
                 continue
-            optima.costs[row], optima.steps[row], optima.iterations[row] = found.costs[i], steps, found.iterations[i]
+            optima.costs[row], optima.steps[row] = found.costs[i], steps
             optima.states[row, : steps + 1], optima.states[row, steps + 1 :] = (
                 found.x[i, : steps + 1],
                 found.x[i, steps],
@@ -298,7 +295,6 @@ class _Batch:
             np.concatenate([found.slopes, rest.slopes(x[:, :-1])], axis=1),
             found.costs - expected + costs,
             found.solved,
-            found.iterations,
         )
         exact = np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
         again = _Guesses(guesses.of, whole.x, whole.a, guesses.steps + left)

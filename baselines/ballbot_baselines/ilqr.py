@@ -77,7 +77,6 @@ class Solutions:
     | slopes | (J, n, ns) | of the remaining cost with respect to each state but the last |
     | costs | (J,) | |
     | solved | (J,) bool | |
-    | iterations | (J,) | |
     """
 
     x: np.ndarray
@@ -86,7 +85,6 @@ class Solutions:
     slopes: np.ndarray
     costs: np.ndarray
     solved: np.ndarray
-    iterations: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,7 @@ class Ilqr:
         # named, because all have to live as long as the call
         arrays = (np.array(astuple(options)), *each, x, a, gains, slopes, costs, missed, status, iterations)
         self._solve(jobs, n, *(array.ctypes.data for array in arrays))
-        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, iterations)
+        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL)
 
     def follow(
         self, x0: np.ndarray, length: float, given: np.ndarray, paths: np.ndarray, settings: tuple[float, float]

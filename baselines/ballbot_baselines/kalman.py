@@ -22,7 +22,7 @@ from ballbot_gym.tasks import Task
 FACTORS = ("body_mass", "com_height", "force")
 """What is estimated of the robot: factors on the nominal values."""
 
-_X, _FACTORS, _ERRORS = slice(0, 8), slice(8, 11), slice(11, 17)
+_X, _FACTORS = slice(0, 8), slice(8, 11)
 _SIZE = 17
 _WIDE = 10.0  # standard deviation of the state before it is first observed, SI units
 _LEAST_NOISE = 1e-4  # of sensors, SI units: no filter converges on exact ones
@@ -40,7 +40,6 @@ class TrackFilter:
     | `factors` | (3,) | on the nominal values of what `FACTORS` names |
     | `covariance` | (17, 17) | of all that is estimated |
     | `deviations` | (3,) | standard deviations of `factors` |
-    | `errors` | (6,) | drift of odometry, m/s, biases of leans, rad, and of lean rates, rad/s |
     | `delay` | | control steps from a command to its force |
     """
 
@@ -114,10 +113,6 @@ class TrackFilter:
     @property
     def deviations(self) -> np.ndarray:
         return np.sqrt(np.diagonal(self.covariance)[_FACTORS])
-
-    @property
-    def errors(self) -> np.ndarray:
-        return self._z[self._best, _ERRORS].copy()
 
     @property
     def delay(self) -> int:

@@ -52,7 +52,7 @@ def quadratic_cost(
         Q: (n, 8, 8) and R: (n, 2, 2). Mixed terms of x and u are left out; no task has any.
     """
     n = len(x)
-    q, r = _cost_hessians(task)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, n))
+    q, r = _cost_derivatives(task, 2)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, n))
     return _semidefinite(0.5 * _blocks(q, n)), 0.5 * _blocks(r, n)
 
 
@@ -60,7 +60,7 @@ def cost_slopes(
     task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The gradient of the task's cost rate with respect to x (n, 8) and to u (n, 2); arguments as of `quadratic_cost`."""
-    along_x, along_u = _cost_gradient(task)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, len(x)))
+    along_x, along_u = _cost_derivatives(task, 1)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, len(x)))
     return np.array(along_x).T, np.array(along_u).T
 
 
@@ -85,21 +85,13 @@ def _jacobians(params: BallbotParams, dt: float | None) -> casadi.Function:
 
 
 @cache
-def _cost_hessians(task: Task) -> casadi.Function:
+def _cost_derivatives(task: Task, order: int) -> casadi.Function:
+    """Gradients (order 1) or Hessians (order 2) of the cost rate with respect to x and to u."""
     x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
     cost = task.cost(x, u, c)
-    outputs = [casadi.densify(casadi.hessian(cost, x)[0]), casadi.densify(casadi.hessian(cost, u)[0])]
-    return casadi.Function("hessians", [x, u, c], outputs)
-
-
-@cache
-def _cost_gradient(task: Task) -> casadi.Function:
-    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
-    c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
-    cost = task.cost(x, u, c)
-    outputs = [casadi.densify(casadi.gradient(cost, x)), casadi.densify(casadi.gradient(cost, u))]
-    return casadi.Function("gradient", [x, u, c], outputs)
+    parts = [casadi.gradient(cost, z) if order == 1 else casadi.hessian(cost, z)[0] for z in (x, u)]
+    return casadi.Function("derivatives", [x, u, c], [casadi.densify(part) for part in parts])
 
 
 @cache

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
-from ballbot_gym.env import check_history
+from ballbot_gym.checks import check_history
 from ballbot_gym.randomization import TRACKS
 from ballbot_gym.robots import PAPER, ROBOTS, file_name
 from ballbot_gym.tasks import TASKS, Task
