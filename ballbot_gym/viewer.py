@@ -1,7 +1,7 @@
 """A page in the browser that shows drawings live, by viser. It needs no display, because the browser draws.
 
 This is the one place that knows viser's scene. `ballbot play` adds its controls beside the scene. An environment with
-render_mode="human" shows itself here.
+render_mode="human" shows itself here where no window can open.
 """
 
 import contextlib
@@ -318,14 +318,15 @@ class Viewer:
 
 
 class PageScene:
-    """Shows an environment in a page, in real time. It has the methods of `PictureScene`."""
+    """Shows an environment in a page instead of a window, in real time. It has the methods of `PictureScene`."""
 
-    def __init__(self, params: BallbotParams, frame_seconds: float):
+    def __init__(self, params: BallbotParams, frame_seconds: float, reason: str):
         """Starts the page and says its address on stderr.
 
         Args:
             params: the robot.
             frame_seconds: s, between two drawings.
+            reason: why there is no window.
 
         Raises:
             ImportError: viser is missing.
@@ -335,7 +336,7 @@ class PageScene:
         self._markers: tuple[Marker, ...] = ()
         self._trace: list[np.ndarray] = []
         self._next = 0.0
-        sys.stderr.write(f"the robot is shown at {self._viewer.address}\n")
+        sys.stderr.write(f"no window, because {reason}: the robot is shown at {self._viewer.address}\n")
 
     @property
     def address(self) -> str:

@@ -3,6 +3,7 @@ import hashlib
 import itertools
 import json
 import math
+import os
 import pickle
 import subprocess
 import sys
@@ -135,7 +136,7 @@ def test_gymnasium_checker_has_no_complaint(task, physics):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make(task.id, physics=physics)
-        check_env(env.unwrapped, skip_render_check=True)  # its render check opens a page
+        check_env(env.unwrapped, skip_render_check=True)  # its render check opens a window
         env.close()
 
 
@@ -362,10 +363,26 @@ def test_rendering_does_not_change_the_trajectory(task, physics, make_env, rng):
     np.testing.assert_array_equal(states[0], states[1])
 
 
-def test_without_viser_the_page_is_refused(monkeypatch, make_env):
+def test_without_a_display_and_without_viser_the_window_is_refused(monkeypatch, make_env):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(RuntimeError, match=r'viser.*ballbot-gym\[play\].*take render_mode="rgb_array"'):
+    with pytest.raises(RuntimeError, match=r'DISPLAY is not set.*ballbot-gym\[play\].*take render_mode="rgb_array"'):
         make_env(render_mode="human")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X needs a DISPLAY")
+def test_a_display_that_does_not_answer_does_not_end_the_process():
+    code = (
+        "import sys\nsys.modules['viser'] = None\nfrom ballbot_gym import BallbotEnv\n"
+        "try:\n    BallbotEnv(render_mode='human').reset()\n"
+        "except RuntimeError as error:\n    print('refused', error)\n"
+    )
+    environment = {**os.environ, "DISPLAY": ":9876"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "refused" in done.stdout
+    assert "PyBullet can open none on DISPLAY=:9876" in done.stdout
 
 
 @pytest.mark.parametrize(

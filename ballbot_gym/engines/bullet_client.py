@@ -1,4 +1,4 @@
-"""PyBullet's clients, and how the robot is loaded into one. Simulators use it."""
+"""PyBullet's clients, and how the robot is loaded into one. Simulators and the window use it."""
 
 import ctypes
 import importlib.util
@@ -62,9 +62,14 @@ def _silenced() -> Iterator[None]:
             os.close(original)
 
 
-def connect(bullet: ModuleType) -> int:
+def connect(bullet: ModuleType, mode: int) -> int:
     """A new physics client."""
-    client = bullet.connect(bullet.DIRECT)
+    try:
+        client = bullet.connect(mode)
+    except bullet.error as error:
+        raise RuntimeError(
+            'PyBullet opens one window per process; close() the environment that has it, or take render_mode="rgb_array"'
+        ) from error
     if client < 0:
         raise RuntimeError("PyBullet has no free physics client; close() environments that are no longer used")
     return client
@@ -79,7 +84,8 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "ballbot.urdf"
         path.write_text(params.to_urdf(), encoding="utf-8")
-        robot = _load_urdf(bullet, client, path)
+        # Without this flag Bullet recomputes inertias from collision shapes.
+        robot = load_urdf(bullet, client, path, bullet.URDF_USE_INERTIA_FROM_FILE)
     bullet.setGravity(0, 0, -params.gravity, physicsClientId=client)
     index = joint_indices(bullet, client, robot)
     _check_loaded(bullet, client, robot, index, params)
@@ -101,17 +107,16 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
     return robot, joints
 
 
-def _load_urdf(bullet: ModuleType, client: int, path: Path) -> int:
+def load_urdf(bullet: ModuleType, client: int, path: Path, flags: int = 0) -> int:
     """Loads a URDF whose base is fixed; returns its body.
 
-    Bullet reads numbers by C's locale: with decimal commas it would take "0.5" for 0 without a word.
+    Bullet reads numbers by C's locale: with decimal commas it would take "0.5" for 0 without a word. The locale is that of
+    the whole process, because the thread of a window may be the one that reads.
     """
     with _loading:
         found = locale.setlocale(locale.LC_NUMERIC)
         locale.setlocale(locale.LC_NUMERIC, "C")
         try:
-            # Without this flag Bullet recomputes inertias from collision shapes.
-            flags = bullet.URDF_USE_INERTIA_FROM_FILE
             return bullet.loadURDF(str(path), useFixedBase=True, flags=flags, physicsClientId=client)
         finally:
             locale.setlocale(locale.LC_NUMERIC, found)
