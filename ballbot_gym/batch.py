@@ -513,6 +513,10 @@ def run_episodes(
     if drawn is not None and batch.state is not None:
         rows = torch.as_tensor(drawn.T, dtype=batch.dtype, device=batch.device).contiguous()
         batch.state = batch.state._replace(drawn=rows)
+        if batch.history:  # the past before the episode has the drawn errors of sensors too
+            seen = batch.observe(batch.state).T[: len(batch.task.observation_scale)]
+            begun = torch.cat([seen, torch.zeros_like(seen[:2])])
+            batch.state = batch.state._replace(past=begun.repeat(batch.history, 1))
         observation = batch.observe(batch.state)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
     success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)

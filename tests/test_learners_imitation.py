@@ -9,7 +9,7 @@ from resuming import goes_on_as_if_never_stopped
 
 from ballbot_baselines import batched
 from ballbot_baselines.optimum import Backoff, find_optimum
-from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_baselines.tvlqr import TvlqrController, tube_gains
 from ballbot_gym import dynamics
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
@@ -127,7 +127,7 @@ def test_the_tube_gives_the_forces_that_the_optimum_from_there_would():
     task, c = make_task("stabilize"), np.zeros(0)
     plan = find_optimum(task, default_params(), np.array([1.0, 0, 0, 0, 0, 3, 0, 0]), c)
     change, (error,) = feedback_errors(
-        task, plan, c, Backoff(), [dagger.tube_gains(task, default_params(), plan, c)], 0.5
+        task, plan, c, Backoff(), [tube_gains(task, default_params(), plan.trajectory, c)], 0.5
     )
     assert error < 0.15 * change
 
@@ -137,7 +137,7 @@ def test_where_the_goal_ends_the_episode_the_tube_leaves_the_freedom_that_the_op
     task, params, c, backoff = make_task("turn"), default_params(), np.array([2.3]), Backoff(goal=0.3, force=0.02)
     plan = find_optimum(task, params, np.array([0, -1, 0, 0, 0, 2.3, 0, 0]), c, backoff)
     tracking = TvlqrController.for_task(task, params, plan.trajectory, c).gains.k
-    _, errors = feedback_errors(task, plan, c, backoff, [dagger.tube_gains(task, params, plan, c), tracking], 0.3)
+    _, errors = feedback_errors(task, plan, c, backoff, [tube_gains(task, params, plan.trajectory, c), tracking], 0.3)
     assert errors[0] < 0.5 * errors[1]
 
 

@@ -13,6 +13,7 @@ from ballbot_baselines.adaptive import adaptive_nmpc
 from ballbot_baselines.cautious import cautious_trajopt
 from ballbot_baselines.kalman import TrackFilter
 from ballbot_gym import certified
+from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import TRACKS, Randomization
@@ -164,3 +165,27 @@ def test_cautious_plan_leaves_the_force_that_the_weakest_robot_lacks():
     cautious.reset(0.0, np.array([0, 0, 0.6, 0, 5.0, 0, 1.0, 0]), np.zeros(0))
     asked = np.abs(cautious.plan.trajectory.u).max() / env.params.force_limit
     assert asked == pytest.approx(TRACKS["unknown"].force[0], rel=1e-3)
+
+
+def test_the_past_of_an_episode_with_given_draws_begins_with_their_sensors(rng):
+    import torch
+
+    batch = BallbotBatch("stabilize", 3, randomization="noisy", history=2, compile=False)
+    batch.reset(seed=5)
+    drawn = batch.state.drawn.T.numpy()[::-1].copy()
+    seen = []
+
+    def policy(observation):
+        seen.append(observation)
+        return torch.zeros(len(observation), 2)
+
+    run_episodes(
+        batch,
+        policy,
+        *(np.array(part) for part in zip(*(batch.task.sample(rng, batch.params) for _ in range(3)), strict=True)),
+        drawn=drawn,
+    )
+    first = seen[0]
+    assert torch.equal(first[:, :8], first[:, 8:16])
+    assert torch.equal(first[:, :8], first[:, 18:26])
+    assert torch.equal(first[:, 16:18], torch.zeros(3, 2))

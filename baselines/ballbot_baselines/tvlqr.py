@@ -9,6 +9,8 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
+_ACTIVE = 0.05  # a goal function this close to the greatest one still limits the optimum
+
 
 class TvlqrController:
     """Tracks a trajectory sampled at control steps: u = u_k − K_k (x − x_k).
@@ -80,6 +82,23 @@ class TvlqrController:
         if i < len(self.x):
             return self.u[i] - self.gains.k[i] @ (x - self.x[i])
         return -self._end_gain @ (x - self._end)
+
+
+def tube_gains(task: Task, params: BallbotParams, trajectory: Trajectory, c: np.ndarray) -> np.ndarray:
+    """Feedback about an optimum of n steps, (n, 2, 8), N per unit of the state.
+
+    The gains are TVLQR's. If the task ends in its goal, only those goal functions that limit the optimum are weighted at its
+    end. Weighting the whole goal would ask for forces that the optimum from a neighbouring state does not need.
+    """
+    if not task.first_exit:
+        return TvlqrController.for_task(task, params, trajectory, c).gains.k
+    q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
+    end, h = trajectory.x[-1], 1e-5
+    goal = np.array(task.goal(end, c), np.float64)
+    slopes = np.array([np.subtract(task.goal(end + d, c), task.goal(end - d, c)) / (2 * h) for d in h * np.eye(8)])
+    active = slopes[:, goal > goal.max() - _ACTIVE]
+    dt = task.control_dt
+    return TvlqrController(params, trajectory, dt, q * dt, r * dt, active @ active.T + 1e-3 * np.eye(8)).gains.k
 
 
 def _sampled(trajectory: Trajectory, dt: float) -> tuple[np.ndarray, np.ndarray]:

@@ -52,6 +52,11 @@ class Demos:
     def __len__(self) -> int:
         return len(self.actions)
 
+    def median_cost(self, task: Task) -> float:
+        """Median cost of the episodes."""
+        starts = np.flatnonzero(np.roll(self.terminations | self.truncations, 1))
+        return float(task.survival_pay - np.median(np.add.reduceat(self.rewards, starts, dtype=np.float64)))
+
     def without_pay(self, task: Task, failure_price: float) -> "Demos":
         """The same steps where living does not pay: rewards are minus the running cost, and a failure costs its price.
 

@@ -28,10 +28,9 @@ import torch
 from scipy.spatial import KDTree
 
 from ballbot_baselines import batched
-from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
-from ballbot_baselines.tvlqr import TvlqrController
+from ballbot_baselines.tvlqr import tube_gains
 from ballbot_gym import dynamics
 from ballbot_gym.batch import BallbotBatch, BatchEpisodes, BatchState, run_episodes
 from ballbot_gym.params import BallbotParams, ModelNumbers
@@ -41,14 +40,13 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import RoutedSymmetry, check_start, started
-from ballbot_train.learning.datasets import Demos, StreamedDemos, load_demos
+from ballbot_train.learning.datasets import StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.shards import is_set
 
 _SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3])  # standard deviations of a tube, in a state's SI units
-_ACTIVE = 0.05  # a goal function this close to the greatest one still limits the optimum
 _SMALL = 0.3  # of the force limit
 _HARD_AMONG = 16  # episodes that are drawn for each of the hard ones
 _MIN_STEPS = 2  # plans with fewer remaining control steps are not used as a guess
@@ -253,7 +251,7 @@ class Dagger:
         if self.config.batch_episodes:
             return self._gather_batch(rng)
         plans = self._planned(rng)
-        gains = [tube_gains(self._task, self._params, plan, c) for plan, c in plans]
+        gains = [tube_gains(self._task, self._params, plan.trajectory, c) for plan, c in plans]
         for (plan, c), k in zip(plans, gains, strict=True):
             self._samples.add(self._labelled(plan, k, c, plan.cost, rng))
         if self.config.tracked_rollouts_per_plan and plans:
@@ -265,7 +263,7 @@ class Dagger:
             found = self._optimum(x, c, plan.trajectory.x[elapsed:, :2])
             if found is not None:
                 labelled += 1
-                k = tube_gains(self._task, self._params, found, c)
+                k = tube_gains(self._task, self._params, found.trajectory, c)
                 self._samples.add(self._labelled(found, k, c, plan.cost, rng))
         return {"train/labelled": labelled / max(1, len(starts))}
 
@@ -570,24 +568,6 @@ class Dagger:
         return Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights)
 
 
-def tube_gains(task: Task, params: BallbotParams, plan: Optimum, c: np.ndarray) -> np.ndarray:
-    """Feedback about an optimum of n steps, (n, 2, 8), N per unit of the state.
-
-    The gains are TVLQR's. If the task ends in its goal, only those goal functions that limit the optimum are weighted at its
-    end. Weighting the whole goal would ask for forces that the optimum from a neighbouring state does not need.
-    """
-    trajectory = plan.trajectory
-    if not task.first_exit:
-        return TvlqrController.for_task(task, params, trajectory, c).gains.k
-    q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
-    end, h = trajectory.x[-1], 1e-5
-    goal = np.array(task.goal(end, c), np.float64)
-    slopes = np.array([np.subtract(task.goal(end + d, c), task.goal(end - d, c)) / (2 * h) for d in h * np.eye(8)])
-    active = slopes[:, goal > goal.max() - _ACTIVE]
-    dt = task.control_dt
-    return TvlqrController(params, trajectory, dt, q * dt, r * dt, active @ active.T + 1e-3 * np.eye(8)).gains.k
-
-
 def make(
     task: Task,
     params: BallbotParams,
@@ -610,7 +590,7 @@ def make(
         samples = StreamedDemos(demos, task, seed)
     elif demos is not None:
         loaded = load_demos(demos, task)
-        weights = np.full(len(loaded), 1 / max(_median_cost(loaded, task), _MIN_COST))
+        weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))
         samples = Samples.of(loaded.observations, loaded.actions, weights)
     elif not config.gathering_iterations:
         raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
@@ -618,9 +598,3 @@ def make(
     if start is not None:
         learner.start_from(start)
     return learner
-
-
-def _median_cost(demos: Demos, task: Task) -> float:
-    """Median cost of the episodes."""
-    starts = np.flatnonzero(np.roll(demos.terminations | demos.truncations, 1))
-    return float(task.survival_pay - np.median(np.add.reduceat(demos.rewards, starts, dtype=np.float64)))
