@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import gymnasium
 import numpy as np
-import torch
 
 from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, tilt_of
+
+# isort: split
+import torch  # after our modules, whose errors name the extra that brings it
 
 
 class StepInfo(NamedTuple):

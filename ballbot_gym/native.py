@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import torch
 
 from ballbot_gym import codegen, machine_code
 from ballbot_gym.autoreset import StepInfo
@@ -26,6 +25,9 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.spares import Spares
 from ballbot_gym.tasks import Task
+
+# isort: split
+import torch  # after our modules, whose errors name the extra that brings it
 
 _COMPILER_FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fopenmp-simd")
 _PARALLEL_FROM = 4096
