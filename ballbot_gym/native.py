@@ -328,19 +328,19 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
     """
     code, dtype = _code(task, params, double), np.float64 if double else np.float32
     actions = np.asfortranarray([[0.1, -0.2], [-0.3, 0.4], [1.2, 0.5], [-0.6, -1.2]], dtype)
-    found = []
+    own = BallbotNative(task, len(actions), dtype, params, code=code)
     kind = torch.float64 if double else torch.float32
-    for envs, given in (
-        (BallbotNative(task, len(actions), dtype, params, code=code), (actions, None, True)),
-        (BallbotBatch(task, len(actions), dtype=kind, compile=False, params=params), (torch.from_numpy(actions),)),
-    ):
-        envs.state = envs.initial_state(seed=0)
-        start = {"first observation": envs.observe(envs.state), "start": envs.state.x, "constants": envs.state.c}
-        with torch.no_grad():
-            found.append(start | envs.step(*given)._asdict())
-    found[1]["final_observation"] = found[1]["final_observation"][found[1]["terminated"] | found[1]["truncated"]]
-    for name, expected in found[1].items():
-        if not np.allclose(found[0][name], expected, rtol=1e-3, atol=1e-3, equal_nan=True):
+    batch = BallbotBatch(task, len(actions), dtype=kind, compile=False, params=params)
+    own.state = first = own.initial_state(seed=0)
+    batch.state = start = batch.initial_state(seed=0)
+    found = {"first observation": own.observe(first), "start": first.x, "constants": first.c}
+    expected = {"first observation": batch.observe(start), "start": start.x, "constants": start.c}
+    with torch.no_grad():
+        step = batch.step(torch.from_numpy(actions))
+    step = step._replace(final_observation=step.final_observation[step.terminated | step.truncated])
+    found |= own.step(actions, None, True)._asdict()
+    for name, value in (expected | step._asdict()).items():
+        if not np.allclose(found[name], value, rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NativeUnavailableError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
     return code
 
