@@ -25,7 +25,7 @@ import numpy as np
 from ballbot_baselines import righting
 from ballbot_baselines.compiled import LANES, SIMD
 from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
-from ballbot_baselines.shooting import shooting_ocp, symbolic_robot
+from ballbot_baselines.shooting import kind_of, shooting_ocp, symbolic_robot
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -129,9 +129,10 @@ class Ilqr:
     """
 
     def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
+        kind: tuple[Any, ...] = (free_time, *kind_of(task, params))  # which refuses formulas that cannot be optimized
         self._limit, self.rest = params.force_limit, None if free_time else rest(task, params)
-        # where LQR's cost-to-go is no part of it, the code serves all robots of a kind
-        kind = task, free_time, *((params.rolls, params.grips) if self.rest is None else (params,))
+        if self.rest is not None:  # LQR's cost-to-go is part of the code, and each robot has its own
+            kind = (*kind, params)
         if kind not in _COMPILED:
             stage = _Stage(task, params, free_time, self.rest)
             name = f"{task.id}-ilqr{'-free' if free_time else ''}"

@@ -78,10 +78,10 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
     Raises:
         ValueError: no optimizer can use the task's formulas; see `check_formulas`.
     """
-    return _ocp(*_kind(task, params))
+    return _ocp(*kind_of(task, params))
 
 
-def _kind(task: Task, params: BallbotParams) -> tuple[Task, bool, bool]:
+def kind_of(task: Task, params: BallbotParams) -> tuple[Task, bool, bool]:
     """What solvers are made for: a task whose formulas they can use, and whether the ball rolls and the robot has to grip."""
     kind = task, params.rolls, params.grips
     if kind not in _checked:
@@ -184,7 +184,7 @@ def shooting_solver(
         tolerance: of the solver; default, the finest that it reaches.
     """
     options = solver, tolerance or _tolerance(params.grips), iterations, barrier
-    return _solver(*_kind(task, params), steps, *options)
+    return _solver(*kind_of(task, params), steps, *options)
 
 
 @lru_cache(maxsize=256)
@@ -197,7 +197,7 @@ def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolve
 
     Made once for all robots of a kind.
     """
-    return _free_time_solver(*_kind(task, params), solver)
+    return _free_time_solver(*kind_of(task, params), solver)
 
 
 @lru_cache(maxsize=8)
