@@ -10,7 +10,15 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import named_robot
 from ballbot_train.commands.export import export
 from ballbot_train.onnx_export import export_onnx
-from ballbot_train.policy import SHIPPED, PolicyController, PolicyNetwork, PolicySpec, load_policy, save_policy
+from ballbot_train.policy import (
+    SHIPPED,
+    PolicyController,
+    PolicyNetwork,
+    PolicySpec,
+    load_policy,
+    save_policy,
+)
+from ballbot_train.policy_files import read_description, track_in
 
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
 
@@ -37,14 +45,16 @@ def observations_of_an_episode(env, policy):
     "name", [pytest.param(name, marks=[] if name == "orbit-sac" else pytest.mark.slow) for name in SHIPPED_NAMES]
 )
 def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path):
-    task, *others, learner = name.split("-")
-    robot = others[0] if others else "paper"
-    export(learner, task=task, out=tmp_path / "policy.onnx", robot=robot)
+    task, *others = name.split("-")
+    robot = "rolling" if "rolling" in others else "paper"
+    export(str(SHIPPED / f"{name}.json"), task=task, out=tmp_path / "policy.onnx", robot=robot)
     runtime = session(tmp_path / "policy.onnx")
     policy = load_policy(SHIPPED / f"{name}.json")
+    history = read_description(SHIPPED / f"{name}.json")["spec"].get("history", 0)
+    world = {"randomization": track_in(name) or None, "history": history}
     # in the closed form a ball that would slip ends the episode
     physics = "bullet" if named_robot(robot).grips else "rk4"
-    seen = observations_of_an_episode(BallbotEnv(task, physics=physics, robot=robot), policy)
+    seen = observations_of_an_episode(BallbotEnv(task, physics=physics, robot=robot, **world), policy)
     assert len(seen) > 50
     one_by_one = [runtime.run(None, {"observation": row[None]})[0][0] for row in seen]
     (at_once,) = runtime.run(None, {"observation": seen})

@@ -36,7 +36,8 @@ _LARGEST_ERROR = 1e-5  # of an action: float32 sums in another order differ by l
 def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = PAPER) -> Path:
     """Writes a policy as an ONNX file, after checking that it acts as the policy does.
 
-    The model has one input, `observation` (batch, no) float32 as the task observes, and one output, `action` (batch, 2)
+    The model has one input, `observation` (batch, no) float32 as the task observes, with the past behind it if the policy
+    has a history, and one output, `action` (batch, 2)
     float32 in [−1, 1], in units of the force limit. Its metadata says what these are; see `metadata`.
 
     Args:
@@ -69,6 +70,7 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
         "robot": robot,
         "observation": observation_table(task),
         "observation_scale": json.dumps(task.observation_scale),
+        "history": str(described.get("spec", {}).get("history", 0)),
         "observation_version": str(OBSERVATION_VERSION),
         "constants": json.dumps(task.constant_names),
         "action": "force Fx, Fy on the ball in the world's frame, in units of force_limit_newton, in [-1, 1]",
@@ -78,6 +80,12 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
         "weights_sha256": weights_digest(policy),
         "ballbot_gym_version": ballbot_gym.__version__,
     }
+
+
+def _size(network: PolicyNetwork) -> int:
+    """Numbers that the network takes: an observation, and the past behind it."""
+    spec = network.spec
+    return spec.observations + spec.history * (spec.observations + 2)
 
 
 def observation_table(task: Task) -> str:
@@ -90,7 +98,7 @@ def _traced(network: PolicyNetwork) -> Any:
     """The network as an `onnx.ModelProto`, for batches of any size."""
     for library in ("onnx", "onnxscript"):
         _require(library)
-    example = torch.zeros(2, network.spec.observations)
+    example = torch.zeros(2, _size(network))
     silence = logging.getLogger("torch.onnx")
     level, silence.level = silence.level, logging.ERROR  # it lists libraries that are not installed
     try:
@@ -124,7 +132,7 @@ def _check(model: Any, network: PolicyNetwork) -> None:
     from onnx.reference import ReferenceEvaluator
 
     check_model(model, full_check=True)
-    observations = np.random.default_rng(0).normal(size=(64, network.spec.observations)).astype(np.float32)
+    observations = np.random.default_rng(0).normal(size=(64, _size(network))).astype(np.float32)
     (found,) = ReferenceEvaluator(model).run(None, {"observation": observations})  # pyright: ignore
     with torch.inference_mode():
         expected = network(torch.as_tensor(observations)).numpy()
