@@ -82,12 +82,6 @@ def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, st
     }
 
 
-def _size(network: PolicyNetwork) -> int:
-    """Numbers that the network takes: an observation, and the past behind it."""
-    spec = network.spec
-    return spec.observations + spec.history * (spec.observations + 2)
-
-
 def observation_table(task: Task) -> str:
     """The part of a task's docstring that lists its observation: number, quantity, divisor and unit, as a table."""
     _, _, after = (inspect.getdoc(type(task)) or "").partition("Observation, ")
@@ -98,7 +92,7 @@ def _traced(network: PolicyNetwork) -> Any:
     """The network as an `onnx.ModelProto`, for batches of any size."""
     for library in ("onnx", "onnxscript"):
         _require(library)
-    example = torch.zeros(2, _size(network))
+    example = torch.zeros(2, network.spec.seen)
     silence = logging.getLogger("torch.onnx")
     level, silence.level = silence.level, logging.ERROR  # it lists libraries that are not installed
     try:
@@ -132,7 +126,7 @@ def _check(model: Any, network: PolicyNetwork) -> None:
     from onnx.reference import ReferenceEvaluator
 
     check_model(model, full_check=True)
-    observations = np.random.default_rng(0).normal(size=(64, _size(network))).astype(np.float32)
+    observations = np.random.default_rng(0).normal(size=(64, network.spec.seen)).astype(np.float32)
     (found,) = ReferenceEvaluator(model).run(None, {"observation": observations})  # pyright: ignore
     with torch.inference_mode():
         expected = network(torch.as_tensor(observations)).numpy()

@@ -113,6 +113,11 @@ class PolicySpec:
         if self.centred and (self.frame not in FRAMES or FRAMES[self.frame].steady is None):
             raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")
 
+    @property
+    def seen(self) -> int:
+        """Numbers that the policy takes: an observation, and the past behind it."""
+        return self.observations + self.history * (self.observations + 2)
+
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":
         """The spec that a policy's JSON file describes, where JSON has lists in place of tuples.

@@ -151,11 +151,8 @@ class WholeEpisodes:
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
         standing = alive  # an episode that has reached the goal goes on for a while, and may fail then
         noisy = self._batch.randomization.is_noisy
-        ends, patience, ahead = (
-            [],
-            _PATIENCE,
-            int(noisy or task.clock),
-        )  # what noise and clock give changes with the steps
+        ends, patience = [], _PATIENCE
+        ahead = int(noisy or task.clock)  # what noise and clock give changes with the steps
         for k in range(task.steps):
             step = self._step(state)
             total = total + torch.where(alive & standing, step.cost, 0.0)

@@ -80,7 +80,7 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         "routes": [] if network.routes is None else _layers(network.routes.mlp),
     }
     inputs = networks["mlp"][0][0].shape[1]
-    seen = spec.observations + spec.history * (spec.observations + 2)
+    seen = spec.seen
     if network.routes is not None:
         seen += network.routes.route.obstacles
     signs = [[*signs, *(spec.history * (*signs, *action)), *action] for signs, action in spec.mirrors]
