@@ -47,10 +47,13 @@ _ROUGH_SOLUTION = tuple(
     Options(bends=bends, width=width, multiplier=multiplier, tolerance=3e-6)
     for bends, width, multiplier in ((1, 0.01, 3.0), (0, 0.01, 3.0), (3, 0.01, 3.0), (1, 0.02, 1.0))
 )
+_SHIFTED = Options(bends=1, width=0.002, tolerance=3e-6)  # its multiplier is the least
 _SIDES_DOUBT = 0.005  # relative: how differently the coarse grid and rough solutions may order choices of sides
 _SECONDS = 3.0  # optimized of a task that ends at rest
+_AFTER_SECONDS = 1.0  # optimized of a slalom after its last obstacle
 _AT_REST = 1e-5  # relative to an episode's cost: how wrong LQR's cost-to-go may be after these
 _SAME = 0.02  # m: rough solutions that are nowhere farther apart are the same
+_FEW = 16  # problems
 _AT_ONCE = 256  # episodes in memory
 _GUESSES = 5  # as of `find_optimum`
 
@@ -177,6 +180,8 @@ class _Batch:
         self._task, self._params, self._x0, self._c, self._optima = task, params, x0, c, optima
         self._backoff = backoff
         self._solver = ilqr(task, params)
+        # where each episode comes to rest, if it does
+        self._ends = np.array([task.reference(x, constants, params).x[-1] for x, constants in zip(x0, c, strict=True)])
 
     def search(self, forces: np.ndarray | None) -> None:
         task = self._task
@@ -190,14 +195,20 @@ class _Batch:
         else:
             self._follow_paths(np.arange(len(self._x0)))
 
-    def _given(self, c: np.ndarray, then_rest: bool = False, free_time: bool = False) -> np.ndarray:
-        """Parameters of `ilqr`, (J, np), of constants (J, nc). With `then_rest`, LQR's cost-to-go counts."""
-        share = [] if free_time or self._solver.rest is None else [float(then_rest)]
+    def _given(
+        self, of: np.ndarray, c: np.ndarray | None = None, then_rest: bool = False, free_time: bool = False
+    ) -> np.ndarray:
+        """Parameters of `ilqr`, (J, np), of episodes `of` (J,), or with other constants (B, nc). With `then_rest`, LQR's
+        cost-to-go counts.
+        """
+        c = (self._c if c is None else c)[of]
         _, *given = shooting_parameters(self._task, self._params, c[0], self._backoff)
-        rows = np.tile([*given, *share], (len(c), 1))
+        rows = np.tile(given, (len(c), 1))
         first = len(robot_numbers(self._params))
         rows[:, first : first + c.shape[1]] = c
-        return rows
+        if free_time or self._solver.rest is None:
+            return rows
+        return np.column_stack([rows, self._solver.ends(self._ends[of], float(then_rest))])
 
     def _solve(
         self,
@@ -207,33 +218,34 @@ class _Batch:
         c: np.ndarray | None = None,
         free_time: bool = False,
         chosen_sides: np.ndarray | None = None,
+        then_rest: bool = False,
     ) -> Solutions:
         """Solves guesses with some options in turn until they are solved, and on chosen sides (J, obstacles) of obstacles."""
         task, n = self._task, guesses.a.shape[1]
         solver, lengths = (
             (ilqr(task, self._params, True), 1.0) if free_time else (self._solver, coarseness * task.control_dt)
         )
-        given = self._given((self._c if c is None else c)[guesses.of], coarseness == 1 and n < task.steps, free_time)
+        given = self._given(guesses.of, c, then_rest, free_time)
         if free_time:
             bounds = task.control_dt / 4, task.duration / n
             given = np.column_stack([given, np.tile(bounds, (len(given), 1))])
 
-        def right(some: _Guesses, found: Solutions, chosen: np.ndarray | None) -> np.ndarray:
-            return (
-                found.solved if chosen is None else found.solved & (self._sides(some.of, found.x) == chosen).all(axis=1)
-            )
-
-        found = solver.solve(guesses.x, guesses.a, guesses.steps, lengths, given, tries[0])
-        for options in tries[1:]:
-            left = np.flatnonzero(~right(guesses, found, chosen_sides))
-            if not len(left):
-                break
-            some = guesses.some(left)
-            again = solver.solve(some.x, some.a, some.steps, lengths, given[left], options)
-            better = again.solved & ~found.solved[left]
-            better |= right(some, again, None if chosen_sides is None else chosen_sides[left])
-            for field in fields(Solutions):
-                getattr(found, field.name)[left[better]] = getattr(again, field.name)[better]
+        found, left, waiting = None, np.arange(len(guesses.of)), tries
+        while waiting and len(left):
+            # few that are left would not fill the processor's lanes
+            now, waiting = (waiting, ()) if len(left) * len(waiting) <= _FEW else (waiting[:1], waiting[1:])
+            rows = np.tile(left, len(now))
+            some, options = guesses.some(rows), [tried for tried in now for _ in left]
+            again = solver.solve(some.x, some.a, some.steps, lengths, given[rows], options)
+            found = again.some(np.arange(len(left))) if found is None else found
+            right = again.solved
+            if chosen_sides is not None:
+                right = right & (self._sides(some.of, again.x) == chosen_sides[rows]).all(axis=1)
+            for better in (again.solved & ~found.solved[rows], right):
+                first = np.unique(np.where(better, rows, -1), return_index=True)[1]
+                found.put(rows, again, first[better[first]])
+            left = np.setdiff1d(left, rows[right])
+        assert found is not None
         found.costs[~found.solved] = np.inf
         return found
 
@@ -246,10 +258,22 @@ class _Batch:
         return found
 
     def _keep(self, guesses: _Guesses, tries: Sequence[Options], chosen_sides: np.ndarray | None = None) -> np.ndarray:
-        """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,)."""
+        """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,).
+
+        After guesses that end early, LQR goes on. Where that costs something else than its cost-to-go, the whole episode is
+        solved from there.
+        """
         if not len(guesses.of):
             return np.zeros(0)
-        found = self._solve(guesses, tries, chosen_sides=chosen_sides)
+        rests = self._solver.rest is not None and guesses.a.shape[1] < self._task.steps
+        found = self._solve(guesses, tries, chosen_sides=chosen_sides, then_rest=rests)
+        return self._kept(guesses, found)
+
+    def _kept(self, guesses: _Guesses, found: Solutions) -> np.ndarray:
+        if self._solver.rest is not None and guesses.a.shape[1] < self._task.steps:
+            guesses, found = self._to_the_end(guesses, found)
+            again = np.flatnonzero(~found.solved & np.isfinite(found.costs))
+            found.costs[again] = self._keep(guesses.some(again), _MOTION)
         self._write(guesses, found)
         return found.costs
 
@@ -274,46 +298,44 @@ class _Batch:
 
     def _recover(self, forces: np.ndarray | None) -> None:
         """From the recoveries, over the first seconds where LQR is right about the rest."""
-        guesses, rest, dt, limit = (
-            self._recoveries(forces),
+        self._keep(self._recoveries(forces), _MOTION)
+
+    def _to_the_end(self, guesses: _Guesses, found: Solutions) -> tuple[_Guesses, Solutions]:
+        """Whole episodes, of solutions of their first seconds and LQR then: solved where LQR's cost-to-go was right."""
+        rest, ends, dt, limit = (
             self._solver.rest,
+            self._ends[guesses.of],
             self._task.control_dt,
             self._params.force_limit,
         )
+        assert rest is not None
         left = self._task.steps - guesses.a.shape[1]
-        if rest is None or not left:
-            self._keep(guesses, _MOTION)
-            return
-        found = self._solve(guesses, _MOTION)
-        end = found.x[:, -1]
-        x, a, costs = self._solver.stay(end, dt, self._given(self._c[guesses.of]), left)
-        expected = rest.costs(end)
-        whole = Solutions(
-            np.concatenate([found.x, x[:, 1:]], axis=1),
-            np.concatenate([found.a, a], axis=1),
-            np.concatenate([found.gains, np.broadcast_to(rest.gain / limit, (len(a), left, 2, 8))], axis=1),
-            np.concatenate([found.slopes, rest.slopes(x[:, :-1])], axis=1),
-            found.costs - expected + costs,
-            found.solved,
+        last = found.x[:, -1]
+        x, a, costs = self._solver.stay(last, dt, self._given(guesses.of), left, ends)
+        expected = rest.costs(last - ends)
+        whole = replace(
+            found,
+            x=np.concatenate([found.x, x[:, 1:]], axis=1),
+            a=np.concatenate([found.a, a], axis=1),
+            gains=np.concatenate([found.gains, np.broadcast_to(rest.gain / limit, (len(a), left, 2, 8))], axis=1),
+            slopes=np.concatenate([found.slopes, rest.slopes(x[:, :-1] - ends[:, None])], axis=1),
+            costs=found.costs - expected + costs,
         )
-        exact = np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
-        again = _Guesses(guesses.of, whole.x, whole.a, guesses.steps + left)
-        whole.solved[:] &= exact
-        self._write(again, whole)
-        self._keep(again.some(~exact & np.isfinite(whole.costs)), _MOTION)
+        whole.solved[:] &= np.abs(costs - expected) <= _AT_REST * np.abs(whole.costs)
+        return _Guesses(guesses.of, whole.x, whole.a, guesses.steps + left), whole
 
     def _recoveries(self, forces: np.ndarray | None) -> _Guesses:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
         task, x0, count, rest = self._task, self._x0, len(self._x0), self._solver.rest
         n = task.steps if rest is None else min(task.steps, round(_SECONDS / task.control_dt))
-        given, times = self._given(self._c), task.control_dt * np.arange(n)
+        given, times = self._given(np.arange(count)), task.control_dt * np.arange(n)
         best = np.full(count, np.inf)
         x, a = np.zeros((count, n + 1, 8)), np.zeros((count, n, 2))
 
         def improve(rows: np.ndarray, simulated: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
             states, actions, costs = simulated
             if rest is not None and n < task.steps:
-                costs = costs + rest.costs(states[:, -1])
+                costs = costs + rest.costs(states[:, -1] - self._ends[rows])
             cheaper = costs < best[rows]
             for kept, values in zip((x, a, best), (states, actions, costs), strict=True):
                 kept[rows[cheaper]] = values[cheaper]
@@ -400,29 +422,80 @@ class _Batch:
                     wanted += [(i, s) for s in (best - 1, best + 1) if s not in tried]
 
     def _weave(self) -> None:
-        """Slaloms: likely choices of sides are compared with forces held longer."""
-        task, coarse, every = self._task, search.COARSE, range(len(self._x0))
-        straight = [search.straight_path(task, self._params, self._x0[i], self._c[i]) for i in every]
+        """Slaloms: likely choices of sides are compared with forces held longer, over the time until LQR is right about the
+        rest.
+        """
+        task, coarse, every = self._task, search.COARSE, np.arange(len(self._x0))
+        straight = [search.straight_path(task, self._params, x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
         away = np.array([task.without_obstacles(c) for c in self._c])
-        free = self._solve(self._along(list(every), straight, coarse), _ROUGH_PATH, coarse, c=away)
-        of, paths = [], []
-        for i in np.flatnonzero(free.solved).tolist():
-            likely = search.likely_paths(task, self._params, self._x0[i], self._c[i], free.x[i], float(free.costs[i]))
-            of += [i] * len(likely)
-            paths += likely
-        if not of:
+        free = self._solve(self._along(every.tolist(), straight, coarse), _ROUGH_PATH, coarse, c=away)
+        solved = np.flatnonzero(free.solved)
+        if not len(solved):
             return
-        along = self._along(of, paths, coarse)
-        rough = self._solve(along, _SIDES, coarse, chosen_sides=self._sides(of, paths))
+        likely = search.likely_sides(
+            task, self._params, self._x0[solved], self._c[solved], free.x[solved], free.costs[solved]
+        )
+        of = [i for i, chosen in zip(solved.tolist(), likely.sides, strict=True) for _ in chosen]
+        paths = [
+            task.routed_path(self._x0[i], self._c[i], tuple(sides.tolist()))
+            for i, chosen in zip(solved.tolist(), likely.sides, strict=True)
+            for sides in chosen
+        ]
+        steps = task.steps
+        if self._solver.rest is not None:
+            steps = min(steps, coarse * math.ceil((likely.passed.max() + _AFTER_SECONDS / task.control_dt) / coarse))
+        rests = steps < task.steps
+        along, sides = self._along(of, [path[: steps + 1] for path in paths], coarse), self._sides(of, paths)
+        rough = self._solve(along, _SIDES, coarse, chosen_sides=sides, then_rest=rests)
         chosen = _contenders(along.of, rough, _SIDES_DOUBT)
         if not len(chosen):
             return
-        x = np.array([guess.resampled(states, task.steps) for states in rough.x[chosen]])
+        x = np.array([guess.resampled(states, steps) for states in rough.x[chosen]])
         a = np.repeat(rough.a[chosen], coarse, axis=1)
-        near = _Guesses(along.of[chosen], x, a, np.full(len(chosen), task.steps))
-        left = chosen[np.isinf(self._keep(near, _ROUGH_SOLUTION, self._sides(near.of, x)))]
+        near = _Guesses(along.of[chosen], x, a, np.full(len(chosen), steps))
+        found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=sides[chosen], then_rest=rests)
+        self._pass_later(near, found, rests)
+        left = chosen[np.isinf(self._kept(near, found))]
         if len(left):
-            self._keep(self._along([of[i] for i in left], [paths[i] for i in left]), _PATH)
+            self._keep(self._along([of[i] for i in left], [paths[i][: steps + 1] for i in left]), _PATH)
+
+    def _pass_later(self, guesses: _Guesses, found: Solutions, then_rest: bool) -> None:
+        """Replaces the best solution of every episode by one that passes the obstacles a control step later or earlier, where
+        that is cheaper.
+
+        A robot cuts corners between its control steps. So wherever an apex lies between two of them is a local optimum.
+        """
+        of = guesses.of[np.isfinite(found.costs)]
+        if not len(of):
+            return
+        rows = np.array([np.where(guesses.of == i, found.costs, np.inf).argmin() for i in np.unique(of)])
+        two = np.tile(rows, 2)
+        x, a, multipliers = (
+            np.concatenate([_shifted(part[rows], 1), _shifted(part[rows], -1)])
+            for part in (found.x, found.a, found.multipliers)
+        )
+        x[:, 0] = found.x[two, 0]
+        given = self._given(guesses.of[two], then_rest=then_rest)
+        moved = self._solver.solve(
+            x,
+            a,
+            guesses.steps[two],
+            self._task.control_dt,
+            given,
+            _SHIFTED,
+            np.maximum(multipliers, _SHIFTED.multiplier),
+            found.end_multipliers[two],
+        )
+        moved.costs[~moved.solved] = np.inf
+        earlier = moved.costs[len(rows) :] < moved.costs[: len(rows)]
+        best = np.arange(len(rows)) + len(rows) * earlier
+        found.put(two, moved, best[moved.costs[best] < found.costs[rows]])
+
+
+def _shifted(values: np.ndarray, later: int) -> np.ndarray:
+    """(J, n, k) values, each so many steps later; the first or last ones are repeated."""
+    n = values.shape[1]
+    return values[:, np.clip(np.arange(n) - later, 0, n - 1)]
 
 
 def _contenders(of: np.ndarray, found: Solutions, doubt: float) -> np.ndarray:

@@ -49,15 +49,16 @@ static void violation(int count, const real *g, const real *multiplier, int k, r
    than n steps begin with steps of no length. */
 typedef struct {
     const int64_t *steps;
+    const options *each;
     const double *lengths, *given;
-    double *x_all, *a_all, *gains_all, *slopes_all, *costs, *missed_all;
+    double *x_all, *a_all, *path_prices, *end_prices, *gains_all, *slopes_all, *costs, *missed_all;
     int64_t *status, *iterations;
 } problems;
 
 /* LANES episodes: row t of the arrays is step t. */
 typedef struct {
     int64_t n, active, job[LANES], tick[LANES];
-    const options *o;
+    options o[LANES];
     ROWS(x, STATES); ROWS(x_new, STATES); ROWS(shift, STATES); ROWS(slope, STATES); ROWS(gain, 2 * STATES);
     ROWS(a, 2); ROWS(a_new, 2); ROWS(change, 2); ROWS(m, PATH + 1); ROWS(g, PATH + 1); ROWS(g_new, PATH + 1);
     ROWS(dt, 1); ROWS(rate, 1); ROWS(priced, 1);
@@ -71,16 +72,16 @@ static void load(block *b, const problems *q, int64_t j, int k) {
     const int64_t empty = b->n - q->steps[j];
     b->job[k] = j;
     ++b->active, b->tick[k] = 0, b->merit[k] = INFINITY;
-    b->width[0][k] = b->o->width, b->share[0][k] = 1, b->damping[0][k] = 0;
+    b->o[k] = q->each[j], b->width[0][k] = b->o[k].width, b->share[0][k] = 1, b->damping[0][k] = 0;
     for (int64_t t = 0; t <= b->n; ++t) {
         const int64_t s = t < empty ? 0 : t - empty;
         for (int i = 0; i < STATES; ++i) b->x[t][i][k] = q->x_all[(j * (b->n + 1) + s) * STATES + i];
         if (t == b->n) break;
         b->dt[t][0][k] = t < empty ? 0 : q->lengths[j];
         for (int i = 0; i < 2; ++i) b->a[t][i][k] = t < empty ? 0 : q->a_all[(j * b->n + s) * 2 + i];
-        for (int i = 0; i < PATH; ++i) b->m[t][i][k] = t < empty ? 0 : b->o->multiplier;
+        for (int i = 0; i < PATH; ++i) b->m[t][i][k] = t < empty ? 0 : q->path_prices[(j * b->n + s) * PATH + i];
     }
-    for (int i = 0; i < END; ++i) b->e[i][k] = b->o->multiplier;
+    for (int i = 0; i < END; ++i) b->e[i][k] = q->end_prices[j * END + i];
     for (int i = 0; i < PARAMS; ++i) b->p[i][k] = q->given[j * PARAMS + i];
 }
 
@@ -101,7 +102,9 @@ static void unload(block *b, const problems *q, int k, int over) {
         for (int i = 0; i < 2; ++i) q->a_all[(j * b->n + s) * 2 + i] = b->a[t][i][k];
         for (int i = 0; i < 2 * STATES; ++i) q->gains_all[(j * b->n + s) * 2 * STATES + i] = b->gain[t][i][k];
         for (int i = 0; i < STATES; ++i) q->slopes_all[(j * b->n + s) * STATES + i] = b->slope[t][i][k];
+        for (int i = 0; i < PATH; ++i) q->path_prices[(j * b->n + s) * PATH + i] = b->m[t][i][k];
     }
+    for (int i = 0; i < END; ++i) q->end_prices[j * END + i] = b->e[i][k];
     off(b, k, &gap, &missed);
     q->costs[j] = b->cost[k], q->missed_all[j] = missed, q->status[j] = over, q->iterations[j] = b->tick[k];
     b->job[k] = -1, --b->active;
@@ -134,7 +137,7 @@ static void bend_guesses(block *b) {
     for (int64_t t = 0; t < b->n; ++t)
         bend(AT(b->x[t]), AT(b->shift[t]), AT(b->x[t + 1]), AT(b->a[t]), AT(b->change[t]), AT(b->share), AT(b->gain[t]),
              AT(b->dt[t]), AT(b->p), AT(b->shift[t + 1]), AT(b->a_new[t]));
-    EACH_LANE if (b->job[k] >= 0 && b->tick[k] < b->o->bends) {
+    EACH_LANE if (b->job[k] >= 0 && b->tick[k] < b->o[k].bends) {
         for (int64_t t = 0; t < b->n; ++t)
             for (int i = 0; i < 2; ++i) b->a[t][i][k] = b->a_new[t][i][k];
         for (int64_t t = 0; t <= b->n; ++t)
@@ -170,10 +173,11 @@ static void accept(block *b, int k) {
 
 /* New multipliers, and a narrower price. */
 static void reprice(block *b, int k) {
+    const options *o = &b->o[k];
     for (int64_t t = 0; t < b->n; ++t)
-        if (b->dt[t][0][k] > 0) update(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], b->o->factor, k);
-    update(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], b->o->factor, k);
-    b->width[0][k] = fmax(b->width[0][k] * b->o->shrink, b->o->least_width);
+        if (b->dt[t][0][k] > 0) update(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], o->factor, k);
+    update(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], o->factor, k);
+    b->width[0][k] = fmax(b->width[0][k] * o->shrink, o->least_width);
     b->merit[k] = b->cost[k] + price(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], k), b->share[0][k] = 1;
     for (int64_t t = 0; t < b->n; ++t)
         if (b->dt[t][0][k] > 0) b->merit[k] += price(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], k);
@@ -181,7 +185,8 @@ static void reprice(block *b, int k) {
 
 /* Takes or refuses the simulated step, and says how the episode ended, or -1. */
 static int decide(block *b, int k) {
-    const int tracked = b->tick[k] == b->o->bends;
+    const options *o = &b->o[k];
+    const int tracked = b->tick[k] == o->bends;
     const int accepted = tracked ? isfinite(b->merit_new[k]) : b->merit_new[k] < b->merit[k];
     int over = -1;
     if (accepted)
@@ -193,28 +198,28 @@ static int decide(block *b, int k) {
     real *damping = &b->damping[0][k];
     *damping = !accepted ? fmin(*damping * 4 + 1e-3, 1e3) : used < 1 ? *damping : *damping * 0.2;
     if (*damping < 1e-6) *damping = 0;
-    const int settled = b->promised[k] < b->o->tolerance * scale;
+    const int settled = b->promised[k] < o->tolerance * scale;
     const int stuck = !accepted && b->share[0][k] < 1e-3;
     if (over < 0 && !tracked && (settled || stuck || (accepted && b->promised[k] < 1e-2 * scale))) {
         real gap = 0, missed = 0;
         off(b, k, &gap, &missed);
-        if ((settled || stuck) && missed <= b->o->violation && gap <= 10 * b->o->tolerance * scale)
+        if ((settled || stuck) && missed <= o->violation && gap <= 10 * o->tolerance * scale)
             over = settled ? OPTIMAL : STUCK;
-        else if (stuck && b->width[0][k] <= b->o->least_width)
+        else if (stuck && b->width[0][k] <= o->least_width)
             over = STUCK;
         else
             reprice(b, k);
     }
-    return ++b->tick[k] >= b->o->iterations && over < 0 ? EXHAUSTED : over;
+    return ++b->tick[k] >= o->iterations && over < 0 ? EXHAUSTED : over;
 }
 
-/* Solves `jobs` episodes of at most n steps. */
-void solve(int64_t jobs, int64_t n, const options *o, const int64_t *steps, const double *lengths, const double *given,
-           double *x, double *a, double *gains, double *slopes, double *costs, double *missed, int64_t *status,
+/* Solves `jobs` episodes of at most n steps, each with its options. */
+void solve(int64_t jobs, int64_t n, const options *each, const int64_t *steps, const double *lengths, const double *given,
+           double *x, double *a, double *path_prices, double *end_prices, double *gains, double *slopes, double *costs, double *missed, int64_t *status,
            int64_t *iterations) {
-    const problems q = {steps, lengths, given, x, a, gains, slopes, costs, missed, status, iterations};
+    const problems q = {steps, each, lengths, given, x, a, path_prices, end_prices, gains, slopes, costs, missed, status, iterations};
     block *b = calloc(1, sizeof *b);
-    b->n = n, b->o = o;
+    b->n = n;
 #define MAKE(name) b->name = calloc((size_t)n + 1, sizeof *b->name)
     MAKE(x); MAKE(x_new); MAKE(shift); MAKE(slope); MAKE(gain); MAKE(a); MAKE(a_new); MAKE(change); MAKE(m); MAKE(g);
     MAKE(g_new); MAKE(dt); MAKE(rate); MAKE(priced);
@@ -224,8 +229,8 @@ void solve(int64_t jobs, int64_t n, const options *o, const int64_t *steps, cons
         int bending = 0, simulating = 0, bends[LANES];
         EACH_LANE {
             if (b->job[k] < 0 && next < jobs) load(b, &q, next++, k);
-            bends[k] = b->job[k] >= 0 && b->tick[k] < o->bends;
-            b->open[0][k] = b->tick[k] <= o->bends;
+            bends[k] = b->job[k] >= 0 && b->tick[k] < b->o[k].bends;
+            b->open[0][k] = b->tick[k] <= b->o[k].bends;
             if (b->job[k] >= 0) *(bends[k] ? &bending : &simulating) = 1;
         }
         if (!b->active) break;
@@ -244,7 +249,7 @@ void solve(int64_t jobs, int64_t n, const options *o, const int64_t *steps, cons
 }
 
 /* Simulates the cascade along paths (jobs, n, 8) with its two settings, or the actions a where there is no path, with feedback
-   where there is one: its gain (2, STATES), and the state about which it is. x (jobs, n+1, STATES) has the initial states. */
+   where there is one: gains (jobs, 2, STATES), each with the state about which it is. x (jobs, n+1, STATES) has the initial states. */
 void follow(int64_t jobs, int64_t n, const double *lengths, const double *given, const double *path_all,
             const double *settings, const double *feedback, double *x_all, double *a_all, double *costs, double *missed_all) {
     for (int64_t first = 0; first < jobs; first += LANES) {
@@ -259,7 +264,7 @@ void follow(int64_t jobs, int64_t n, const double *lengths, const double *given,
             for (int i = 0; i < STATES; ++i) x[0][i][k] = x_all[j * (n + 1) * STATES + i];
             for (int i = 0; i < PARAMS; ++i) p[i][k] = given[j * PARAMS + i];
             if (feedback)
-                for (int i = 0; i < 3 * STATES; ++i) lqr[i][k] = feedback[i];
+                for (int i = 0; i < 3 * STATES; ++i) lqr[i][k] = feedback[j * 3 * STATES + i];
         }
         for (int64_t t = 0; t < n; ++t) {
             real *now = &x[t & 1][0][0], *after = &x[(t + 1) & 1][0][0];

@@ -15,7 +15,7 @@ Where a task ends at rest, LQR's cost-to-go can stand for the end of an episode.
 import ctypes
 import functools
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +38,13 @@ MARGIN = 2e-5
 _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
 _LEAST_CURVATURE = 1e-9  # of the cost along an action, so that steps of no length have a best one
 _LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
+_REST = 8 + 36 + 1  # parameters of `Ilqr.ends`
 _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
 
 
 @dataclass(frozen=True)
 class Options:
-    """Of the solver, in the order in which ilqr.c reads them. Widths are in the unit of the constraints."""
+    """Of the solver, in ilqr.c's order, the multiplier last. Widths are in the unit of the constraints."""
 
     width: float = 0.2
     """Of the constraints' prices, at first."""
@@ -77,6 +78,8 @@ class Solutions:
     | slopes | (J, n, ns) | of the remaining cost with respect to each state but the last |
     | costs | (J,) | |
     | solved | (J,) bool | |
+    | multipliers | (J, n, np) | of the constraints of each step |
+    | end_multipliers | (J, ne) | of those of the last state |
     """
 
     x: np.ndarray
@@ -85,34 +88,47 @@ class Solutions:
     slopes: np.ndarray
     costs: np.ndarray
     solved: np.ndarray
+    multipliers: np.ndarray
+    end_multipliers: np.ndarray
+
+    def some(self, rows: np.ndarray) -> "Solutions":
+        """Copies of some of them."""
+        return Solutions(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def put(self, rows: np.ndarray, others: "Solutions", which: np.ndarray) -> None:
+        """Puts the others' solutions `which` in place of the rows at the same indices."""
+        for field in fields(self):
+            getattr(self, field.name)[rows[which]] = getattr(others, field.name)[which]
 
 
 @dataclass(frozen=True)
 class Rest:
-    """The state (8,) where a task ends at rest, and LQR about it: its gain (2, 8), and P (8, 8) of its cost-to-go xᵀPx."""
+    """LQR where a task ends at rest: its gain (2, 8), and P (8, 8) of its cost-to-go xᵀPx of states x relative to the end."""
 
-    x: np.ndarray
     gain: np.ndarray
     p: np.ndarray
 
-    def slopes(self, x: np.ndarray) -> np.ndarray:
-        """(..., 8) of the cost-to-go of states (..., 8)."""
-        off = x - self.x  # BLAS would add in an order that depends on the number of states
+    def slopes(self, off: np.ndarray) -> np.ndarray:
+        """(..., 8) of the cost-to-go, of states (..., 8) relative to the end."""
+        # BLAS would add in an order that depends on the number of states
         return sum((2 * off[..., i, None] * row for i, row in enumerate(self.p)), np.zeros(8))
 
-    def costs(self, x: np.ndarray) -> np.ndarray:
-        """(...) costs-to-go of states (..., 8)."""
-        return 0.5 * (self.slopes(x) * (x - self.x)).sum(axis=-1)
+    def costs(self, off: np.ndarray) -> np.ndarray:
+        """(...) costs-to-go of states (..., 8) relative to the end."""
+        return 0.5 * (self.slopes(off) * off).sum(axis=-1)
 
 
 def rest(task: Task, params: BallbotParams) -> Rest | None:
-    """Where the task ends at rest, if that is the same equilibrium for all episodes."""
-    if task.first_exit or task.constant_names:
+    """LQR where the task ends, if that is at rest, and the same relative to the end of every episode."""
+    if task.first_exit:
         return None
-    end = task.reference(np.zeros(8), np.zeros(0), params)
-    if len(end.x) > 1 or not is_equilibrium(params, end.x[0], end.u[0]):
-        return None
-    return Rest(end.x[0], *discrete_lqr(task, params, end.x[0], end.u[0], np.zeros(0)))
+    found: list[Rest] = []
+    for x0, c in (task.sample(np.random.default_rng(seed), params) for seed in range(2 if task.constant_names else 1)):
+        end = task.reference(x0, c, params)
+        if len(end.x) > 1 or not is_equilibrium(params, end.x[0], end.u[0]):
+            return None
+        found.append(Rest(*discrete_lqr(task, params, end.x[0], end.u[0], c)))
+    return found[0] if np.allclose(found[0].p, found[-1].p, rtol=1e-9) else None
 
 
 _COMPILED: dict[tuple[Any, ...], tuple[ctypes.CDLL, int, dict[str, int]]] = {}
@@ -131,20 +147,26 @@ class Ilqr:
     def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
         kind: tuple[Any, ...] = (free_time, *kind_of(task, params))  # which refuses formulas that cannot be optimized
         self._limit, self.rest = params.force_limit, None if free_time else rest(task, params)
-        if self.rest is not None:  # LQR's cost-to-go is part of the code, and each robot has its own
-            kind = (*kind, params)
         if kind not in _COMPILED:
-            stage = _Stage(task, params, free_time, self.rest)
+            stage = _Stage(task, params, free_time, self.rest is not None)
             name = f"{task.id}-ilqr{'-free' if free_time else ''}"
             _COMPILED[kind] = ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD))), stage.ns, stage.sizes
         library, self.states, self._sizes = _COMPILED[kind]
         self._solve, self._follow = library.solve, library.follow
         count, pointer = ctypes.c_int64, ctypes.c_void_p
-        self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 12], None
+        self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 14], None
         self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 9], None
 
     def solve(
-        self, x: np.ndarray, a: np.ndarray, steps: Any, lengths: Any, given: np.ndarray, options: Options = Options()
+        self,
+        x: np.ndarray,
+        a: np.ndarray,
+        steps: Any,
+        lengths: Any,
+        given: np.ndarray,
+        options: Options | Sequence[Options] = Options(),
+        multipliers: np.ndarray | None = None,
+        end_multipliers: np.ndarray | None = None,
     ) -> Solutions:
         """Solves J problems from guesses.
 
@@ -154,8 +176,10 @@ class Ilqr:
             steps: (J,) or one number of steps, n at most.
             lengths: (J,) or one length of a step, s; 1 where it is free.
             given: (J, np) parameters: p of `shooting_ocp` but the first, and the bounds of a free length, s, or else, for
-                tasks with a `rest`, the share of LQR's cost-to-go that the last state costs, 0 or 1.
-            options: of the solver.
+                tasks with a `rest`, what `ends` gives.
+            options: of the solver, or of each problem.
+            multipliers, end_multipliers: (J, n, path constraints) and (J, constraints of the end) at first, of a solution of
+                nearly the same problem; default, the option.
         """
         jobs, n = a.shape[:2]
         x, a = np.array(x, np.float64, order="C"), np.array(a, np.float64, order="C")
@@ -163,10 +187,17 @@ class Ilqr:
         costs, missed = np.zeros(jobs), np.zeros(jobs)
         status, iterations = np.zeros(jobs, np.int64), np.zeros(jobs, np.int64)
         each = (np.ascontiguousarray(np.broadcast_to(steps, jobs), np.int64), *self._given(jobs, lengths, given))
+        each_options = [options] * jobs if isinstance(options, Options) else options
+        settings = np.array([astuple(one) for one in each_options], np.float64).reshape(jobs, -1)
+        m, e = np.zeros((jobs, n, self._sizes["PATH"])), np.zeros((jobs, self._sizes["END"]))
+        if multipliers is None:
+            m[:], e[:] = settings[:, -1:, None], settings[:, -1:]
+        else:
+            m[:], e[:] = multipliers, end_multipliers
         # named, because all have to live as long as the call
-        arrays = (np.array(astuple(options)), *each, x, a, gains, slopes, costs, missed, status, iterations)
+        arrays = (settings, *each, x, a, m, e, gains, slopes, costs, missed, status, iterations)
         self._solve(jobs, n, *(array.ctypes.data for array in arrays))
-        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL)
+        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, m, e)
 
     def follow(
         self, x0: np.ndarray, length: float, given: np.ndarray, paths: np.ndarray, settings: tuple[float, float]
@@ -193,12 +224,19 @@ class Ilqr:
         """The same under actions a (J, n, 2)."""
         return self._simulated(x0, np.array(a, np.float64, order="C"), length, given, None, (0.0, 0.0))
 
-    def stay(
-        self, x0: np.ndarray, length: float, given: np.ndarray, n: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same for n steps under LQR about the task's `rest`."""
+    def ends(self, ends: np.ndarray, share: float) -> np.ndarray:
+        """(J, 45) parameters: that a share of LQR's cost-to-go about the states `ends` (J, 8) counts, 0 or 1."""
         assert self.rest is not None
-        feedback = np.concatenate([self.rest.gain.ravel() / self._limit, self.rest.x])
+        same = np.tile([*self.rest.p[np.triu_indices(8)], share], (len(ends), 1))
+        return np.column_stack([ends, same])
+
+    def stay(
+        self, x0: np.ndarray, length: float, given: np.ndarray, n: int, ends: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same for n steps under LQR about the states `ends` (J, 8)."""
+        assert self.rest is not None
+        gains = np.tile(self.rest.gain.ravel() / self._limit, (len(ends), 1))
+        feedback = np.column_stack([gains, ends])
         return self._simulated(x0, np.zeros((len(x0), n, 2)), length, given, None, (0.0, 0.0), feedback)
 
     def _simulated(
@@ -238,13 +276,13 @@ def ilqr(task: Task, params: BallbotParams, free_time: bool = False) -> Ilqr:
 class _Stage:
     """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
 
-    def __init__(self, task: Task, params: BallbotParams, free_time: bool, at_rest: Rest | None):
+    def __init__(self, task: Task, params: BallbotParams, free_time: bool, rests: bool):
         self._ocp = shooting_ocp(task, params)
         self._substeps = dynamics.substeps_for(task.control_dt)
-        self._free, self.ns, self.rest = free_time, 9 if free_time else 8, at_rest
+        self._free, self.ns, self._rests = free_time, 9 if free_time else 8, rests
         symbol = casadi.SX.sym
         self._x, self._a, self._dt = symbol("x", self.ns), symbol("a", 2), symbol("dt")
-        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + (at_rest is not None))
+        self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + _REST * rests)
         self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
         self._limit: Any
         self._robot, self._limit = symbolic_robot(params.rolls, params.grips, self._all)
@@ -327,8 +365,10 @@ class _Stage:
         """The cost of the last state, with what is ahead of the last step, and its constraints."""
         x, p = self._x, self._all
         limits, cost = self._ocp.final_inequalities(x[:8], p), self._ocp.final_cost(x[:8], p)
-        if self.rest is not None:
-            cost += self._p[-1] * casadi.bilin(self.rest.p, x - self.rest.x, x - self.rest.x)
+        if self._rests:
+            end, squares, share = casadi.vertsplit(self._p[-_REST:], [0, 8, _REST - 1, _REST])
+            upper = casadi.SX(casadi.Sparsity.upper(8).T, squares).T
+            cost += share * casadi.bilin(casadi.triu2symm(upper), x - end, x - end)
         push, stiffness = _price_slopes(limits, self._end_multipliers, self._width)
         of_limits, held = casadi.jacobian(limits, x), casadi.SX.sym("held", push.shape[0])
         # How the goal bends counts: its functions are squares, which have no slope in its middle.

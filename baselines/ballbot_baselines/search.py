@@ -6,7 +6,7 @@ leads to a solution, the search starts from simulated recoveries (`righting.py`)
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -255,18 +255,40 @@ def _predicted_sides(
     return cost + prediction.costs[row_of], [np.column_stack([along[:, 0], prediction.y[row]]) for row in row_of]
 
 
-def likely_paths(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, free: np.ndarray, cost: float
-) -> list[np.ndarray]:
-    """The guessed path of every choice of sides that may be the best, the likeliest first.
-
-    From the states (n+1, 8) and the cost of the motion without obstacles.
+@dataclass(frozen=True)
+class LikelySides:
+    """Of B slaloms: every choice of sides that may be the best, the likeliest first, −1 or 1, (k, obstacles) of each; and the
+    control steps (B,) at which the last obstacle is passed.
     """
-    paths = task.guess_paths(x0, c, params)
-    predicted, _ = _predicted_sides(task, params, x0, c, paths, free, cost)
+
+    sides: list[np.ndarray]
+    passed: np.ndarray
+
+
+def likely_sides(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, free: np.ndarray, costs: np.ndarray
+) -> LikelySides:
+    """From the states (B, n+1, 8) and costs (B,) of the motions without obstacles of slaloms x0 (B, 8), c (B, nc)."""
     doubt = _GRIPPING_DOUBT if params.grips else _SIDE_DOUBT
-    order = np.argsort(predicted, kind="stable")
-    return [paths[i] for i in order if predicted[i] <= predicted.min() * (1 + doubt)]
+    found: list[np.ndarray] = [np.zeros((0, 0), int)] * len(c)
+    last = np.zeros(len(c), int)
+    obstacles = [np.asarray(task.passed_obstacles(each)) for each in c]
+    goals = np.array([task.reference(*episode, params).x[-1, :2] for episode in zip(x0, c, strict=True)])
+    across = x0[:, sides.ACROSS] - np.pad(goals[:, 1:], ((0, 0), (0, 3)))
+    along = np.array([guess.resampled(states[:, :1], task.steps)[:, 0] for states in free])
+    counts = np.array([len(each) for each in obstacles])
+    for count in np.unique(counts):
+        rows = np.flatnonzero(counts == count)
+        own = np.array([obstacles[i] for i in rows])
+        passed = np.abs(along[rows, :, None] - own[:, None, :, 0]).argmin(1)
+        own[..., 1] -= goals[rows, None, 1]
+        predicted = costs[rows, None] + sides.predict_costs(task, params, across[rows], own[..., 1:], passed)
+        choices = sides.choices(count)
+        for i, prices in zip(rows.tolist(), predicted, strict=True):
+            order = np.argsort(prices, kind="stable")
+            found[i] = choices[order[prices[order] <= prices.min() * (1 + doubt)]]
+        last[rows] = passed.max(1)
+    return LikelySides(found, last)
 
 
 def _on_coarse_grid(episode: Shooting, solved: list[Found]) -> list[Found]:

@@ -24,7 +24,8 @@ from ballbot_baselines.linearize import discretize, quadratic_cost
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
-_ACROSS = [1, 3, 5, 7]  # y, θ, ẏ, θ̇ in a state
+ACROSS = [1, 3, 5, 7]
+"""y, θ, ẏ, θ̇ in a state."""
 _REGULARIZATION = 1e-9  # of the kernel, m²: obstacles passed in the same control step
 
 
@@ -58,7 +59,7 @@ def predict(
     goal_y = task.reference(x0, c, params).x[-1, 1]
     model = _model(task, params)
     passed = np.array([int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]])
-    free = goal_y + model.free @ (np.asarray(x0)[_ACROSS] - [goal_y, 0, 0, 0])
+    free = goal_y + model.free @ (np.asarray(x0)[ACROSS] - [goal_y, 0, 0, 0])
     (prices,), (costs,) = _priced(model, passed[None], obstacles[None, :, 1:], free[passed][None])
     sides = choices(len(passed))
     return Prediction(sides, costs, free + (sides * prices) @ model.responses[passed] @ model.responses.T)
@@ -102,9 +103,9 @@ class _Model:
 def _model(task: Task, params: BallbotParams) -> _Model:
     dt, rest = task.control_dt, np.zeros((1, 8))
     a, b = (matrix[0] for matrix in discretize(params, rest, np.zeros((1, 2)), dt))
-    a, b = a[np.ix_(_ACROSS, _ACROSS)], b[_ACROSS, 1:]
+    a, b = a[np.ix_(ACROSS, ACROSS)], b[ACROSS, 1:]
     q, r = quadratic_cost(task, rest, np.zeros((1, 2)), np.zeros(len(task.constant_names)))
-    q, r = q[0][np.ix_(_ACROSS, _ACROSS)] * dt, r[0][1:, 1:] * dt
+    q, r = q[0][np.ix_(ACROSS, ACROSS)] * dt, r[0][1:, 1:] * dt
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     price = r + b.T @ p @ b
     closed = a - b @ np.linalg.solve(price, b.T @ p @ a)
