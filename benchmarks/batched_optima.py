@@ -22,7 +22,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation import fresh
 
 _ACCURATE = 1e-4  # relative
-_TURN = 40  # episodes that each solves before the other's turn
+_TURN = 200  # episodes that each solves before the other's turn: a set of certificates
 
 
 @dataclass(frozen=True)

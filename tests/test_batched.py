@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("casadi")
 
 from ballbot_baselines import batched
-from ballbot_baselines.optimum import find_optimum
-from ballbot_gym import dynamics, machine_code, ops
+from ballbot_baselines.optimum import FROM_BATCH, find_optimum
+from ballbot_gym import certified, dynamics, machine_code, ops
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
@@ -81,6 +81,27 @@ def test_they_cost_what_optima_one_by_one_cost_or_less(drawn):
     excess = (drawn.optima.costs / drawn.costs - 1)[drawn.optima.solved & np.isfinite(drawn.costs)]
     assert (excess < 1e-4).mean() > 0.9  # the others are other local optima
     assert excess.max() < 0.1
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_no_certified_optimum_costs_more(name, params):
+    known, task = certified.load(name, "paper"), TASKS[name]()
+    found = batched.find_optima(task, params, known.states, known.constants)
+    assert (found.costs[found.solved] > known.costs[found.solved] * (1 - 1e-4)).all()
+
+
+@pytest.mark.parametrize(("name", "episode"), [("stabilize", 79), ("turn", 37)])
+def test_a_second_search_finds_what_the_first_one_misses(name, episode, params):
+    known, task = certified.load(name, "paper"), TASKS[name]()
+    once, twice = (
+        find_optimum(task, params, known.states[episode], known.constants[episode], twice=twice)
+        for twice in (False, True)
+    )
+    assert once.cost > 1.01 * twice.cost
+    assert once.guess != twice.guess == FROM_BATCH
+    assert twice.is_optimal
+    assert twice.cost == pytest.approx(known.costs[episode], rel=1e-6)
+    assert twice.next_basin == pytest.approx(once.cost / twice.cost - 1, abs=1e-3)
 
 
 def test_they_are_episodes_of_the_closed_form_that_obey_every_constraint(drawn, params):

@@ -16,7 +16,7 @@ What remains unsolved is left to `find_optimum`. `benchmarks/batched_optima.py` 
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -45,12 +45,13 @@ _SIDES = tuple(
 )
 _ROUGH_SOLUTION = tuple(
     Options(bends=bends, width=width, multiplier=multiplier, tolerance=3e-6)
-    for bends, width, multiplier in ((1, 0.01, 3.0), (0, 0.01, 3.0), (3, 0.01, 3.0), (1, 0.02, 1.0))
+    for bends, width, multiplier in ((1, 0.02, 3.0), (0, 0.01, 3.0), (3, 0.01, 3.0), (1, 0.02, 1.0))
 )
 _SHIFTED = Options(bends=1, width=0.002, tolerance=3e-6)  # its multiplier is the least
-_SIDES_DOUBT = 0.005  # relative: how differently the coarse grid and rough solutions may order choices of sides
+_SIDES_DOUBT = 0.003  # relative: how differently the coarse grid and rough solutions may order choices of sides
 _SECONDS = 3.0  # optimized of a task that ends at rest
-_AFTER_SECONDS = 1.0  # optimized of a slalom after its last obstacle
+_AFTER_SECONDS = 0.6  # optimized of a slalom after its last obstacle
+_SHARED_SECONDS = 0.4  # horizons are multiples of these
 _AT_REST = 1e-5  # relative to an episode's cost: how wrong LQR's cost-to-go may be after these
 _SAME = 0.02  # m: rough solutions that are nowhere farther apart are the same
 _FEW = 16  # problems
@@ -435,17 +436,25 @@ class _Batch:
         likely = search.likely_sides(
             task, self._params, self._x0[solved], self._c[solved], free.x[solved], free.costs[solved]
         )
-        of = [i for i, chosen in zip(solved.tolist(), likely.sides, strict=True) for _ in chosen]
+        steps = np.full(len(solved), task.steps)
+        if self._solver.rest is not None:  # rounded up, so that many episodes share a horizon
+            shared = coarse * max(1, round(_SHARED_SECONDS / task.control_dt / coarse))
+            after = likely.passed + _AFTER_SECONDS / task.control_dt
+            steps = np.minimum(steps, np.ceil(after / shared).astype(int) * shared)
+        for some in np.unique(steps).tolist():
+            chosen = {int(solved[k]): likely.sides[k] for k in np.flatnonzero(steps == some)}
+            self._pass_obstacles(chosen, some)
+
+    def _pass_obstacles(self, likely: Mapping[int, np.ndarray], steps: int) -> None:
+        """The best of likely choices of sides (k, obstacles) of episodes, whose first control steps are optimized."""
+        task, coarse, rests = self._task, search.COARSE, steps < self._task.steps
+        of = [i for i, choices in likely.items() for _ in choices]
         paths = [
-            task.routed_path(self._x0[i], self._c[i], tuple(sides.tolist()))
-            for i, chosen in zip(solved.tolist(), likely.sides, strict=True)
-            for sides in chosen
+            task.routed_path(self._x0[i], self._c[i], tuple(chosen.tolist()))[: steps + 1]
+            for i, choices in likely.items()
+            for chosen in choices
         ]
-        steps = task.steps
-        if self._solver.rest is not None:
-            steps = min(steps, coarse * math.ceil((likely.passed.max() + _AFTER_SECONDS / task.control_dt) / coarse))
-        rests = steps < task.steps
-        along, sides = self._along(of, [path[: steps + 1] for path in paths], coarse), self._sides(of, paths)
+        along, sides = self._along(of, paths, coarse), self._sides(of, paths)
         rough = self._solve(along, _SIDES, coarse, chosen_sides=sides, then_rest=rests)
         chosen = _contenders(along.of, rough, _SIDES_DOUBT)
         if not len(chosen):
@@ -457,7 +466,7 @@ class _Batch:
         self._pass_later(near, found, rests)
         left = chosen[np.isinf(self._kept(near, found))]
         if len(left):
-            self._keep(self._along([of[i] for i in left], [paths[i][: steps + 1] for i in left]), _PATH)
+            self._keep(self._along([of[i] for i in left], [paths[i] for i in left]), _PATH)
 
     def _pass_later(self, guesses: _Guesses, found: Solutions, then_rest: bool) -> None:
         """Replaces the best solution of every episode by one that passes the obstacles a control step later or earlier, where

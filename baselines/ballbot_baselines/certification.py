@@ -71,7 +71,9 @@ def _solved(
     delay = randomization.moves_optima and drawn[5] > 0
     try:
         optimum = optimum_of(task, params, x0, c, randomization, drawn, guesses)
-        ideal = find_optimum(task, randomization.robot(params, drawn), x0, c, guesses=guesses) if delay else optimum
+        ideal = optimum
+        if delay:
+            ideal = find_optimum(task, randomization.robot(params, drawn), x0, c, guesses=guesses, twice=True)
     except PlanError as error:
         return {"episode": index, "error": str(error)}
     for found in (optimum, ideal):
@@ -127,7 +129,7 @@ def optimum_of(
         params = randomization.robot(params, drawn)
     delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
-        return find_optimum(task, params, x0, c, guesses=guesses)
+        return find_optimum(task, params, x0, c, guesses=guesses, twice=True)
     dt, none, states, cost = task.control_dt, np.zeros(2), [np.asarray(x0, np.float64)], 0.0
     for k in range(delay):
         began = task.at(c, k * dt)
@@ -142,7 +144,7 @@ def optimum_of(
         # only over an even number of steps are choices of sides compared
         longer = replace(task, duration=rest.duration + dt)
         paths = [find_optimum(longer, params, states[-1], c, guesses=guesses, start=start).trajectory.x[:-1, :2]]
-    found = find_optimum(rest, params, states[-1], c, guesses=guesses, paths=paths, start=start)
+    found = find_optimum(rest, params, states[-1], c, guesses=guesses, paths=paths, start=start, twice=True)
     x = np.concatenate([states[:-1], found.trajectory.x])
     u = np.concatenate([np.zeros((delay, 2)), found.trajectory.u])
     return replace(found, cost=cost + found.cost, trajectory=Trajectory(dt * np.arange(len(x)), x, u))
