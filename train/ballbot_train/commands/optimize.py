@@ -59,7 +59,7 @@ def optimize(
     env = BallbotEnv(problem, physics="rk4", params=params)
     options = {"constants": constants} | ({} if state is None else {"state": state})
     _, info = env.reset(seed=seed, options=options)
-    optimum = find_optimum(env.task, params, info["state"], info["constants"])
+    optimum = find_optimum(env.task, params, info["state"], info["constants"], twice=True)
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
     circles = figures.marker_circles(env.task.markers(info["constants"]))

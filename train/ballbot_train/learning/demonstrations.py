@@ -352,7 +352,7 @@ def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jo
 
 def _optimum(env: BallbotEnv, x: np.ndarray, c: np.ndarray) -> dict[str, Any]:
     try:
-        optimum = find_optimum(env.task, env.params, x, c)
+        optimum = find_optimum(env.task, env.params, x, c, twice=True)
     except PlanError as error:
         return {"optimum": math.nan, "solver_status": str(error), "violation": math.nan}
     return {

@@ -247,7 +247,7 @@ def _optimum_costs(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarr
     """(n + 1,) what the optimum has cost after each control step."""
     from ballbot_baselines import find_optimum
 
-    trajectory = find_optimum(task, params, x, c).trajectory
+    trajectory = find_optimum(task, params, x, c, twice=True).trajectory
     rates = task.cost(tuple(trajectory.x[:-1].T), tuple(trajectory.u.T), task.at(tuple(c), trajectory.t[:-1]))
     return np.concatenate([[0.0], np.cumsum(rates * task.control_dt)])
 
