@@ -53,7 +53,7 @@ def test_the_episodes_of_every_controller_are_the_certified_ones():
 
 def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path, monkeypatch):
     def run():
-        return benchmark.benchmark({"stabilize": ["lqr"]}, 4, "rk4", tmp_path, 1, lambda task, count: None)
+        return benchmark.benchmark({"stabilize": ["lqr"]}, 4, "rk4", tmp_path, 1)
 
     first = run()
     (path,) = tmp_path.rglob("*.jsonl")
@@ -69,7 +69,7 @@ def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_p
 
 def test_a_rerun_in_other_processes_gives_the_same_but_for_times(tmp_path):
     def rows(out, workers):
-        results = benchmark.benchmark({"stabilize": ["lqr"]}, 7, "rk4", out, workers, lambda task, count: None)
+        results = benchmark.benchmark({"stabilize": ["lqr"]}, 7, "rk4", out, workers)
         return [replace(row, plan_ms_median=0, step_us_median=0) for row in leaderboard(results)]
 
     assert rows(tmp_path / "a", 1) == rows(tmp_path / "b", 2)

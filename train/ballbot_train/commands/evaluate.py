@@ -213,9 +213,9 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
 def _certified(
     chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: Workers, robot: str
 ) -> None:
-    facts = open_run(out, chosen, workers, physics, 0, robot, episodes=episodes)
-    with progress_bars(dict.fromkeys(chosen, episodes)) as bars:
-        results = benchmark(chosen, episodes, physics, out, workers, bars.advance, robot=robot)
+    settings = {"physics": physics, "episodes": episodes}
+    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), 0, robot, **settings)
+    results = benchmark(chosen, episodes, physics, out, workers, robot=robot)
     rows = leaderboard(results)
     write_leaderboard(rows, results, facts, out)
     jobs.release(out)
