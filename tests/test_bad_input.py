@@ -526,7 +526,7 @@ EVALUATION = [
     (lambda f: evaluate(nothing, episodes=[200]), "indices of episodes must be 0 to 199, not 200"),
     (lambda f: evaluate(nothing, episodes=[0.5]), "indices of episodes must be whole numbers, not 0.5"),
     (lambda f: evaluate(nothing, episodes=itertools.count()), "names more than the 200 episodes"),
-    (lambda f: training.score(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
+    (lambda f: training.score_and_validate(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
     (lambda f: evaluate(nothing, randomization=3), "randomization must be a Randomization"),
     (lambda f: evaluate(None), "None is no policy: give a Controller"),
     (lambda f: evaluate("pid"), "unknown controller 'pid'"),
