@@ -23,8 +23,8 @@ from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_l
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
-from ballbot_train.report.replay import certified_replay
-from ballbot_train.report.sections import leaderboard_sections
+from ballbot_train.report.playground import playground_page
+from ballbot_train.report.replay import certified_replay, replay_of
 
 
 def benchmark(
@@ -67,9 +67,10 @@ def benchmark(
     regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
     table = [cells(row) for row in rows]
-    sections = leaderboard_sections(HEADER, table, done, chosen, regrets, pictures, physics, robot)
+    replays = [replay_of(task, names, done, physics, robot) for task, names in chosen.items()]
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
-    page = write_report(title, sections, facts, out / "report.html")
+    shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
+    page = write_report(out / "report.html", title, HEADER, table, replays, playground_page(), shown, facts)
     publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
     for result in done:
         if result.note:
