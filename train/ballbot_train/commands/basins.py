@@ -5,7 +5,7 @@ from pathlib import Path
 from ballbot_gym.robots import PAPER
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table, progress_bars
+from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table
 from ballbot_train.evaluation import basins as maps
 from ballbot_train.evaluation.benchmark import controllers_of, open_run, policy_digests
 from ballbot_train.executors import Workers
@@ -36,10 +36,7 @@ def basins(
     physics = physics_or_default(physics)
     names = chosen[maps.TASK]
     facts = open_run(out, chosen, workers, policy_digests(chosen, robot), robot=robot, physics=physics, points=points)
-    with progress_bars({maps.BOUNDARY: len(maps.AXES)}) as bars:
-        bounds = maps.boundaries(out, workers, bars.advance, robot)
-        bars.add(maps.states_to_run(bounds, names, points, physics))
-        made = maps.run(bounds, names, points, physics, out, workers, bars.advance, robot)
+    made = maps.run(names, points, physics, out, workers, robot)
     maps.write(made, facts, out)
     picture = figures.save(figures.basin_figure(made), out / "basins.png")
     jobs.release(out)

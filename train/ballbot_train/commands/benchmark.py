@@ -12,13 +12,13 @@ from ballbot_train.console import Physics, RobotName, console, physics_or_defaul
 from ballbot_train.evaluation import optima, robustness, tracks
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import (
-    checked_episodes,
     controllers_of,
     open_run,
     policy_digests,
     publish,
     run_groups,
 )
+from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures

@@ -9,13 +9,13 @@ from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
 from ballbot_train.evaluation import robustness as stressed
 from ballbot_train.evaluation.benchmark import (
-    checked_episodes,
     controllers_of,
     open_run,
     policy_digests,
     publish,
     run_groups,
 )
+from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures

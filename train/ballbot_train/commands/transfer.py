@@ -11,7 +11,8 @@ from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default, print_table
 from ballbot_train.evaluation import agreement
 from ballbot_train.evaluation import transfer as matrix
-from ballbot_train.evaluation.benchmark import checked_episodes, open_run, policy_digests, publish, run_groups
+from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish, run_groups
+from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures

@@ -136,13 +136,6 @@ def publish(out: Path, name: str, title: str, header: Sequence[str], table: Sequ
     print_table(title, header, table)
 
 
-def checked_episodes(episodes: int) -> int:
-    """A number of certified episodes; raises a ValueError where there are not so many."""
-    if not 1 <= episodes <= certified.EPISODES:
-        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
-    return episodes
-
-
 @dataclass(frozen=True)
 class Group:
     """One controller on the certified episodes of a task, in one world."""
