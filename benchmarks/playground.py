@@ -5,8 +5,8 @@
 NMPC runs beside a ghost, is pushed every few seconds, and a page that somebody watches is drawn 30 times per second. Run it
 on a quiet machine. Controllers are made, and solvers compiled, before time counts. As in `ballbot play` another process plans
 the next episode every 8 s, and that counts. Beside it, a loop that does nothing but wait counts how often the machine itself
-is late. Memory is that of both processes of the playground. Its growth is counted from the first minute on, because plots and
-traces are full by then. Exit status 1 says that the real-time factor is below 0.99, that more than 0.1 % of the steps began
+is late. Memory is that of both processes of the playground. Its growth is counted from the first minute on, because traces
+are full by then. Exit status 1 says that the real-time factor is below 0.99, that more than 0.1 % of the steps began
 later than 20 ms after their time, or that memory grew by more than `--growth` MiB.
 """
 
@@ -103,7 +103,7 @@ def measure(
     """
     playground = Playground(task, controller, ghosts, physics, episode=0, other_process=True)
     viewer = Viewer(port=0)
-    page = PlayPage(playground, viewer, out)
+    page = PlayPage(playground, viewer)
     page.visitors.add(-1)  # `watch` does not say where its camera is, so viser does not count it
     watcher = multiprocessing.get_context("spawn").Process(target=watch, args=(viewer.port,), daemon=True)
     watcher.start()

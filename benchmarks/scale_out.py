@@ -185,7 +185,7 @@ def certified_set(out: Path, workers: Workers, episodes: int) -> dict[str, np.nd
 
 def leaderboard(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
     controllers = {task: ["lqr"] for task in ("stabilize", "turn")}
-    done = benchmark(controllers, episodes // 2, "rk4", out, workers, lambda task, count: None)
+    done = benchmark(controllers, episodes // 2, "rk4", out, workers)
     return {
         name: np.array([getattr(row, name) for row in done])
         for name in ("cost", "optimum", "success", "failure", "settle_time")

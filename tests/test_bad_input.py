@@ -521,12 +521,9 @@ def nothing(observation):
 
 
 EVALUATION = [
-    (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, or a list of indices, not 0"),
-    (lambda f: evaluate(nothing, episodes=[0, 0]), "names an episode twice; give each once"),
-    (lambda f: evaluate(nothing, episodes=[200]), "indices of episodes must be 0 to 199, not 200"),
-    (lambda f: evaluate(nothing, episodes=[0.5]), "indices of episodes must be whole numbers, not 0.5"),
-    (lambda f: evaluate(nothing, episodes=itertools.count()), "names more than the 200 episodes"),
-    (lambda f: training.score(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
+    (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, not 0"),
+    (lambda f: evaluate(nothing, episodes=[0]), "episodes must be a number of episodes, not"),
+    (lambda f: training.score_and_validate(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
     (lambda f: evaluate(nothing, randomization=3), "randomization must be a Randomization"),
     (lambda f: evaluate(None), "None is no policy: give a Controller"),
     (lambda f: evaluate("pid"), "unknown controller 'pid'"),
@@ -590,7 +587,6 @@ TYPED = [
     ("train shac --demos x", "shac uses no demonstrations"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),
     ("train dagger --gathering-iterations 0", "gathering_iterations 0 needs demonstrations: give --demos"),
-    ("evaluate shac --bins 0", "bins must be at least 1, not 0"),
     ("evaluate shac --fresh 0", "nothing to run: give --fresh or --episodes"),
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),

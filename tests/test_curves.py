@@ -132,7 +132,8 @@ def test_a_queue_trains_each_seed_in_a_folder_of_its_own_and_does_only_what_is_m
 
 
 def test_a_seed_that_fails_everywhere_is_the_worst():
-    trained = [seeds.Trained(seed, 0.5, 3, regret, 1.0) for seed, regret in enumerate((0.2, float("nan"), 0.1))]
+    reached = {"success": 0.5, "failures": 3, "minutes": 1.0}
+    trained = [reached | {"regret_mean": regret} for regret in (0.2, float("nan"), 0.1)]
     middle, worst = seeds.middle_and_worst(trained)
     assert (middle["regret_mean"], worst["regret_mean"]) == (0.2, float("inf"))
 

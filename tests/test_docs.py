@@ -65,8 +65,8 @@ def test_commands_run(page, typed, monkeypatch):
     monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: MEASURED_AS)
     monkeypatch.setattr(model_free, "_CLONE_ITERATIONS", 1)
-    monkeypatch.setattr("ballbot_train.report.sections.playground_section", lambda *given: None)  # a second per report
-    monkeypatch.setattr("ballbot_train.commands.benchmark.checked_episodes", lambda *given, few: 2)
+    monkeypatch.setattr("ballbot_train.commands.benchmark.playground_page", lambda: "")  # a second per report
+    monkeypatch.setattr("ballbot_train.commands.benchmark.checked_episodes", lambda episodes: 2)
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():
         command = shlex.split(line, comments=True)

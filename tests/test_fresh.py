@@ -102,8 +102,8 @@ def test_every_way_to_give_a_policy_gives_the_same_result(turns):
 
 
 def test_bins_hold_every_episode_once(turns):
-    bins = turns.bins(7)
-    assert len(bins) == 7
+    bins = turns.bins()
+    assert len(bins) == 4
     assert sum(entry.episodes for entry in bins) == len(turns)
     assert sum(entry.failures for entry in bins) == turns.failure.sum()
     assert np.dot([e.episodes for e in bins], [e.cost_mean for e in bins]) == pytest.approx(turns.costs.sum())
@@ -139,16 +139,16 @@ def test_regret_on_fresh_episodes_is_found_once_and_is_not_negative(tmp_path, mo
 
 def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    evaluate("dagger", task="turn", fresh=60, bins=5, episodes=1, physics="rk4", workers=1)
+    evaluate("dagger", task="turn", fresh=60, episodes=1, physics="rk4", workers=1)
     out = tmp_path / "runs" / "evaluate" / "turn-dagger"
     document = json.loads((out / "fresh.json").read_text())
     assert document["summary"][0]["episodes"] == 60
-    assert len(document["bins"]) == 5
+    assert len(document["bins"]) == 4
     assert document["about"]["policies"].keys() == {"turn/dagger"}
     worst = document["worst"][0]
     file = worst["replay"].removeprefix("ballbot replay ")
     np.testing.assert_allclose(Trajectory.load(file).x[0], worst["start"])
-    for name, lines in (("bins", 5), ("worst", 10), ("fresh", 60)):
+    for name, lines in (("bins", 4), ("worst", 10), ("fresh", 60)):
         with (out / f"{name}.csv").open() as opened:
             assert len(list(csv.DictReader(opened))) == lines
     assert (out / "fresh.png").exists()
@@ -167,6 +167,6 @@ def test_what_does_not_act_is_refused():
 
 def test_validation_prices_an_episode_without_success_as_failing_at_once():
     task = TASKS["stabilize"]()
-    validation = training.validate(idle, task)
+    _, validation = training.score_and_validate(idle, task)
     assert validation.success == 0
     assert validation.cost >= task.survival_pay

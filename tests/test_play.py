@@ -254,8 +254,7 @@ def saved_model(tmp_path):
 
 
 def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_model):
-    playground = play(policies=[saved_model])
-    assert saved_model in playground.controllers
+    playground = play()
     playground.set_controller(saved_model)
     playground.settle()
     go(playground, 0.04)
@@ -263,6 +262,8 @@ def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_m
     assert playground.crew.notice == ""
     playground.set_task("orbit")  # its observations are others
     assert saved_model not in playground.controllers
+    playground.set_task("stabilize")
+    assert saved_model in playground.controllers
 
 
 def test_a_controller_that_fails_gives_no_force_and_is_named(play):

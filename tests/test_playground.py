@@ -115,30 +115,6 @@ def test_the_optimum_drives_along_its_trajectory_and_costs_what_is_certified(eng
         assert run["costs"][-1] == pytest.approx(episodes.costs[run["episode"]], rel=1e-6)
 
 
-HASHES = [
-    "",
-    "#",
-    "#turn-1",
-    "#turn-1-2",
-    "#turn-199-2.0",
-    "#dance-1-2.0",
-    "#turn-1-2.0<b>",
-    "#turn-1-NaN",
-    "#turn-01-2.0x",
-]
-
-
-def test_a_link_holds_task_episode_and_score_and_any_other_is_none(engine, tmp_path):
-    script = f"""
-    const scenario = DATA.scenarios.find(({{ task }}) => task === "turn");
-    answer([challengeText(scenario, 12.345), {json.dumps(HASHES)}.map(challengeOf), challengeOf("#turn-1-12.3")]);
-    """
-    text, others, challenge = run_in_node(engine + script, tmp_path)
-    assert text == "turn-1-12.3"
-    assert others == [None] * len(HASHES)
-    assert challenge["regret"] == 12.3
-
-
 def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng):
     torch.manual_seed(0)
     task = make_task("stabilize")
@@ -331,26 +307,11 @@ def said(browser):
     return browser.find_element("css selector", ".said").text
 
 
-def test_who_drives_an_episode_gets_a_regret_and_a_link_that_invites_others(opened):
+def test_who_drives_an_episode_gets_a_regret(opened):
     opened.find_element("css selector", ".drive").click()  # from Push, which has no optimum, to Throw
     opened.execute_script("playground.setPlaying(false)")
     drive(opened)
-    regret = float(re.fullmatch(r"Your regret is ([\d.]+) %. The policy's: [\d.]+ %.", said(opened))[1])
-    assert regret > 0
-    opened.find_element("css selector", ".share").click()
-    link = opened.find_element("css selector", ".link").get_property("value")
-    assert link.endswith(f"#stabilize-7-{regret:.1f}")
-    opened.get("about:blank")
-    opened.get(link)
-    assert said(opened) == f"Somebody drove this episode with a regret of {regret:.1f} %. Press Play and beat it."
-    assert opened.execute_script("return playground.driver !== null && !playground.playing")
-
-
-def test_a_strangers_link_is_text_that_is_thrown_away(browser, page):
-    browser.get("about:blank")
-    browser.get(page.as_uri() + "#turn-1-2.0<img src=x onerror=document.title='x'>")
-    assert said(browser) == "This link names no episode of this page."
-    assert browser.execute_script("return document.querySelectorAll('img').length") == 0
+    assert float(re.fullmatch(r"Your regret is ([\d.]+) %. The policy's: [\d.]+ %.", said(opened))[1]) > 0
 
 
 STEERED = """
@@ -373,13 +334,6 @@ return found
 
 def test_keys_and_a_drag_hold_the_stick_as_long_as_they_are_held(opened):
     assert opened.execute_script(STEERED) == pytest.approx([1, 1, 0, 0] * 3, abs=1e-6)
-
-
-def wait_for(browser, condition, seconds=20):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, said(browser)
-        time.sleep(0.05)
 
 
 def test_everything_that_can_be_used_has_a_name(opened):

@@ -50,7 +50,7 @@ def certified_sets(out, workers):
 
 
 def results(out, workers):
-    done = benchmark({"stabilize": ["lqr"], "turn": ["lqr"]}, 12, "rk4", out, workers, lambda task, count: None)
+    done = benchmark({"stabilize": ["lqr"], "turn": ["lqr"]}, 12, "rk4", out, workers)
     times = {"plan_seconds", "step_seconds"}
     return {
         f"{row.task}-{row.episode}": np.array([str(value) for name, value in vars(row).items() if name not in times])

@@ -8,22 +8,14 @@ import numpy as np
 import pytest
 from browser import start_chromium
 from builders import result
-from markupsafe import Markup
 
 from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
 from ballbot_train.report.film import write_film
-from ballbot_train.report.page import (
-    Section,
-    pictures_section,
-    replay_section,
-    table_section,
-    write_report,
-)
-from ballbot_train.report.replay import Replay, Take
-from ballbot_train.report.sections import replay_of
+from ballbot_train.report.page import write_report
+from ballbot_train.report.replay import Replay, Take, replay_of
 
 HEADER = ["task", "controller", "regret", "falls"]
 ROWS = [
@@ -53,13 +45,8 @@ def page(tmp_path_factory):
     replays = [Replay("first", takes, markers), Replay("second", takes[1:])]
     curve = figures.Curve("a", leaning(0.3, 1.0), "#1f6fb2")
     picture = figures.save(figures.trajectory_figure("a figure", [curve]), folder / "pictures" / "some-figure.png")
-    sections = [
-        table_section("Leaderboard", HEADER, ROWS),
-        replay_section("Watch", replays),
-        pictures_section("Pictures", [picture]),
-        pictures_section("Nothing", []),
-    ]
-    return write_report("A <title>", sections, {"commit": "abc"}, folder / "report.html")
+    pictures = {"Pictures": [picture], "Nothing": []}
+    return write_report(folder / "report.html", "A <title>", HEADER, ROWS, replays, "", pictures, {"commit": "abc"})
 
 
 def test_the_page_holds_everything_it_shows(page):
@@ -70,22 +57,20 @@ def test_the_page_holds_everything_it_shows(page):
     assert [source for source in sources if not source.startswith(("data:", "#"))] == []
 
 
-def test_what_has_no_data_has_no_section(page):
+def test_what_has_no_data_has_no_section(page, tmp_path):
     assert "Nothing" not in page.read_text()
-    assert pictures_section("a", []) is replay_section("b", []) is None
+    assert "Push them" not in page.read_text()
+    empty = write_report(tmp_path / "report.html", "t", HEADER, ROWS, [Replay("r", ())], "<p>", {}, {}).read_text()
+    assert "Watch an episode" not in empty
+    assert 'srcdoc="&lt;p&gt;"' in empty
 
 
 def test_words_are_text_and_not_markup(tmp_path):
-    sections = [
-        table_section("<b>", ["<i>"], [["<u>"]]),
-        Section("body", Markup("<em>kept</em>"), lead="<s>"),
-        Section("text", "<h8>"),
-        replay_section("r", [Replay("</script>", (Take("<q>", leaning(0.1, 0.1), "red"),))]),
-    ]
-    text = write_report("<h9>", sections, {"<p9>": "<p8>"}, tmp_path / "report.html").read_text()
+    replays = [Replay("</script>", (Take("<q>", leaning(0.1, 0.1), "red"),))]
+    path = write_report(tmp_path / "r.html", "<h9>", ["<i>"], [["<u>"]], replays, "<s>", {}, {"<p9>": "<p8>"})
+    text = path.read_text()
     text = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)  # less the page's own scripts
     assert not re.search("<(b|i|u|s|q|h8|h9|p9|p8)>", text)
-    assert "<em>kept</em>" in text
     assert '"title":"\\u003c/script\\u003e"' in text
 
 
@@ -94,12 +79,10 @@ def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
     picture = figures.save(
         figures.trajectory_figure("t", [figures.Curve("a", leaning(0.1, 0.1), "red")]), tmp_path / "'a\"&.png"
     )
-    sections = [
-        table_section(name, [name], [[name, name]], lead=name),
-        replay_section(name, [Replay(name, (Take(name, leaning(0.1, 0.1), "red", note=name),))]),
-        pictures_section(name, [picture]),
-    ]
-    text = write_report(name, sections, {name: name}, tmp_path / "report.html").read_text()
+    replays = [Replay(name, (Take(name, leaning(0.1, 0.1), "red", note=name),))]
+    table, pictures = ([name], [[name, name]]), {name: [picture]}
+    path = write_report(tmp_path / "r.html", name, *table, replays, name, pictures, {name: name})
+    text = path.read_text()
     assert "alert" in text
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(&#39;&#34;a&#34; &amp; b&#39;)&lt;/script&gt;" in text

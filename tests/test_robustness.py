@@ -22,11 +22,14 @@ def test_severity_0_is_no_disturbance_and_every_level_is_one(name):
         assert stress.at(level).active
 
 
+def run(stress, episodes, out, seed=0):
+    groups = robustness.groups_of({"stabilize": ["lqr"]}, robustness.conditions([stress]), "rk4")
+    return benchmark.run_groups(groups, episodes, out, 1, robustness.StressResult, seed)
+
+
 def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
-    results = robustness.run(
-        {"stabilize": ["lqr"]}, robustness.conditions(["delay"]), 3, "rk4", tmp_path, 1, lambda name, count: None
-    )
-    plain = benchmark.benchmark({"stabilize": ["lqr"]}, 3, "rk4", tmp_path / "plain", 1, lambda name, count: None)
+    results = run("delay", 3, tmp_path)
+    plain = benchmark.benchmark({"stabilize": ["lqr"]}, 3, "rk4", tmp_path / "plain", 1)
     rows = rows_of(results, robustness.StressRow, "stress", "level")
     assert [(row.stress, row.level) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == summarize(plain).cost_mean
@@ -36,9 +39,7 @@ def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
 
 def test_the_same_seed_draws_the_same_pushes(tmp_path):
     def costs(name, seed):
-        pushes = robustness.conditions(["push"])
-        results = robustness.run({"stabilize": ["lqr"]}, pushes, 1, "rk4", tmp_path / name, 1, lambda *_: None, seed)
-        return [result.cost for result in results]
+        return [result.cost for result in run("push", 1, tmp_path / name, seed)]
 
     first, again, other = costs("a", 0), costs("b", 0), costs("c", 1)
     assert first == again

@@ -41,11 +41,11 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     task, params = TASKS["stabilize"](), default_params()
     config = replace(LEARNERS["shac"].settings("stabilize"), iterations=10, num_envs=32, horizon=20, hidden=(32,))
     learner = shac.Shac(task, params, config)
-    before = training.score(learner.network, task)
+    before = training.score_and_validate(learner.network, task)[0]
     assert before.success > 0.5  # LQR within the limits of tanh
     for _ in range(config.iterations):
         learner.iterate()
-    assert training.score(learner.network, task).cost_ratio < 0.7 * before.cost_ratio
+    assert training.score_and_validate(learner.network, task)[0].cost_ratio < 0.7 * before.cost_ratio
 
 
 def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():

@@ -8,21 +8,23 @@ import pytest
 
 pytest.importorskip("optuna")
 
+from optuna.distributions import CategoricalDistribution as Categorical
+from optuna.distributions import FloatDistribution as Float
+
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.tune import tune
 from ballbot_train.learning import tuning
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.learning.training import Score, Validation
-from ballbot_train.learning.tuning import SPACES, Choice, Outcome, Range, Search, settings_of, zoo_yaml
+from ballbot_train.learning.tuning import SPACES, Search, encoded, settings_of, zoo_yaml
 
 
 @pytest.mark.parametrize("learner", SPACES)
 @pytest.mark.parametrize("task", TASKS)
 def test_the_tuned_settings_lie_in_the_space_that_is_searched(learner, task):
-    settings = LEARNERS[learner].settings(task)
-    for name, domain in SPACES[learner].items():
-        value = getattr(settings, name)
-        inside = domain.low <= value <= domain.high if isinstance(domain, Range) else value in domain.values
+    for name, value in encoded(SPACES[learner], LEARNERS[learner].settings(task)).items():
+        domain = SPACES[learner][name]
+        inside = domain.low <= value <= domain.high if isinstance(domain, Float) else value in domain.choices
         assert inside, (name, value)
 
 
@@ -59,11 +61,13 @@ def fakes(monkeypatch):
             raise ValueError("not finite")
         return Fake(settings, seed)
 
+    def measured(network, task, robot):
+        return Score(network, 0.1, 0.1, 0.1, 1.0, 0), Validation(network, 1.0, 0, network)
+
     monkeypatch.setattr(type(LEARNERS["ppo"]), "make", make)
-    monkeypatch.setattr(tuning.training, "validate", lambda network, task, robot: Validation(network, 1.0, 0, network))
-    monkeypatch.setattr(tuning.training, "score", lambda network, task, robot: Score(network, 0.1, 0.1, 0.1, 1.0, 0))
-    space = {"learning_rate": Range(1e-4, 5e-3), "batch_size": Choice((512, 3072, 2048))}
-    space["hidden"] = Choice(((64, 64), (128, 128)))
+    monkeypatch.setattr(tuning.training, "score_and_validate", measured)
+    space = {"learning_rate": Float(1e-4, 5e-3, log=True), "batch_size": Categorical((512, 3072, 2048))}
+    space["hidden"] = Categorical(("[64, 64]", "[128, 128]"))
     monkeypatch.setitem(tuning.SPACES, "ppo", space)
     monkeypatch.setattr(tuning, "_STARTUP_TRIALS", 2)
     return made
@@ -154,5 +158,4 @@ def test_real_trainings_have_an_outcome_per_seed():
     search = Search("ppo", "stabilize", (0, 1), 32, 1, "rolling")
     cost, outcome = tuning.outcome_of(search, settings_of(search, tiny))
     assert isinstance(cost, float)
-    assert isinstance(outcome, Outcome)
-    assert len(set(outcome.costs)) == 2
+    assert len(set(outcome["costs"])) == 2

@@ -5,9 +5,9 @@ from pathlib import Path
 from ballbot_gym.robots import PAPER
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table, progress_bars
+from ballbot_train.console import Physics, RobotName, console, physics_or_default, print_table
 from ballbot_train.evaluation import basins as maps
-from ballbot_train.evaluation.benchmark import controllers_of, open_run
+from ballbot_train.evaluation.benchmark import controllers_of, open_run, policy_digests
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 
@@ -15,7 +15,6 @@ from ballbot_train.report import figures
 def basins(
     controllers: tuple[str, ...] = (),
     points: int = 21,
-    quick: bool = False,
     physics: Physics | None = None,
     out: Path = Path("runs/basins"),
     workers: WorkersOption = Workers(),
@@ -26,23 +25,18 @@ def basins(
     Args:
         controllers: as of `ballbot benchmark`.
         points: along each axis of a map; odd.
-        quick: only 9 points.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         out: folder of basins.json, basins.csv and basins.png; an interrupted run continues here.
         workers: who does the work.
         robot: whose limits and controllers.
     """
-    points = min(points, 9) if quick else points
     if not 3 <= points <= 501 or points % 2 == 0:
         raise ValueError(f"points must be odd, and 3 to 501, not {points}")
     chosen = controllers_of([maps.TASK], controllers, robot)
     physics = physics_or_default(physics)
     names = chosen[maps.TASK]
-    facts = open_run(out, chosen, workers, physics, robot=robot, points=points)
-    with progress_bars({maps.BOUNDARY: len(maps.AXES)}) as bars:
-        bounds = maps.boundaries(out, workers, bars.advance, robot)
-        bars.add(maps.states_to_run(bounds, names, points, physics))
-        made = maps.run(bounds, names, points, physics, out, workers, bars.advance, robot)
+    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), robot=robot, physics=physics, points=points)
+    made = maps.run(names, points, physics, out, workers, robot)
     maps.write(made, facts, out)
     picture = figures.save(figures.basin_figure(made), out / "basins.png")
     jobs.release(out)

@@ -2,29 +2,35 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from ballbot_gym import certified, files
+from ballbot_gym import certified
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, console, markdown, physics_or_default, print_table, progress_bars
-from ballbot_train.evaluation import robustness, tracks
+from ballbot_train.console import Physics, RobotName, console, physics_or_default
+from ballbot_train.evaluation import optima, robustness, tracks
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
-from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.evaluation.benchmark import (
+    controllers_of,
+    open_run,
+    policy_digests,
+    publish,
+    run_groups,
+)
+from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
-from ballbot_train.report.replay import certified_replay
-from ballbot_train.report.sections import leaderboard_sections
+from ballbot_train.report.playground import playground_page
+from ballbot_train.report.replay import certified_replay, replay_of
 
 
 def benchmark(
     tasks: tuple[str, ...] = tuple(TASKS),
     controllers: tuple[str, ...] = (),
     episodes: int = certified.EPISODES,
-    quick: bool = False,
     physics: Physics | None = None,
     seed: int = 0,
     out: Path = Path("runs/benchmark"),
@@ -39,7 +45,6 @@ def benchmark(
         controllers: names of experts and policies, or files of policies; default all experts and all policies that come
             with the package. A policy is run on the task it was made for.
         episodes: how many of each task's certified episodes.
-        quick: only 8 episodes of each task.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of the bootstrap intervals, and of whatever an episode draws.
         out: folder of the results; an interrupted run continues here.
@@ -49,26 +54,24 @@ def benchmark(
             controllers. Then the result is one table of controllers by tracks, with the parts of their regret; by default
             with the experts that are made for each track.
     """
-    if randomization:
-        _benchmark_tracks(tasks, controllers, episodes, quick, physics, seed, out, workers, robot, randomization)
-        return
-    chosen = controllers_of(tasks, controllers, robot)
+    chosen = controllers_of(tasks, controllers, robot, tracks=bool(randomization))
     physics = physics_or_default(physics)
-    episodes = checked_episodes(episodes, quick, few=8)
-    facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
-    with progress_bars({task: episodes * len(group) for task, group in chosen.items()}) as bars:
-        done = run_benchmark(chosen, episodes, physics, out, workers, bars.advance, seed, robot)
+    settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes)}
+    if randomization:
+        _benchmark_tracks(chosen, not controllers, seed, out, workers, robot, randomization, **settings)
+        return
+    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
+    done = run_benchmark(chosen, episodes, physics, out, workers, seed, robot)
     rows = leaderboard(done, seed)
     write_leaderboard(rows, done, facts, out)
     regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
     table = [cells(row) for row in rows]
-    files.write(out / "leaderboard.md", markdown(HEADER, table))
-    sections = leaderboard_sections(HEADER, table, done, chosen, regrets, pictures, physics, robot)
+    replays = [replay_of(task, names, done, physics, robot) for task, names in chosen.items()]
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
-    page = write_report(title, sections, facts, out / "report.html")
-    jobs.release(out)
-    print_table(f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
+    shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
+    page = write_report(out / "report.html", title, HEADER, table, replays, playground_page(), shown, facts)
+    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")
@@ -76,31 +79,30 @@ def benchmark(
 
 
 def _benchmark_tracks(
-    tasks: Sequence[str],
-    controllers: Sequence[str],
-    episodes: int,
-    quick: bool,
-    physics: Physics | None,
+    chosen: dict[str, list[str]],
+    with_experts: bool,
     seed: int,
     out: Path,
     workers: Workers,
     robot: str,
     names: Sequence[str],
+    physics: str,
+    episodes: int,
 ) -> None:
-    wanted, chosen = tracks.conditions(names), controllers_of(tasks, controllers, robot, tracks=True)
-    if not controllers:
+    wanted = tracks.conditions(names)
+    if with_experts:
         chosen, wanted = tracks.with_experts(chosen, wanted)
-    physics, episodes = physics_or_default(physics), checked_episodes(episodes, quick, few=8)
-    facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes, tracks=list(names))
-    tracks.find_optima(list(chosen), names, episodes, robot, workers)
-    with progress_bars(robustness.episodes_to_run(chosen, wanted, episodes)) as bars:
-        results = robustness.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
+    settings = {"physics": physics, "episodes": episodes, "tracks": list(names)}
+    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
+    for task in chosen:
+        for condition in wanted:
+            optima.known(task, robot, range(episodes), workers, condition.randomization)
+    groups = robustness.groups_of(chosen, wanted, physics, robot)
+    results = run_groups(groups, episodes, out, workers, robustness.StressResult, seed)
     rows = tracks.rows_of(results, robot, seed)
     write_results("tracks", rows, results, facts, out)
-    table = [tracks.cells(row) for row in rows]
-    files.write(out / "tracks.md", markdown(tracks.HEADER, table))
-    jobs.release(out)
-    print_table(f"{episodes} certified episodes per task and track, physics={physics}", tracks.HEADER, table)
+    title = f"{episodes} certified episodes per task and track, physics={physics}"
+    publish(out, "tracks", title, tracks.HEADER, [tracks.cells(row) for row in rows])
 
 
 def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path, robot: str) -> Path:

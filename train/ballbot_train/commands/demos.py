@@ -28,7 +28,6 @@ def demos(
     out: Path | None = None,
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
-    optima: bool = True,
 ) -> None:
     """Records episodes of an expert with exploration as a Minari dataset; a killed run continues when started again.
 
@@ -48,12 +47,10 @@ def demos(
         out: folder of the dataset, named NAME-vNUMBER; default runs/demos/TASK-EXPERT-v0.
         workers: who does the work.
         robot: the robot that is shown.
-        optima: whether each episode's optimum is searched too. Learners do not need it, and for a policy as expert it takes
-            most of the time.
     """
     check_names("task", [task], TASKS)
     physics = physics_or_default(physics)
-    config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed, robot, optima)
+    config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed, robot)
     kind = file_name(task, robot)
     named = out
     out = Path("runs") / "demos" / f"{kind}-{expert}-v0" if out is None else out

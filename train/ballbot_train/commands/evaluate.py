@@ -31,7 +31,6 @@ from ballbot_train.provenance import provenance
 
 _FRESH = 10_000
 _WORST = 10
-_MOST_BINS = 10_000
 _SHOWN_BINS = 6
 _FULL_BIN = 20  # episodes from which a bin is called weak
 
@@ -42,7 +41,6 @@ def evaluate(
     task: str | None = None,
     fresh: int | None = None,
     seed: int = 0,
-    bins: int | None = None,
     optima: int = 0,
     episodes: int = 0,
     physics: Physics | None = None,
@@ -61,7 +59,6 @@ def evaluate(
         fresh: how many fresh episodes, in the batched closed-form model; default 10000, or none where --episodes is given.
             They are never the certified ones.
         seed: of the fresh episodes.
-        bins: ranges into which each quantity is divided; default one per 125 episodes, 4 to 80.
         optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
             folder `optima` beside --out, for later calls and other policies.
         episodes: how many of the certified episodes to run in PyBullet.
@@ -79,10 +76,7 @@ def evaluate(
     task = task_name(policy, task, robot)
     chosen = controllers_of([task], [policy], robot)
     check_least(0, seed=seed, optima=optima, episodes=episodes)
-    check_least(1, **({} if bins is None else {"bins": bins}))
     Workers.of(workers)
-    if bins is not None and bins > _MOST_BINS:
-        raise ValueError(f"bins must be at most {_MOST_BINS}, not {bins}")
     if episodes > certified.EPISODES:
         raise ValueError(f"episodes must be at most {certified.EPISODES}, the certified ones, not {episodes}")
     fresh = (0 if episodes else _FRESH) if fresh is None else fresh
@@ -99,7 +93,7 @@ def evaluate(
     named = f"{task}-{Path(policy).stem}" + (f"-on-{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
     if fresh:
-        _fresh(policy, task, fresh, seed, bins, optima, out, workers, robot, varied)
+        _fresh(policy, task, fresh, seed, optima, out, workers, robot, varied)
     if episodes:
         _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers, robot)
 
@@ -109,7 +103,6 @@ def _fresh(
     task: str,
     episodes: int,
     seed: int,
-    count: int | None,
     optima: int,
     out: Path,
     workers: Workers,
@@ -139,7 +132,7 @@ def _fresh(
             folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
             found = fresh.find_optima(task, optima, seed, folder, workers, bars.advance, robot, varied)
         result = replace(result, optima=found)
-    binned = result.bins(count)
+    binned = result.bins()
     worst = _worst(result, policy, task, out / "worst", robot, varied)
     fresh.write(result, binned, worst, facts, out)
     picture = figures.save(figures.fresh_figure(result, binned), out / "fresh.png")
@@ -213,9 +206,9 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
 def _certified(
     chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: Workers, robot: str
 ) -> None:
-    facts = open_run(out, chosen, workers, physics, 0, robot, episodes=episodes)
-    with progress_bars(dict.fromkeys(chosen, episodes)) as bars:
-        results = benchmark(chosen, episodes, physics, out, workers, bars.advance, robot=robot)
+    settings = {"physics": physics, "episodes": episodes}
+    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), 0, robot, **settings)
+    results = benchmark(chosen, episodes, physics, out, workers, robot=robot)
     rows = leaderboard(results)
     write_leaderboard(rows, results, facts, out)
     jobs.release(out)

@@ -1,7 +1,6 @@
 """`ballbot play`: a live playground in the browser."""
 
 import signal
-from pathlib import Path
 from typing import Literal
 
 from ballbot_gym.env import make_task
@@ -18,14 +17,12 @@ def play(
     /,
     controller: str | None = None,
     ghosts: tuple[str, ...] = ("lqr",),
-    policies: tuple[str, ...] = (),
     episode: int | Literal["rest", "random"] | None = None,
     physics: Literal["bullet", "mujoco", "rk4"] | None = None,
     robot: RobotName = PAPER,
     seed: int = 0,
     host: str = HOST,
     port: int = PORT,
-    out: Path = Path("runs/play"),
     randomization: str | None = None,
 ) -> None:
     """Opens a page on which you push the robot, change it, and compare controllers.
@@ -35,7 +32,6 @@ def play(
         controller: of the robot: an expert, a policy that comes with the package, a policy file, or a model saved
             by Stable-Baselines3 (.zip); default, the best shipped policy.
         ghosts: controllers that get the same start and the same pushes beside it.
-        policies: more policy files and saved models, which the page offers in the tasks that they are made for.
         episode: index of the certified episode it starts with, a random start, or at rest until a push that fells LQR;
             default, at rest where all episodes of the task differ in their start alone, and else 0.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
@@ -43,7 +39,6 @@ def play(
         seed: of random starts, noise and pushes.
         host: address to bind. Everybody but this machine needs the token that is printed.
         port: where the page is; the next free one, if it is taken.
-        out: folder of saved files.
         randomization: name of a track, as "unknown": every episode has a robot of it, which the controllers are not told.
     """
     task = task_name(controller or "", task, robot)
@@ -51,9 +46,9 @@ def play(
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"
     start = None if episode == "random" else episode
-    playground = Playground(task, controller, ghosts, physics, start, seed, robot, policies, True, randomization)
+    playground = Playground(task, controller, ghosts, physics, start, seed, robot, True, randomization)
     viewer = Viewer(host, port, "ballbot play")
-    page = PlayPage(playground, viewer, out)
+    page = PlayPage(playground, viewer)
     signal.signal(signal.SIGTERM, lambda *_: page.stop())
     try:
         console.print(f"open {viewer.address}\nCtrl+C ends it", highlight=False)

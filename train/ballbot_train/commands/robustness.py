@@ -3,23 +3,19 @@
 import math
 from pathlib import Path
 
-from ballbot_gym import files
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
-from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import (
-    Physics,
-    RobotName,
-    check_some,
-    console,
-    markdown,
-    physics_or_default,
-    print_table,
-    progress_bars,
-)
+from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
 from ballbot_train.evaluation import robustness as stressed
-from ballbot_train.evaluation.benchmark import checked_episodes, controllers_of, open_run
+from ballbot_train.evaluation.benchmark import (
+    controllers_of,
+    open_run,
+    policy_digests,
+    publish,
+    run_groups,
+)
+from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
@@ -30,7 +26,6 @@ def robustness(
     controllers: tuple[str, ...] = (),
     stresses: tuple[str, ...] = tuple(stressed.STRESSES),
     episodes: int = 20,
-    quick: bool = False,
     physics: Physics | None = None,
     seed: int = 0,
     out: Path = Path("runs/robustness"),
@@ -44,7 +39,6 @@ def robustness(
         controllers: as of `ballbot benchmark`; by default NMPC with a disturbance estimator, nmpc-offset-free, runs too.
         stresses: names of disturbances.
         episodes: how many of each task's certified episodes.
-        quick: only 3 episodes of each task.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         seed: of pushes, noise and the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
@@ -56,11 +50,10 @@ def robustness(
         chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
     physics = physics_or_default(physics)
     check_some("stress", stresses, stressed.STRESSES)
-    episodes = checked_episodes(episodes, quick, few=3)
-    facts = open_run(out, chosen, workers, physics, seed, robot, episodes=episodes)
-    wanted = stressed.conditions(stresses)
-    with progress_bars(stressed.episodes_to_run(chosen, wanted, episodes)) as bars:
-        results = stressed.run(chosen, wanted, episodes, physics, out, workers, bars.advance, seed, robot)
+    settings = {"physics": physics, "episodes": checked_episodes(episodes)}
+    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
+    groups = stressed.groups_of(chosen, stressed.conditions(stresses), physics, robot)
+    results = run_groups(groups, episodes, out, workers, stressed.StressResult, seed)
     rows = rows_of(results, stressed.StressRow, "stress", "level", seed=seed)
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
     write_results("robustness", rows, results, facts, out, stresses=labels)
@@ -73,9 +66,7 @@ def robustness(
         for controller in group
     ]
     header = ["task", "disturbance", "controller", "severity", "success, %", "falls, %", stressed.REGRET]
-    files.write(out / "robustness.md", markdown(header, table))
-    jobs.release(out)
-    print_table(f"{episodes} certified episodes per task and severity, physics={physics}", header, table)
+    publish(out, "robustness", f"{episodes} certified episodes per task and severity, physics={physics}", header, table)
     console.print(f"curves: {out / 'figures'}")
 
 

@@ -190,7 +190,7 @@ def _train_seeds(learner: str, run: Run, settings: Any, named: str) -> None:
         bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
         trained = queue.run(command_of, expected, seeds, out, run.workers, lambda seed: progress.advance(bar))
     header = ["seed", "", "success", "failures", "mean regret", "minutes"]
-    rows = [_row(str(each.seed), vars(each)) for each in trained]
+    rows = [_row(str(seed), each) for seed, each in zip(seeds, trained, strict=True)]
     middle, worst = queue.middle_and_worst(trained)
     print_table(
         f"{learner} on {run.task}, certified episodes", header, [*rows, _row("median", middle), _row("worst", worst)]

@@ -7,25 +7,14 @@ from pathlib import Path
 from ballbot_gym import files
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS
-from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import (
-    Physics,
-    RobotName,
-    check_least,
-    check_some,
-    console,
-    markdown,
-    physics_or_default,
-    print_table,
-    progress_bars,
-)
-from ballbot_train.evaluation import agreement, optima
+from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default, print_table
+from ballbot_train.evaluation import agreement
 from ballbot_train.evaluation import transfer as matrix
-from ballbot_train.evaluation.benchmark import checked_episodes, policy_digests
-from ballbot_train.evaluation.results import rows_of
+from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish, run_groups
+from ballbot_train.evaluation.evaluate import checked_episodes
+from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
-from ballbot_train.provenance import provenance
 from ballbot_train.report import figures
 from ballbot_train.report.film import write_film
 from ballbot_train.report.replay import engines_replay
@@ -38,7 +27,6 @@ def transfer(
     robot: RobotName = "rolling",
     frictions: tuple[float, ...] = (),
     episodes: int = 20,
-    quick: bool = False,
     physics: tuple[Physics, ...] = (),
     seed: int = 0,
     out: Path = Path("runs/transfer"),
@@ -55,7 +43,6 @@ def transfer(
         robot: what they run on, with its certified episodes.
         frictions: coefficients of friction of the floor, for a robot whose ball rolls; default, the robot's own.
         episodes: how many of each task's certified episodes.
-        quick: only 3 episodes of each task.
         physics: "bullet", "mujoco" or "rk4", with contact where the ball rolls except in the last; default, the first that is
             installed. With several, also where they disagree, and a film of the first episode that ends otherwise.
         seed: of the bootstrap intervals.
@@ -63,44 +50,26 @@ def transfer(
         workers: who does the work.
     """
     check_some("robot", made_for, ROBOTS)
-    check_least(0, seed=seed)
     floors = frictions or (None,)
     for friction in floors:
         matrix.floor(robot, friction)
     chosen = matrix.controllers_of(tasks, controllers, made_for)
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
-    engines = [physics_or_default(one) for one in physics or (None,)]
-    episodes = checked_episodes(episodes, quick, few=3)
-    settings = {
-        "controllers": chosen,
-        "policies": {name: policy_digests(group, name) for name, group in chosen.items()},
-        "robot": robot,
-        "frictions": frictions,
-        "episodes": episodes,
-        "physics": engines,
-        "seed": seed,
-    }
-    facts = provenance() | settings | {"workers": Workers.of(workers).named}
-    jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
-    for task in tasks:
-        optima.known(task, robot, range(episodes), workers)
-    totals = dict.fromkeys(tasks, 0)
-    for group in chosen.values():
-        for task, names in group.items():
-            totals[task] += len(names) * len(floors) * len(engines) * matrix.episodes_of(task, robot, episodes)
-    with progress_bars(totals) as bars:
-        results = matrix.run(chosen, robot, floors, episodes, engines, out, workers, bars.advance, seed)
+    engines, episodes = [physics_or_default(one) for one in physics or (None,)], checked_episodes(episodes)
+    digests = {f"{name}/{key}": d for name, group in chosen.items() for key, d in policy_digests(group, name).items()}
+    settings = {"controllers": chosen, "frictions": frictions, "physics": engines, "episodes": episodes}
+    facts = open_run(out, tasks, workers, digests, seed, robot, **settings)
+    groups = matrix.groups_of(chosen, robot, floors, engines)
+    results = run_groups(groups, episodes, out, workers, matrix.TransferResult, seed)
     rows = rows_of(results, matrix.TransferRow, "made_for", "robot", "friction", "physics", seed=seed)
-    matrix.write(rows, results, facts, out)
-    table = [matrix.cells(row) for row in rows]
-    files.write(out / "transfer.md", markdown(matrix.HEADER, table))
+    write_results("transfer", rows, results, facts, out, matrix.COLUMNS, regret=matrix.REGRET)
     figures.save(figures.transfer_figure(rows), out / "transfer.png")
-    print_table(f"{episodes} certified episodes of {robot} per task", matrix.HEADER, table)
-    console.print(f"matrix: {out / 'transfer.png'}, {out / 'transfer.csv'}")
     if len(engines) > 1:
         _compare(results, chosen, robot, episodes, engines, out)
-    jobs.release(out)
+    title, table = f"{episodes} certified episodes of {robot} per task", [matrix.cells(row) for row in rows]
+    publish(out, "transfer", title, matrix.HEADER, table)
+    console.print(f"matrix: {out / 'transfer.png'}, {out / 'transfer.csv'}")
 
 
 def _compare(

@@ -9,7 +9,7 @@ episode succeeds: at rest at the origin when it ends. It is recoverable if it li
 import json
 import math
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,11 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_train import jobs
+from ballbot_train.console import progress_bars
 from ballbot_train.evaluation.controllers import make_packed, packed
 from ballbot_train.executors import Workers
 
 TASK = "stabilize"
-BOUNDARY = "boundary"
-"""What the search for the boundaries counts its progress for."""
 LEAN_LIMIT = 75.0  # degrees, either side
 _BOUNDARY_POINTS = 31  # its search goes from value to value, in steps that it can follow
 _ARENA_RADIUS = 1000.0  # m: a map asks whether the robot comes back, not how far it goes meanwhile
@@ -64,20 +63,27 @@ class BasinMap:
         return float(np.sum(self.recovered[controller]) / np.sum(self.recoverable))
 
 
-def boundaries(
-    out: Path, workers: int | Workers, on_progress: Callable[[str, int], None], robot: str = PAPER
-) -> dict[str, np.ndarray]:
-    """The boundary of what is recoverable along every axis, (m, 2) lean, degrees, and value, resumably.
+def run(
+    controllers: Sequence[str], points: int, physics: str, out: Path, workers: int | Workers, robot: str = PAPER
+) -> list[BasinMap]:
+    """Finds the boundaries, runs the controllers from every state within them, resumably, and makes a map for each axis.
 
     Args:
+        controllers: names.
+        points: along each axis of a map; odd.
+        physics: "bullet", "mujoco" or "rk4".
         out: folder of the results.
         workers: a number of processes, or `Workers`.
-        on_progress: called with `BOUNDARY` and a number of finished axes.
         robot: by name.
     """
-    work = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (robot,), (name,), BOUNDARY) for name in AXES]
-    done = jobs.run(work, out, workers, on_progress)
-    return {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, done, strict=True)}
+    search = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (robot,), (name,), "boundary") for name in AXES]
+    with progress_bars({"boundary": len(AXES)}) as bars:
+        found = jobs.run(search, out, workers, bars.advance)
+        bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
+        work = cell_jobs(bounds, controllers, points, physics, robot)
+        bars.add({name: sum(len(job.items) for job in work if job.group == name) for name in controllers})
+        done = jobs.run(work, out, workers, bars.advance)
+    return maps_of(bounds, (entry for entries in done for entry in entries), controllers, points)
 
 
 def _boundary(robot: str, names: Sequence[str]) -> Iterator[jobs.Entry]:
@@ -120,40 +126,6 @@ def cell_jobs(
                 stem = f"{_slug(name)}-{_slug(controller)}-{zlib.crc32(controller.encode()):08x}-{physics}-{points}-{i:02d}"
                 work.append(jobs.Job(stem, _cells, arguments, items, controller))
     return work
-
-
-def states_to_run(
-    bounds: Mapping[str, np.ndarray], controllers: Sequence[str], points: int, physics: str
-) -> dict[str, int]:
-    """How many states `run` runs under every controller."""
-    work = cell_jobs(bounds, controllers, points, physics)
-    return {name: sum(len(job.items) for job in work if job.group == name) for name in controllers}
-
-
-def run(
-    bounds: Mapping[str, np.ndarray],
-    controllers: Sequence[str],
-    points: int,
-    physics: str,
-    out: Path,
-    workers: int | Workers,
-    on_progress: Callable[[str, int], None],
-    robot: str = PAPER,
-) -> list[BasinMap]:
-    """Runs the controllers from every state within the boundaries, resumably, and makes a map for each axis.
-
-    Args:
-        bounds: as `boundaries` gives.
-        controllers: names.
-        points: along each axis of a map; odd.
-        physics: "bullet", "mujoco" or "rk4".
-        out: folder of the results.
-        workers: a number of processes, or `Workers`.
-        on_progress: called with a controller and a number of finished states.
-        robot: by name.
-    """
-    done = jobs.run(cell_jobs(bounds, controllers, points, physics, robot), out, workers, on_progress)
-    return maps_of(bounds, (entry for entries in done for entry in entries), controllers, points)
 
 
 def _cells(
@@ -209,8 +181,15 @@ def write(maps: Sequence[BasinMap], facts: Mapping[str, Any], out: Path) -> None
         | {basin.axis: basin.fraction(c) for basin in maps}
         for c in maps[0].recovered
     ]
-    document = {"about": facts, "rows": rows, "maps": [_as_json(basin) for basin in maps]}
-    files.write(out / "basins.json", json.dumps(document, ensure_ascii=False) + "\n")
+    document = {
+        "about": facts,
+        "rows": rows,
+        "maps": [vars(basin) | {"label": AXES[basin.axis].label} for basin in maps],
+    }
+    text = json.dumps(
+        document, ensure_ascii=False, default=lambda array: (0 + array).tolist()
+    )  # truth values as 0 and 1
+    files.write(out / "basins.json", text + "\n")
     lines = [
         {
             "axis": basin.axis,
@@ -224,18 +203,6 @@ def write(maps: Sequence[BasinMap], facts: Mapping[str, Any], out: Path) -> None
         for j, lean in enumerate(basin.leans)
     ]
     files.write_csv(out / "basins.csv", lines)
-
-
-def _as_json(basin: BasinMap) -> dict[str, Any]:
-    return {
-        "axis": basin.axis,
-        "label": AXES[basin.axis].label,
-        "leans": basin.leans.tolist(),
-        "values": basin.values.tolist(),
-        "boundary": basin.boundary.tolist(),
-        "recoverable": basin.recoverable.astype(int).tolist(),
-        "recovered": {name: cells.astype(int).tolist() for name, cells in basin.recovered.items()},
-    }
 
 
 def _slug(text: str) -> str:

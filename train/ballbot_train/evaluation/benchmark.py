@@ -1,22 +1,23 @@
 """Every controller of every task on the certified episodes, in parallel processes and resumably."""
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ballbot_baselines import VARIANTS
-from ballbot_gym import certified
+from ballbot_gym import certified, files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import check_least, check_names, check_some
+from ballbot_train.console import check_least, check_names, check_some, markdown, print_table, progress_bars
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import iterate_episodes
@@ -90,22 +91,22 @@ def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER)
 
 def open_run(
     out: Path,
-    controllers: Mapping[str, Sequence[str]],
+    tasks: Iterable[str],
     workers: int | Workers,
-    physics: str,
+    policies: Mapping[str, str],
     seed: int | None = None,
     robot: str = PAPER,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Claims a folder for a run of controllers by task with some settings; `jobs.release` ends the run.
+    """Claims a folder for a run with some settings; `publish` or `jobs.release` ends the run.
 
     The optima of the episodes of a run with `episodes` are computed, where the package has none.
 
     Args:
         out: the folder.
-        controllers: names by task.
+        tasks: names.
         workers: a number of processes, or `Workers`; they change no result.
-        physics: "bullet", "mujoco" or "rk4".
+        policies: digests of the policies that are run, as `policy_digests` gives.
         seed: of whatever is drawn, if anything is.
         robot: by name.
         settings: whatever else decides the results.
@@ -117,28 +118,83 @@ def open_run(
         ValueError: the folder holds an unfinished run with other settings, policies or code; another process is using it;
             or a number is out of its range.
     """
-    settings["physics"] = physics
     if seed is not None:
         check_least(0, seed=seed)
         settings["seed"] = seed
-    settings |= robot_setting(robot)
-    settings["policies"] = policy_digests(controllers, robot)
+    settings |= robot_setting(robot) | {"policies": policies}
     facts = provenance() | settings | {"workers": Workers.of(workers).named}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
-    for task in controllers if "episodes" in settings else ():
+    for task in tasks if "episodes" in settings else ():
         optima.known(task, robot, range(settings["episodes"]), workers)
     return facts
 
 
-def checked_episodes(episodes: int, quick: bool, few: int) -> int:
-    """How many certified episodes to run: `few` at most if quick.
+def publish(out: Path, name: str, title: str, header: Sequence[str], table: Sequence[Sequence[str]]) -> None:
+    """Ends a run: writes its table as NAME.md, and prints it."""
+    files.write(out / f"{name}.md", markdown(header, table))
+    jobs.release(out)
+    print_table(title, header, table)
 
-    Raises:
-        ValueError: there are not so many.
+
+@dataclass(frozen=True)
+class Group:
+    """One controller on the certified episodes of a task, in one world."""
+
+    task: str
+    controller: str
+    physics: str
+    robot: str = PAPER
+    """Whose episodes they are, by name."""
+    made_for: str | None = None
+    """Name of the robot that the controller is made for; default, `robot`."""
+    variant: BallbotParams | None = None
+    """A robot that runs in the place of `robot`; regret is over the optimum of `robot` then too."""
+    randomization: Randomization | None = None
+    own_optima: bool = False
+    """Whether regret is over the optimum of each episode's own robot."""
+    told: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of the results beside those of `Result`."""
+    counts_for: str = ""
+    """What its progress counts for; default, the task."""
+
+
+ResultKind = TypeVar("ResultKind", bound=Result)
+
+
+def run_groups(
+    groups: Sequence[Group],
+    episodes: int,
+    out: Path,
+    workers: int | Workers,
+    kind: type[ResultKind] = Result,
+    seed: int = 0,
+    record: bool = False,
+) -> list[ResultKind]:
+    """Runs groups in parallel processes, with progress bars. What an interrupted run finished is not run again.
+
+    Args:
+        groups: what to run.
+        episodes: of each group, from the first.
+        out: folder of the results.
+        workers: a number of processes, or `Workers`.
+        kind: of the results.
+        seed: of whatever is drawn: episode i draws the same in every group.
+        record: whether to write what the controllers do, for `ballbot submit`.
     """
-    if not 1 <= episodes <= certified.EPISODES:
-        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
-    return min(episodes, few) if quick else episodes
+    totals: Counter[str] = Counter()
+    for group in groups:
+        totals[group.counts_for or group.task] += episodes
+    parts = [range(start, min(start + CHUNK, episodes)) for start in range(0, episodes, CHUNK)]
+    work = [_job(group, part, seed, record) for group in groups for part in parts]
+    with progress_bars(totals) as bars:
+        done = iter(jobs.run(work, out, workers, bars.advance))
+    results = []
+    for group in groups:
+        entries = [entry for _ in parts for entry in next(done)]
+        if record:
+            _write_recording(group, [recordings.from_text(entry.pop("motion")) for entry in entries], out)
+        results += [kind(**entry, **group.told) for entry in entries]
+    return results
 
 
 def benchmark(
@@ -147,99 +203,56 @@ def benchmark(
     physics: str,
     out: Path,
     workers: int | Workers,
-    on_progress: Callable[[str, int], None],
     seed: int = 0,
     robot: str = PAPER,
 ) -> list[Result]:
-    """Runs the controllers of every task, in parallel processes, and records what they do for `ballbot submit`.
-
-    What an interrupted run finished is not run again.
-
-    Args:
-        controllers: names by task, as `controllers_of` gives.
-        episodes: how many of each task's certified ones.
-        physics: "bullet", "mujoco" or "rk4".
-        out: folder of the results.
-        workers: a number of processes, or `Workers`.
-        on_progress: called with a task and a number of finished episodes.
-        seed: of whatever is drawn.
-        robot: by name.
-    """
-    work = [
-        episode_job(task, name, physics, range(start, min(start + CHUNK, episodes)), seed, robot=robot, record=True)
-        for task, group in controllers.items()
-        for name in group
-        for start in range(0, episodes, CHUNK)
-    ]
-    entries = [entry for done in jobs.run(work, out, workers, on_progress) for entry in done]
-    motions = [recordings.from_text(entry.pop("motion")) for entry in entries]
-    results = [Result(**entry) for entry in entries]
-    for task, group in controllers.items():
-        for name in group:
-            digest = registry.policy_digest(name, make_task(task, robot), robot)
-            about = recordings.about(make_task(task, robot), task, named_robot(robot), physics, name, digest)
-            done = [m for r, m in zip(results, motions, strict=True) if (r.task, r.controller) == (task, name)]
-            recordings.write_in(out, about, done)
-    return results
+    """Runs controllers by task, as `controllers_of` gives, and records what they do; the others as of `run_groups`."""
+    groups = [Group(task, name, physics, robot) for task, names in controllers.items() for name in names]
+    return run_groups(groups, episodes, out, workers, seed=seed, record=True)
 
 
-def episode_job(
-    task: str,
-    controller: str,
-    physics: str,
-    episodes: range,
-    seed: int,
-    randomization: Randomization | None = None,
-    label: str = "",
-    group: str = "",
-    robot: str = PAPER,
-    made_for: str | None = None,
-    variant: BallbotParams | None = None,
-    record: bool = False,
-    own_optima: bool = False,
-) -> jobs.Job:
-    """Some certified episodes of a robot under a controller by name, as a job whose entries are the fields of Results.
+def _write_recording(group: Group, motions: Sequence[recordings.Motion], out: Path) -> None:
+    task, params = make_task(group.task, group.robot), named_robot(group.robot)
+    digest = registry.policy_digest(group.controller, task, group.robot)
+    recordings.write_in(
+        out, recordings.about(task, group.task, params, group.physics, group.controller, digest), motions
+    )
 
-    The controller is made for the robot, or for another one by name. A variant of the robot may run in its place; regret is
-    over the robot's own optimum then too, or with own_optima over that of each episode's robot. The label tells jobs apart
-    that differ in their randomization or robots; progress counts for the group, or else the task. With record each entry also
-    has the "motion" as `recordings.to_text` gives it.
-    """
-    what, packed = f"{task}-{controller}-{physics}-{label}", registry.packed(controller)
+
+def _job(group: Group, episodes: range, seed: int, record: bool) -> jobs.Job:
+    """Some episodes of a group, as a job whose entries are the fields of Results, and with record the "motion"."""
+    told = "-".join(f"{value:g}" if isinstance(value, float) else f"{value}" for value in group.told.values())
+    what = f"{group.task}-{group.controller}-{group.physics}-{told}"
     # the optima go along, because workers on other machines do not have this user's cache
-    varied = (own_optima and randomization) or Randomization()
-    known = certified.load(task, robot, episodes=episodes, randomization=varied)
+    varied = (group.own_optima and group.randomization) or Randomization()
+    known = certified.load(group.task, group.robot, episodes=episodes, randomization=varied)
     known = replace(known, trajectories=(), statuses=np.zeros(0, str))
     slug = "".join(sign if sign.isalnum() else "-" for sign in what)
     return jobs.Job(
         name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
         function=_episode_entries,
-        arguments=(task, controller, packed, physics, seed, randomization, robot, made_for, variant, known, record),
+        arguments=(group, registry.packed(group.controller), seed, known, record),
         items=tuple(episodes),
-        group=group or task,
+        group=group.counts_for or group.task,
     )
 
 
 def _episode_entries(
-    task: str,
-    controller: str,
+    group: Group,
     packed: Mapping[str, bytes],
-    physics: str,
     seed: int,
-    randomization: Randomization | None,
-    robot: str,
-    made_for: str | None,
-    variant: BallbotParams | None,
     known: certified.EvaluationSet,
     record: bool,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
-    env = BallbotEnv(task, physics=physics, randomization=randomization, robot=variant or robot)
-    believed = (env.task, env.params) if made_for is None else (make_task(task, made_for), named_robot(made_for))
-    made = registry.make_packed(controller, packed, *believed)
+    world: dict[str, Any] = {"randomization": group.randomization, "robot": group.variant or group.robot}
+    env = BallbotEnv(group.task, physics=group.physics, **world)
+    believed = env.task, env.params
+    if group.made_for is not None:
+        believed = make_task(group.task, group.made_for), named_robot(group.made_for)
+    made = registry.make_packed(group.controller, packed, *believed)
     motions: list[recordings.Motion] = []
-    for result in iterate_episodes(
-        env, made, controller, task, episodes, seed, known, motions.append if record else None
-    ):
+    keep = motions.append if record else None
+    for result in iterate_episodes(env, made, group.controller, group.task, episodes, seed, known, keep):
         yield asdict(result) | ({"motion": recordings.to_text(motions.pop())} if record else {})
     env.close()

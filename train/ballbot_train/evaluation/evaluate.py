@@ -3,7 +3,6 @@
 Importing this module is light: torch is imported for policy files, CasADi for experts that plan, SciPy for intervals.
 """
 
-import itertools
 import math
 import numbers
 from collections.abc import Callable, Iterable, Iterator
@@ -92,7 +91,7 @@ class Predictor:
 def evaluate(
     policy: Any,
     task: str | Task = "stabilize",
-    episodes: int | Iterable[int] = certified.EPISODES,
+    episodes: int = certified.EPISODES,
     physics: str | None = None,
     name: str | None = None,
     randomization: Randomization | str | None = None,
@@ -108,7 +107,7 @@ def evaluate(
         policy: see `as_controller`: a Stable-Baselines3 model, a function of the observation, a Controller, the name of a
             controller ("lqr", "trajopt", "nmpc") or a policy file.
         task: a name in `TASKS`, or any Task.
-        episodes: how many of the certified episodes, from the first, or their indices, each once.
+        episodes: how many of the certified episodes, from the first.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         name: of the row; default, the policy's own.
         randomization: what the policy is not told, or a name in `TRACKS`; default, nothing. The regret is over the optimum
@@ -125,7 +124,7 @@ def evaluate(
     """
     env = BallbotEnv(task, physics=physics, randomization=randomization, robot=robot)
     try:
-        indices = episode_indices(episodes, certified.EPISODES)
+        indices = range(checked_episodes(episodes))
         controller = as_controller(policy, env.task, env.params)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), task_name(env.task)
@@ -137,7 +136,7 @@ def evaluate(
             ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
             facts = provenance() | ran
             write_leaderboard([row], results, facts, Path(out))
-            if indices == list(range(len(indices))) and not env.randomization.active:
+            if not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
                 about = recordings.about(env.task, named[1], env.params, env.physics, named[0], digest)
                 recordings.write_in(Path(out), about, motions)
@@ -146,37 +145,13 @@ def evaluate(
         env.close()
 
 
-def episode_indices(episodes: int | Iterable[int], available: int) -> list[int]:
-    """The indices of the episodes to run.
-
-    Args:
-        episodes: how many, from the first, or their indices.
-        available: how many certified episodes there are.
-
-    Raises:
-        ValueError: none, more than there are, or one of them twice.
-        TypeError: they are no whole numbers.
-    """
-    if isinstance(episodes, bool | str) or not isinstance(episodes, numbers.Integral | Iterable):
-        raise TypeError(f"episodes must be a number of episodes or a list of indices, not {episodes!r}")
-    if isinstance(episodes, numbers.Integral):
-        count = int(episodes)
-        if not 1 <= count <= available:
-            raise ValueError(f"episodes must be 1 to {available}, or a list of indices, not {count}")
-        return list(range(count))
-    indices = list(itertools.islice(episodes, available + 1))  # it may be endless
-    if len(indices) > available:
-        raise ValueError(f"episodes names more than the {available} episodes that there are; give each once")
-    if not indices:
-        raise ValueError("episodes is empty; give at least one index")
-    for index in indices:
-        if isinstance(index, bool) or not isinstance(index, numbers.Integral):
-            raise TypeError(f"indices of episodes must be whole numbers, not {index!r}")
-        if not 0 <= index < available:
-            raise ValueError(f"indices of episodes must be 0 to {available - 1}, not {index}")
-    if len(set(indices)) < len(indices):
-        raise ValueError(f"episodes {indices} names an episode twice; give each once")
-    return [int(index) for index in indices]
+def checked_episodes(episodes: int) -> int:
+    """A number of certified episodes; raises a ValueError where there are not so many."""
+    if isinstance(episodes, bool) or not isinstance(episodes, numbers.Integral):
+        raise TypeError(f"episodes must be a number of episodes, not {episodes!r}")
+    if not 1 <= episodes <= certified.EPISODES:
+        raise ValueError(f"episodes must be 1 to {certified.EPISODES}, not {episodes}")
+    return int(episodes)
 
 
 def _name(policy: Any) -> str:

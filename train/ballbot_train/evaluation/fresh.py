@@ -161,22 +161,17 @@ class FreshResult:
             **{f"regret_{name}": value for name, value in regrets.items()},
         )
 
-    def bins(self, count: int | None = None) -> list[Bin]:
+    def bins(self) -> list[Bin]:
         """Success and cost by ranges of every measure, equally wide from its smallest to its largest value.
 
-        Args:
-            count: bins of a measure; default one per 125 episodes, 4 to 80. A measure with few values has a bin for each.
+        A measure has a bin per 125 episodes, 4 to 80; one with few values has a bin for each.
         """
+        count = min(max(len(self) // _PER_BIN, 4), _MOST_BINS)
         return [
             self._bin(name, low, high, chosen)
             for name, values in self.measures.items()
-            for low, high, chosen in intervals(values, self.bin_count if count is None else count)
+            for low, high, chosen in intervals(values, count)
         ]
-
-    @property
-    def bin_count(self) -> int:
-        """Bins of a measure by default."""
-        return min(max(len(self) // _PER_BIN, 4), _MOST_BINS)
 
     def _bin(self, measure: str, low: float, high: float, chosen: np.ndarray) -> Bin:
         n, success = int(chosen.sum()), int(self.success[chosen].sum())

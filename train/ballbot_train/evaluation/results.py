@@ -186,11 +186,21 @@ def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
 
 
 def write_results(
-    name: str, rows: Sequence[Row], results: Sequence[Result], facts: Mapping[str, Any], out: Path, **more: Any
+    name: str,
+    rows: Sequence[Row],
+    results: Sequence[Result],
+    facts: Mapping[str, Any],
+    out: Path,
+    columns: Mapping[str, str] = {},
+    **more: Any,
 ) -> None:
-    """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", the rows, and more."""
+    """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", the rows, and more.
+
+    Some columns of the CSV files may have other names than the fields.
+    """
     for table, entries in ((name, rows), ("episodes", results)):
-        files.write_csv(out / f"{table}.csv", [asdict(entry) for entry in entries])
+        named = [{columns.get(key, key): value for key, value in asdict(entry).items()} for entry in entries]
+        files.write_csv(out / f"{table}.csv", named)
     files.write(out / f"{name}.json", to_json({"about": facts, **more, "rows": rows}))
 
 

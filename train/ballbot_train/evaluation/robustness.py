@@ -7,14 +7,11 @@ measured against the optimum of each episode's own robot. Every controller meets
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER
-from ballbot_train import jobs
-from ballbot_train.evaluation.benchmark import CHUNK, episode_job
+from ballbot_train.evaluation.benchmark import Group
 from ballbot_train.evaluation.results import Result, Row
-from ballbot_train.executors import Workers
 from ballbot_train.policy_files import track_in
 
 
@@ -122,68 +119,24 @@ def conditions(stresses: Sequence[str]) -> list[Condition]:
     ]
 
 
-def episodes_to_run(
-    controllers: Mapping[str, Sequence[str]], wanted: Sequence[Condition], episodes: int
-) -> dict[str, int]:
-    """How many episodes `run` runs under every stress or track."""
-    counts: dict[str, int] = {}
-    for condition in wanted:
-        each = sum(map(len, condition.chosen(controllers).values())) * episodes
-        counts[condition.name] = counts.get(condition.name, 0) + each
-    return counts
-
-
-def run(
-    controllers: Mapping[str, Sequence[str]],
-    wanted: Sequence[Condition],
-    episodes: int,
-    physics: str,
-    out: Path,
-    workers: int | Workers,
-    on_progress: Callable[[str, int], None],
-    seed: int = 0,
-    robot: str = PAPER,
-) -> list[StressResult]:
-    """Runs everything, resumably.
-
-    Args:
-        controllers: names by task.
-        wanted: the conditions.
-        episodes: certified episodes of each task, from the first.
-        physics: "bullet", "mujoco" or "rk4".
-        out: folder of the results.
-        workers: a number of processes, or `Workers`.
-        on_progress: called with the name of a condition and a number of finished episodes.
-        seed: of the draws: episode i draws the same with every controller.
-        robot: by name.
-    """
-    work = [
-        (
-            condition,
-            episode_job(
-                task,
-                name,
-                physics,
-                range(start, min(start + chunk, episodes)),
-                seed,
-                condition.randomization,
-                f"{condition.name}-{condition.level:g}",
-                condition.name,
-                robot,
-                own_optima=condition.own_optima,
-            ),
+def groups_of(
+    controllers: Mapping[str, Sequence[str]], wanted: Sequence[Condition], physics: str, robot: str = PAPER
+) -> list[Group]:
+    """Controllers by task under conditions, for `run_groups`, whose results are StressResults."""
+    return [
+        Group(
+            task,
+            name,
+            physics,
+            robot,
+            randomization=condition.randomization,
+            own_optima=condition.own_optima,
+            told={"stress": condition.name, "level": condition.level},
+            counts_for=condition.name,
         )
         for condition in wanted
-        for chunk in (CHUNK if condition.own_optima else episodes,)
-        for task, group in condition.chosen(controllers).items()
-        for name in group
-        for start in range(0, episodes, chunk)
-    ]
-    done = jobs.run([job for _, job in work], out, workers, on_progress)
-    return [
-        StressResult(**entry, stress=condition.name, level=condition.level)
-        for (condition, _), entries in zip(work, done, strict=True)
-        for entry in entries
+        for task, names in condition.chosen(controllers).items()
+        for name in names
     ]
 
 

@@ -21,7 +21,6 @@ from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.results import Row, shown, summarize
 from ballbot_train.evaluation.robustness import Condition, StressResult
-from ballbot_train.executors import Workers
 
 HEADER = (
     *("track", "task", "controller", "success, %", "failures", "mean regret, %", "95 % interval"),
@@ -70,13 +69,6 @@ def with_experts(
     others = {c.name: tuple(name for name in experts if name not in EXPERTS[c.name]) for c in wanted}
     chosen = {task: [*group, *experts] for task, group in controllers.items()}
     return chosen, [replace(condition, left_out=others[condition.name]) for condition in wanted]
-
-
-def find_optima(tasks: Sequence[str], tracks: Sequence[str], episodes: int, robot: str, workers: int | Workers) -> None:
-    """Computes those optima of the episodes of some tracks that neither the package nor the user's cache has."""
-    for task in tasks:
-        for track in tracks:
-            optima.known(task, robot, range(episodes), workers, TRACKS[track])
 
 
 def rows_of(results: Sequence[StressResult], robot: str = PAPER, seed: int = 0) -> list[TrackRow]:

@@ -104,14 +104,13 @@ def highest_value(task: Task, reward_scale: float, gamma: float) -> float:
     return max(living, value_of_living(task, reward_scale, 1.0)) if task.first_exit else living
 
 
-def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float | torch.Tensor) -> torch.Tensor:
+def relative_advantages(returns: torch.Tensor, values: torch.Tensor, living: float) -> torch.Tensor:
     """Advantages relative to the cost to go, normalized, of returns and values of any one shape.
 
     Args:
         returns: estimates of the return.
         values: what the critic expects.
-        living: value of a state without any cost, so that the cost to go is `living` minus the value. Where rewards are
-            shaped, it is less by the potential of the state, and so a tensor.
+        living: value of a state without any cost, so that the cost to go is `living` minus the value.
     """
     relative = (returns - values) / cost_to_go(values, living)
     return (relative - relative.mean()) / (relative.std() + 1e-8)
@@ -131,7 +130,7 @@ def weigh_gradients(values: Sequence[torch.Tensor], living: float) -> None:
         value.register_hook(lambda gradient: gradient * weights)
 
 
-def cost_to_go(values: torch.Tensor, living: float | torch.Tensor) -> torch.Tensor:
+def cost_to_go(values: torch.Tensor, living: float) -> torch.Tensor:
     """The costs to go that values of any shape stand for, but no less than a share of their mean.
 
     Args:

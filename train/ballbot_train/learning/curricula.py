@@ -32,6 +32,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.console import console
 from ballbot_train.evaluation import fresh
+from ballbot_train.learning.state import load_state, state_of
 
 FAILURE_PRICE = 60.0
 """What a failure costs at once where living does not pay."""
@@ -51,6 +52,10 @@ _SHAPING = 10.0  # 1/m
 _EARLY_FAILURE_PRICE = 300.0  # while the curriculum lasts: it teaches not to fail; beside a low one cost is learnt
 _KEPT_STARTS = 1024  # of the last episodes that went wrong
 _OWN, _ON_OPTIMUM = 0, 1  # how an episode began
+_STATE = (
+    *("_goal_factor", "_ramp", "_reach", "_has_settled", "_own_episodes", "_on_optima"),
+    *("_kind", "_again", "_begun", "_hard"),
+)
 
 
 class Starts(NamedTuple):
@@ -77,8 +82,11 @@ class _Tally:
     share: float = math.nan
     """Of successes, when they were last looked at."""
 
-    def state(self) -> list[float]:
-        return [self.ended, self.succeeded, self.share]
+    def state_dict(self) -> dict[str, float]:
+        return dict(vars(self))
+
+    def load_state_dict(self, state: Mapping[str, float]) -> None:
+        vars(self).update(state)
 
     def add(self, ended: torch.Tensor, success: torch.Tensor) -> bool:
         """Counts episodes. True where there are enough to look at; their share of successes is then new."""
@@ -144,8 +152,6 @@ class CurriculumBatch(BallbotBatch):
         self._has_settled = not backwards  # whether enough episodes of the task itself have succeeded
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
-        self.last_potential = torch.zeros(num_envs)
-        """(B,) potential of the states from which the last step was taken; 0 without shaping."""
         # states, constants and passed steps at the starts of the running episodes, and of the last ones of each kind that
         # went wrong
         rows = 8 + len(task.constant_names) + 1
@@ -189,8 +195,7 @@ class CurriculumBatch(BallbotBatch):
             if task.first_exit:
                 reward = reward - survive * (task.steps - before.steps - 1) * result.success
         if self.backwards:
-            start = self.last_potential = self._potential(before.x, before.c)
-            end = self._potential(result.final_x, before.c)
+            start, end = (self._potential(x, before.c) for x in (before.x, result.final_x))
             # An episode that terminates ends with a potential of 0, and a truncated one goes on.
             reward = reward + self.gamma * torch.where(result.terminated, 0.0, end) - start
         ended = result.terminated | result.truncated
@@ -203,27 +208,11 @@ class CurriculumBatch(BallbotBatch):
 
     def curriculum_state(self) -> dict[str, Any]:
         """What the batch remembers besides `state`: tensors and plain values."""
-        return {
-            "goal_factor": self._goal_factor,
-            "ramp": self._ramp,
-            "reach": self._reach,
-            "settled": self._has_settled,
-            "own_episodes": self._own_episodes.state(),
-            "on_optima": self._on_optima.state(),
-            "kind": self._kind,
-            "again": self._again,
-            "begun": self._begun,
-            "hard": self._hard,
-            "starts": None if self._starts is None else list(self._starts),
-        }
+        return state_of(self, _STATE) | {"starts": None if self._starts is None else list(self._starts)}
 
     def load_curriculum_state(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
-        self._goal_factor, self._ramp, self._reach = state["goal_factor"], dict(state["ramp"]), state["reach"]
-        self._has_settled = state["settled"]
-        self._own_episodes, self._on_optima = _Tally(*state["own_episodes"]), _Tally(*state["on_optima"])
-        self._kind, self._again = state["kind"], state["again"]
-        self._begun, self._hard = state["begun"], list(state["hard"])
+        load_state(self, _STATE, state)
         self._starts = None if state["starts"] is None else Starts(*state["starts"])
         self._set_difficulty()
 

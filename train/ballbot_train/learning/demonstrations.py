@@ -11,9 +11,7 @@ dataset shows recoveries too.
 | infos/state (T+1, 8) | states; order and units in `dynamics.STATE` |
 | an episode's metadata | seed, expert, physics, cost, success, failure and the following |
 
-`optimum` is the cost of the optimal undisturbed episode from the same start, NaN if none was found or asked for;
-`solver_status` and `violation` are those of its search. `plans` counts the expert's plans, and `plans_failed` its searches
-that found none.
+`plans` counts the expert's plans, and `plans_failed` its searches that found none.
 
 `load_demos` reads a dataset for learners. Datasets of any size are shards: `write_shards` makes them, and `StreamedDemos`
 reads them one by one.
@@ -39,7 +37,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
+from ballbot_baselines.optimum import Backoff, Optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import files, seeding
 from ballbot_gym.env import BallbotEnv, make_task
@@ -57,7 +55,6 @@ from ballbot_train.policy_files import OBSERVATION_VERSION
 _CHUNK = 5  # episodes of a job
 _ARRAYS = "npz"  # where an entry holds the arrays of its episode
 _MOST_EPISODES = 1_000_000
-_NOT_SEARCHED = {"optimum": math.nan, "solver_status": "not searched", "violation": math.nan}
 
 
 @dataclass(frozen=True)
@@ -82,8 +79,6 @@ class DemoConfig:
     """Seed of the dataset."""
     robot: str = PAPER
     """Name of a robot in `ROBOTS`."""
-    optima: bool = True
-    """Whether each episode's optimum is searched too. Learners do not need it."""
 
     def __post_init__(self) -> None:
         task = make_task(self.task, self.robot)
@@ -339,7 +334,6 @@ def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jo
             "seed": config.episode_seed(i),
             "expert": config.expert,
             "physics": config.physics,
-            **(_optimum(env, recording.states[0], info["constants"]) if config.optima else _NOT_SEARCHED),
             "cost": env.task.survival_pay - float(recording.rewards.sum()),
             "success": bool(info["success"]),
             "failure": bool(info["failure"]),
@@ -348,18 +342,6 @@ def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jo
             _ARRAYS: base64.b64encode(files.npz(asdict(recording))).decode(),
         }
     env.close()
-
-
-def _optimum(env: BallbotEnv, x: np.ndarray, c: np.ndarray) -> dict[str, Any]:
-    try:
-        optimum = find_optimum(env.task, env.params, x, c, twice=True)
-    except PlanError as error:
-        return {"optimum": math.nan, "solver_status": str(error), "violation": math.nan}
-    return {
-        "optimum": optimum.cost if optimum.is_optimal else math.nan,
-        "solver_status": f"{optimum.solver}: {optimum.solver_status}",
-        "violation": optimum.violation,
-    }
 
 
 def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, out: Path) -> None:

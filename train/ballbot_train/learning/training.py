@@ -39,7 +39,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -74,6 +74,9 @@ class Learner(Protocol):
 
     `state_dict` holds everything that a later iteration depends on. So a resumed learner does exactly what it would have
     done without the interruption.
+
+    It may also have `preparation`, a number of iterations with which it begins by something else, as imitation: a run keeps
+    a policy of theirs only as long as there is no later one. And `difficulty`, how far its curriculum has come, by name.
     """
 
     iteration: int
@@ -100,26 +103,6 @@ class Learner(Protocol):
         """Goes back to a state."""
 
 
-@runtime_checkable
-class Staged(Protocol):
-    """A learner whose training begins easier than the task."""
-
-    @property
-    def difficulty(self) -> dict[str, float]:
-        """How far its curriculum has come, by name; empty where it has none."""
-        ...
-
-
-@runtime_checkable
-class Prepared(Protocol):
-    """A learner that begins by something else, as with imitating demonstrations."""
-
-    @property
-    def preparation(self) -> int:
-        """Iterations of that. A run keeps a policy of theirs only as long as there is no later one."""
-        ...
-
-
 @dataclass(frozen=True)
 class Score:
     """What a policy costs on the certified episodes, in the batched closed-form model."""
@@ -136,13 +119,6 @@ class Score:
     """Share of the episodes that ended in success."""
     failures: int
     """Number of episodes that failed."""
-
-
-def score(policy: Policy, task: Task, robot: str = PAPER) -> Score:
-    """Measures a policy on all certified episodes at once, much faster than in PyBullet one by one."""
-    episodes = certified.load(task, robot)
-    (run,) = _runs(policy, task, robot, Randomization(), (episodes.states, episodes.constants, episodes.drawn))
-    return _score(run, task, episodes.costs)
 
 
 def _score(run: BatchEpisodes, task: Task, optima: np.ndarray) -> Score:
@@ -183,12 +159,6 @@ _COLUMNS = (
 """Of evaluations.csv."""
 
 
-def validate(policy: Policy, task: Task, robot: str = PAPER, episodes: int = VALIDATION_EPISODES) -> Validation:
-    """Measures a policy on the validation set, which shares no episode with the certified ones nor with `evaluate_fresh`."""
-    (run,) = _runs(policy, task, robot, Randomization(), _validation_set(task, robot, episodes, Randomization()))
-    return _validation(run, task)
-
-
 def score_and_validate(
     policy: Policy,
     task: Task,
@@ -196,7 +166,10 @@ def score_and_validate(
     episodes: int = VALIDATION_EPISODES,
     randomization: Randomization = Randomization(),
 ) -> tuple[Score, Validation]:
-    """`score` and `validate` in one batch, in half the time; with a randomization, against the optima of its episodes."""
+    """Measures a policy on the certified episodes and on the validation set, which shares none with others, in one batch.
+
+    With a randomization the optima are those of its episodes.
+    """
     known = certified.load(task, robot, randomization=randomization)
     fresh_set = _validation_set(task, robot, episodes, randomization)
     drawn = known.drawn
@@ -388,7 +361,7 @@ class _Run:
 
     @property
     def _preparation(self) -> int:
-        return self.learner.preparation if isinstance(self.learner, Prepared) else 0
+        return getattr(self.learner, "preparation", 0)
 
     @property
     def _chosen(self) -> dict[str, Any]:
@@ -448,7 +421,7 @@ class _Run:
         save_policy(self.out / "policy", network, self._about() | more)
 
     def _about(self) -> dict[str, Any]:
-        reached = self.learner.difficulty if isinstance(self.learner, Staged) else {}
+        reached = getattr(self.learner, "difficulty", {})
         return {
             "training": self.config,
             "chosen_by": {"episodes": f"{self.validation_episodes} fresh, for validation", "cost": self.best[0]},

@@ -55,42 +55,36 @@ _INTERRUPTED = "interrupted"
 _STUDY = "study.db"
 
 
-@dataclass(frozen=True)
-class Range:
+_Space = dict[str, optuna.distributions.BaseDistribution]
+
+
+def _range(low: float, high: float, log: bool = True) -> optuna.distributions.FloatDistribution:
     """Numbers between two ends, drawn by their logarithm or evenly."""
-
-    low: float
-    high: float
-    log: bool = True
+    return optuna.distributions.FloatDistribution(low, high, log=log)
 
 
-@dataclass(frozen=True)
-class Choice:
-    """One of a few values."""
+_choice = optuna.distributions.CategoricalDistribution
 
-    values: tuple[Any, ...]
-
-
-_OF_BOTH: dict[str, Range | Choice] = {
-    "learning_rate": Range(1e-4, 5e-3),
-    "final_learning_rate_fraction": Range(0.005, 0.5),
-    "gamma": Choice((0.98, 0.985, 0.99, 0.995, 0.998)),
-    "std": Range(0.1, 0.8),
-    "hidden": Choice(((64, 64), (128, 128), (256, 256))),
+_OF_BOTH: _Space = {
+    "learning_rate": _range(1e-4, 5e-3),
+    "final_learning_rate_fraction": _range(0.005, 0.5),
+    "gamma": _choice((0.98, 0.985, 0.99, 0.995, 0.998)),
+    "std": _range(0.1, 0.8),
+    "hidden": _choice(("[64, 64]", "[128, 128]", "[256, 256]")),  # Optuna keeps no tuples
 }
 
-SPACES: dict[str, dict[str, Range | Choice]] = {
+SPACES: dict[str, _Space] = {
     "ppo": {
-        "num_steps": Choice((24, 48, 64, 96, 128, 256)),
-        "batch_size": Choice((512, 1024, 2048, 3072)),
-        "gae_lambda": Range(0.9, 0.99, log=False),
-        "final_std": Range(0.005, 0.1),
+        "num_steps": _choice((24, 48, 64, 96, 128, 256)),
+        "batch_size": _choice((512, 1024, 2048, 3072)),
+        "gae_lambda": _range(0.9, 0.99, log=False),
+        "final_std": _range(0.005, 0.1),
         **_OF_BOTH,
     },
     "sac": {
-        "gradient_steps": Choice((4, 8, 16)),
-        "batch_size": Choice((128, 256, 512)),
-        "target_entropy": Range(-8.0, -1.0, log=False),
+        "gradient_steps": _choice((4, 8, 16)),
+        "batch_size": _choice((128, 256, 512)),
+        "target_entropy": _range(-8.0, -1.0, log=False),
         **_OF_BOTH,
     },
 }
@@ -113,23 +107,6 @@ class Search:
     """Of each training, at equal distances. Trials are pruned at these."""
     robot: str = PAPER
     """Name of a robot."""
-
-    def config(self) -> dict[str, Any]:
-        """Everything, as JSON holds it."""
-        others = {name: value for name, value in vars(self).items() if name != "robot"}
-        return others | robot_setting(self.robot) | {"seeds": list(self.seeds)}
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What the trainings of one trial reached; an entry per seed."""
-
-    costs: tuple[float, ...]
-    """Least cost of the validation episodes; see above."""
-    success: tuple[float, ...]
-    """Share of the validation episodes in which the last policy succeeded."""
-    certified_regret: tuple[float, ...]
-    """Mean regret of the last policy on the certified episodes; an episode without success counts as failing at once."""
 
 
 def run(
@@ -159,7 +136,7 @@ def run(
     if search.learner not in SPACES:
         raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
     workers = Workers.of(workers)
-    jobs.claim(out, search.config(), "config.json")
+    jobs.claim(out, asdict(search), "config.json")
     try:
         study = open_study(search, out)
         with open_pool(workers, serial=workers.here == 1, per_core=1) as pool:
@@ -201,32 +178,16 @@ def _given(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
     return {**trial.system_attrs.get("fixed_params", {}), **trial.params}
 
 
-def encoded(space: Mapping[str, Range | Choice], settings: Any) -> dict[str, Any]:
+def encoded(space: Mapping[str, Any], settings: Any) -> dict[str, Any]:
     """The searched settings of a learner as Optuna's parameters."""
     values = {name: getattr(settings, name) for name in space}
-    return {name: json.dumps(value) if isinstance(space[name], Choice) else value for name, value in values.items()}
-
-
-def _proposed(trial: "optuna.Trial", space: Mapping[str, Range | Choice]) -> dict[str, Any]:
-    """The settings that Optuna proposes. Choices are JSON texts in its storage."""
-    chosen: dict[str, Any] = {}
-    for name, domain in space.items():
-        if isinstance(domain, Range):
-            chosen[name] = trial.suggest_float(name, domain.low, domain.high, log=domain.log)
-        else:
-            text = trial.suggest_categorical(name, [json.dumps(value) for value in domain.values])
-            chosen[name] = _decoded(text)
-    return chosen
-
-
-def _decoded(text: Any) -> Any:
-    value = json.loads(text) if isinstance(text, str) else text
-    return tuple(value) if isinstance(value, list) else value
+    return {name: json.dumps(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
     """A learner's settings with those that were chosen, and with the search's number of env steps."""
-    settings = replace(LEARNERS[search.learner].settings(search.task), **chosen)
+    decoded = {name: tuple(json.loads(value)) if isinstance(value, str) else value for name, value in chosen.items()}
+    settings = replace(LEARNERS[search.learner].settings(search.task), **decoded)
     iterations = max(1, round(search.env_steps / (settings.num_envs * settings.num_steps)))
     return replace(settings, evaluations=search.evaluations, iterations=iterations)
 
@@ -242,8 +203,8 @@ def _search(
         ended = len(_ended(study))
         on_trial(ended)
         while ended + len(running) < trials and pool.has_room():
-            trial = study.ask()
-            settings = settings_of(search, _proposed(trial, SPACES[search.learner]))
+            trial = study.ask(SPACES[search.learner])
+            settings = settings_of(search, trial.params)
             running[trial.number] = trial, settings
             pool.start(trial.number, _attempt, search, settings)
         if not running:
@@ -260,7 +221,7 @@ def _search(
                 study.tell(trial, state=optuna.trial.TrialState.PRUNED)  # others were better by then
                 pool.stop(event.key)
             elif event.kind == "yielded":
-                _end(study, trial, *event.value)
+                _end(study, trial, event.value)
                 continue
             elif event.kind != "ended":
                 deaths[event.key] += event.kind == "worker died"
@@ -268,59 +229,57 @@ def _search(
                 if deaths[event.key] < 2:
                     pool.start(event.key, _attempt, search, settings)
                     continue
-                _end(study, trial, "its worker died twice", 0.0)
+                _end(study, trial, {"error": "its worker died twice"})
             del running[event.key]
             write_tables(study, search, out)
 
 
-def _end(study: "optuna.Study", trial: "optuna.Trial", outcome: Outcome | str, minutes: float) -> None:
-    """Ends a trial with what it reached, or with what went wrong."""
-    if isinstance(outcome, str):
-        trial.set_user_attr("error", outcome)
+def _end(study: "optuna.Study", trial: "optuna.Trial", reached: Mapping[str, Any]) -> None:
+    """Ends a trial with what it reached, or with the error that ended it."""
+    for name, value in reached.items():
+        trial.set_user_attr(name, value)
+    if "error" in reached:
         study.tell(trial, state=optuna.trial.TrialState.FAIL)
-        return
-    for name, value in vars(outcome).items():
-        trial.set_user_attr(name, list(value))
-    trial.set_user_attr("cpu_minutes", minutes)
-    study.tell(trial, float(np.mean(outcome.costs)))
+    else:
+        study.tell(trial, float(np.mean(reached["costs"])))
 
 
-def _attempt(search: Search, settings: Any) -> Iterator[float | tuple[Any, float]]:
+def _attempt(search: Search, settings: Any) -> Iterator[float | dict[str, Any]]:
     """A trial, on a worker: as `outcome_of`, with the CPU time of it all, min. A failure is given in words."""
     began = time.process_time()
     try:
         for reached in outcome_of(search, settings):
-            if isinstance(reached, float):
-                yield reached
-            else:
-                yield reached, (time.process_time() - began) / 60
+            if isinstance(reached, dict):
+                reached["cpu_minutes"] = (time.process_time() - began) / 60
+            yield reached
     except (ValueError, FloatingPointError) as error:  # what torch answers to weights that are not finite
-        yield f"{error!r:.200}", (time.process_time() - began) / 60
+        yield {"error": f"{error!r:.200}", "cpu_minutes": (time.process_time() - began) / 60}
 
 
-def outcome_of(search: Search, settings: Any) -> Iterator[float | Outcome]:
+def outcome_of(search: Search, settings: Any) -> Iterator[float | dict[str, Any]]:
     """Trains with one set of settings on every seed.
 
     Yields:
-        After every evaluation the least cost so far, averaged over the seeds; at the end the outcome.
+        After every evaluation the least cost so far, averaged over the seeds. At the end lists with an entry per seed:
+        "costs", the least of the validation episodes; "success", the share of them in which the last policy succeeded; and
+        "certified_regret", its mean regret on the certified episodes, where no success counts as failing at once.
     """
     task, params = make_task(search.task, search.robot), named_robot(search.robot)
     learners = [LEARNERS[search.learner].make(task, params, settings, seed, None) for seed in search.seeds]
-    best, validations = [math.inf] * len(learners), []
+    best, measured = [math.inf] * len(learners), []
     for k in range(1, search.evaluations + 1):
         for learner in learners:
             while learner.iteration < learner.iterations * k // search.evaluations:
                 learner.iterate()
-        validations = [training.validate(learner.network, task, search.robot) for learner in learners]
-        costs = [(validation.cost + validation.mean_cost) / 2 for validation in validations]
+        measured = [training.score_and_validate(learner.network, task, search.robot) for learner in learners]
+        costs = [(validation.cost + validation.mean_cost) / 2 for _, validation in measured]
         best = [min(pair) for pair in zip(best, costs, strict=True)]
         yield float(np.mean(best))
-    scores = [training.score(learner.network, task, search.robot) for learner in learners]
-    yield Outcome(
-        costs=tuple(best),
-        success=tuple(validation.success for validation in validations),
-        certified_regret=tuple(score.cost_ratio - 1 for score in scores),
-    )
+    yield {
+        "costs": best,
+        "success": [validation.success for _, validation in measured],
+        "certified_regret": [score.cost_ratio - 1 for score, _ in measured],
+    }
 
 
 def _ended(study: "optuna.Study") -> list[Any]:
@@ -356,7 +315,7 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
     if not study.get_trials(states=(optuna.trial.TrialState.COMPLETE,)):
         return {}
     trial = study.best_trial
-    settings = settings_of(search, {name: _decoded(value) for name, value in trial.params.items()})
+    settings = settings_of(search, trial.params)
     best = {
         "learner": search.learner,
         "task": search.task,
@@ -386,12 +345,12 @@ def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:
     ]
     for task, chosen in settings.items():
         lines += ["", f"{TASKS[task].id}:"]
-        lines += [f"  {name}: {value}" for name, value in _ZOO[learner](chosen).items()]
+        lines += [f"  {name}: {value}" for name, value in _zoo(learner, chosen).items()]
     return "\n".join(lines) + "\n"
 
 
-def _zoo_common(chosen: Any) -> dict[str, Any]:
-    return {
+def _zoo(learner: str, chosen: Any) -> dict[str, Any]:
+    common = {
         "n_envs": chosen.num_envs,
         "n_timesteps": chosen.iterations * chosen.num_envs * chosen.num_steps,
         "policy": "MlpPolicy",
@@ -399,21 +358,16 @@ def _zoo_common(chosen: Any) -> dict[str, Any]:
         "batch_size": chosen.batch_size,
         "gamma": chosen.gamma,
     }
-
-
-def _zoo_ppo(chosen: Any) -> dict[str, Any]:
-    return _zoo_common(chosen) | {
-        "n_steps": chosen.num_steps,
-        "n_epochs": ppo.UPDATE_EPOCHS,
-        "gae_lambda": round(chosen.gae_lambda, 4),
-        "clip_range": ppo.CLIP_RANGE,
-        "max_grad_norm": ppo.MAX_GRAD_NORM,
-        "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, log_std_init={math.log(chosen.std):.3f})"',
-    }
-
-
-def _zoo_sac(chosen: Any) -> dict[str, Any]:
-    return _zoo_common(chosen) | {
+    if learner == "ppo":
+        return common | {
+            "n_steps": chosen.num_steps,
+            "n_epochs": ppo.UPDATE_EPOCHS,
+            "gae_lambda": round(chosen.gae_lambda, 4),
+            "clip_range": ppo.CLIP_RANGE,
+            "max_grad_norm": ppo.MAX_GRAD_NORM,
+            "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, log_std_init={math.log(chosen.std):.3f})"',
+        }
+    return common | {
         "buffer_size": chosen.buffer_size,
         "n_steps": chosen.n_steps,
         "train_freq": 1,
@@ -423,6 +377,3 @@ def _zoo_sac(chosen: Any) -> dict[str, Any]:
         "target_entropy": round(chosen.target_entropy, 3),
         "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, activation_fn=nn.SiLU)"',
     }
-
-
-_ZOO = {"ppo": _zoo_ppo, "sac": _zoo_sac}

@@ -25,6 +25,7 @@ from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import average_of, spec_for, started
 from ballbot_train.learning.fitting import start_as_lqr
+from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ _RESTING = 25  # last control steps that lack the goal, where noise keeps the ro
 _STEEPEST = 10.0  # slope of the logarithm of an episode's cost with a state: steeper ones, of robots that fall, are cut
 _PATIENCE = 5  # control steps for which episodes go on when all have reached the goal
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
+_STATE = ("iteration", "_trained", "_average", "_optimizer", "_batch")
 
 
 class _Step(NamedTuple):
@@ -126,20 +128,10 @@ class WholeEpisodes:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "iteration": self.iteration,
-            "network": self._trained.state_dict(),
-            "average": self._average.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "batch": list(cast(BatchState, self._batch.state)),
-        }
+        return state_of(self, _STATE)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.iteration = state["iteration"]
-        self._trained.load_state_dict(state["network"])
-        self._average.load_state_dict(state["average"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._batch.state = BatchState(*state["batch"])
+        load_state(self, _STATE, state)
 
     def _episodes(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Runs new episodes; returns their costs (B,), which have gradients, and whether they ended well (B,)."""

@@ -1,15 +1,15 @@
-"""The controls of the live page. Each shows what holds in the playground, and changes it for the browser that drives."""
+"""The controls of the live page. Each shows what holds in the playground, and changes it."""
 
 import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ballbot_gym import files
 from ballbot_gym.robots import ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.plots import MOST_GHOSTS
-from ballbot_train.play.simulation import AT_END, LARGEST_PUSH
+from ballbot_train.play.simulation import LARGEST_PUSH
 from ballbot_train.play.world import PLANT
 from ballbot_train.report import labels
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 SPEEDS = (0.1, 2.0)
 """Least and greatest simulated seconds per second."""
+
+MOST_GHOSTS = 4
 
 _FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip), where the simulation runs"
 
@@ -40,9 +42,8 @@ class Controls:
         with tabs.add_tab("Change"):
             self._build_plant()
         with tabs.add_tab("Scores"):
+            self._button("Save the episode so far", self._save, hint="a trajectory file, for ballbot replay")
             self._scores = self._gui.add_markdown("")
-        with tabs.add_tab("Save"):
-            self._build_saving()
         self.refresh()
 
     def refresh(self) -> None:
@@ -64,7 +65,7 @@ class Controls:
     # --- building blocks ---
 
     def _bind(self, control: Any, apply: Callable[[Any], None], read: Callable[[], Any]) -> Any:
-        """Lets a control change the playground. What a watcher changes, and what is refused, goes back to what holds."""
+        """Lets a control change the playground. What is refused goes back to what holds."""
         control.on_update(self._page.asking(lambda _, value: apply(value)))
         self._bound.append((control, read))
         return control
@@ -108,7 +109,6 @@ class Controls:
                 "At rest": playground.start_at_rest,
             }
             self._button_group("Start", starts, hint="key: N for a random one")
-            self._bind_attribute(gui.add_dropdown("At the end", AT_END), playground, "at_end")
         self._key("pause or play", "space", self._toggle)
         self._key("restart", "R", playground.restart)
         self._key("random start", "N", playground.start_random)
@@ -131,11 +131,6 @@ class Controls:
                     lambda stress=stress: playground.plant[stress],
                 )
             self._button("All as the controllers believe", lambda _: self._reset_plant())
-
-    def _build_saving(self) -> None:
-        saver = self._page.saver
-        self._gui.add_markdown(f"Files are written to `{saver.out}`, and this page downloads them.")
-        self._button("Trajectory file", saver.save_trajectory)
 
     def _build_task(self) -> None:
         """Controls that differ from task to task."""
@@ -206,6 +201,12 @@ class Controls:
     def _step(self) -> None:
         self._page.paused = True
         self._page.single_steps += 1
+
+    def _save(self, client: Any) -> None:
+        """Hands viser's client the trajectory of the episode so far."""
+        episode, name = self._playground.trajectory(), f"{self._playground.world.task_name}.npz"
+        content = files.npz({"t": episode.t, "x": episode.x, "u": episode.u})
+        client.send_file_download(name, content, save_immediately=True)
 
     def _push(self) -> None:
         bearing = math.radians(self._bearing)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, wait
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -106,7 +105,7 @@ class Crew:
         return runner
 
     def _remove(self, runner: Runner) -> None:
-        _cancel(runner.making, runner.following)
+        _cancel(runner.making)
         runner.close()
         self.runners.remove(runner)
 
@@ -120,21 +119,6 @@ class Crew:
             runner.take_controller(None, self.steps)
             runner.name = runner.wanted
             self.order(runner)
-        self._order_optimum()
-
-    def go_on(self) -> None:
-        """Begins another episode where the robots are. A ghost that has failed begins where the main robot is."""
-        self._x = self.main.x
-        for runner in self.runners:
-            ahead, failed = runner.following, runner.violated != ""
-            if failed:
-                runner.place(self._x)
-            runner.restart_cost()
-            planned = not failed and ahead is not None and ahead.done() and ahead.exception() is None
-            if ahead is not None and planned and ahead.result()[0] == runner.wanted == runner.name:
-                runner.take_controller(ahead.result()[2], self.steps)
-            else:
-                self.order(runner)
         self._order_optimum()
 
     def step(
@@ -152,18 +136,12 @@ class Crew:
 
     # --- controllers ---
 
-    def order(self, runner: Runner, ahead: int = 0) -> None:
-        """Asks for the controller that a robot wants, from now on or for an episode that begins some steps ahead."""
-        name, step, compute = runner.wanted, self.steps + ahead, self.background.compute
-        x = np.array(runner.expected(self.steps, ahead) if ahead else runner.x)
-        made = partial(_make, name, self.world.task, self.world.params, x, np.array(self._c), compute)
-        future = self.background.submit(lambda: (name, step, made()))
-        _cancel(runner.following)
-        if ahead:
-            runner.following = future
-        else:
-            _cancel(runner.making)
-            runner.making, runner.following = future, None
+    def order(self, runner: Runner) -> None:
+        """Asks for the controller that a robot wants, from now on."""
+        name, step, compute = runner.wanted, self.steps, self.background.compute
+        problem = self.world.task, self.world.params, np.array(runner.x), np.array(self._c)
+        _cancel(runner.making)
+        runner.making = self.background.submit(lambda: (name, step, _make(name, *problem, compute)))
 
     def _order_optimum(self) -> None:
         _cancel(self._optimum)
@@ -186,7 +164,7 @@ class Crew:
 
     def wait(self) -> None:
         """Waits for everything that is being made; raises a TimeoutError if that takes too long."""
-        jobs = [self._optimum, *(job for runner in self.runners for job in (runner.making, runner.following))]
+        jobs = [self._optimum, *(runner.making for runner in self.runners)]
         if wait([job for job in jobs if job is not None], _SETTLE).not_done:
             raise TimeoutError(f"no plan in {_SETTLE:g} s")
 
@@ -212,10 +190,9 @@ class Crew:
             self.order(runner)
 
 
-def _cancel(*jobs: Future | None) -> None:
-    for job in jobs:
-        if job is not None:
-            job.cancel()
+def _cancel(job: Future | None) -> None:
+    if job is not None:
+        job.cancel()
 
 
 def _make(

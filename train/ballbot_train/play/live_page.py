@@ -1,4 +1,4 @@
-"""The page of the live playground: who drives, what is shown when, and the loop that keeps the simulation in real time.
+"""The page of the live playground: what is shown when, and the loop that keeps the simulation in real time.
 
 viser calls back in a thread of its own. What a browser asks for goes into a queue, and the loop of the simulation does it
 between two steps. So the playground itself needs no locks.
@@ -10,7 +10,6 @@ import math
 import queue
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,9 @@ from ballbot_train.escaping import markdown_text
 from ballbot_train.play import views
 from ballbot_train.play.clock import Clock
 from ballbot_train.play.controls import Controls
-from ballbot_train.play.plots import Plots
-from ballbot_train.play.saving import Saver
 from ballbot_train.play.simulation import Playground
 
-_DRAW_HZ, _PLOT_HZ, _TEXT_HZ = 30.0, 5.0, 4.0
+_DRAW_HZ, _TEXT_HZ = 30.0, 4.0
 _STARVED = 0.25  # s, after which a moment is drawn even if steps are due
 _MOST_STEPS = 10  # between two looks at the requests
 _IDLE = 0.02  # s, between two looks while nothing moves
@@ -37,34 +34,26 @@ _HELP = "Drag the robot and let go: every robot gets the same push."
 
 
 class PlayPage:
-    """Controls, plots and scene of a playground in a viewer, and the loop that runs them."""
+    """Controls and scene of a playground in a viewer, and the loop that runs them. Who may open the page may use them."""
 
-    def __init__(self, playground: Playground, viewer: Viewer, out: Path):
+    def __init__(self, playground: Playground, viewer: Viewer):
         """Builds the page; `run` brings it to life.
 
         Args:
             playground: what is simulated.
             viewer: where it is shown. The page closes neither of them.
-            out: folder of saved files.
         """
         self.playground, self.viewer = playground, viewer
         self.clock = Clock(playground.world.task.control_dt)
         self.paused = False
         self.single_steps = 0
         """To do in a pause."""
-        self.driver: int | None = None
-        """Id of the browser that drives; the next that touches anything, if None."""
         self.visitors: set[int] = set()
         """Ids of the browsers that show the page. While there are none, time stands still and nothing is computed."""
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stopped = self._moving = False
-        gui = viewer.server.gui
-        self._status = gui.add_markdown("")
-        self._role_text = gui.add_markdown("", visible=False)
-        self._role_button = gui.add_button("Take the controls", visible=False)
-        self._role_button.on_click(self._take_over)
-        self.saver = Saver(playground, out)
-        self._controls, self._plots = Controls(self), Plots(playground, gui)
+        self._status = viewer.server.gui.add_markdown("")
+        self._controls = Controls(self)
         viewer.on_grab = self._grab
         viewer.server.on_client_connect(self._on_connect)
         viewer.server.on_client_disconnect(self._on_disconnect)
@@ -75,7 +64,7 @@ class PlayPage:
     def run(self, seconds: float = math.inf) -> None:
         """Simulates and draws in real time until `stop` is called, or for some seconds."""
         end = time.perf_counter() + seconds
-        next_draw = next_plot = next_text = drawn = 0.0
+        next_draw = next_text = drawn = 0.0
         while not self._stopped and (now := time.perf_counter()) < end:
             self._do_requests(0.0 if self.visitors else min(_LONGEST_REST, end - now))
             if not self.visitors:
@@ -89,10 +78,7 @@ class PlayPage:
             if now >= next_draw and (self.clock.wait() > 0 or now - drawn > _STARVED):
                 self.viewer.draw(views.drawing(self.playground))
                 next_draw, drawn = max(next_draw + 1 / _DRAW_HZ, now), now
-                if now >= next_plot:
-                    self._plots.show()
-                    next_plot = now + 1 / _PLOT_HZ
-                elif now >= next_text:
+                if now >= next_text:
                     self._write()
                     next_text = now + 1 / _TEXT_HZ
             until = min(next_draw, end) - time.perf_counter()
@@ -141,12 +127,7 @@ class PlayPage:
             except Exception as error:
                 self.playground.crew.notice = str(error) or repr(error)
 
-    # --- who drives ---
-
-    def ask(self, client_id: int | None, action: Callable[[], object]) -> None:
-        """Does what a browser asks for, if it drives. What a watcher has changed goes back to what holds."""
-        if client_id is not None:  # not set by this program
-            self.request(action if self.drives(client_id) else lambda: None)
+    # --- browsers ---
 
     def asking(self, action: Callable[[Any, Any], object]) -> Any:
         """A callback of viser that asks for something, by viser's client and the value that the control has got.
@@ -156,43 +137,23 @@ class PlayPage:
 
         async def asked(event: Any) -> None:
             value = getattr(event.target, "value", None)
-            self.ask(event.client_id, lambda: action(event.client, value))
+            if event.client_id is not None:  # not set by this program
+                self.request(lambda: action(event.client, value))
 
         return asked
-
-    def drives(self, client_id: int) -> bool:
-        """Whether this browser drives. The first one that asks takes a free seat."""
-        if self.driver is None:
-            self.driver = client_id
-        return self.driver == client_id
 
     def _grab(self, client_id: int, phase: str, vector: np.ndarray) -> None:
         """A drag pushes when it ends, so that the arrow ends where it did."""
         if phase == "end":
             x, y = (vector / PUSH_SCALE).tolist()
-            self.ask(client_id, lambda: self.playground.push(x, y))
+            self.request(lambda: self.playground.push(x, y))
 
     async def _on_connect(self, client: Any) -> None:
         self.visitors.add(client.client_id)
-        self.drives(client.client_id)
         self.request(lambda: None)
-        self._show_roles()
 
     async def _on_disconnect(self, client: Any) -> None:
         self.visitors.discard(client.client_id)
-        if self.driver == client.client_id:
-            self.driver = None
-        self._show_roles()
-
-    async def _take_over(self, event: Any) -> None:
-        self.driver = event.client_id
-
-    def _show_roles(self) -> None:
-        if self._stopped:
-            return
-        count = len(self.visitors)
-        self._role_text.content = f"{count} browsers show this page. One drives, the others watch."
-        self._role_text.visible = self._role_button.visible = count > 1
 
     # --- words ---
 

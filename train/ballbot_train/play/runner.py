@@ -1,10 +1,8 @@
 """One ballbot of the playground: a simulator, a controller, what happened so far."""
 
 import math
-import time
 from collections import deque
 from concurrent.futures import Future
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,22 +17,7 @@ from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.trajectory import Trajectory
 
 TRACE_STEPS = 400
-"""Control steps that the trace on the floor and the plots go back."""
-
-
-class Sample(NamedTuple):
-    """What a step looks like in the plots."""
-
-    seconds: float
-    """Since the playground was opened or restarted."""
-    tilt: float
-    """rad."""
-    force: float
-    """N, its length."""
-    cost: float
-    """Of the episode so far, without the price of a failure."""
-    act: float
-    """s, computing time of the controller."""
+"""Control steps that the trace on the floor goes back."""
 
 
 class Runner:
@@ -44,8 +27,7 @@ class Runner:
         self.name = self.wanted = name
         """Under which controller it runs, and which it shall have as soon as that is made."""
         self.making: Future | None = None
-        self.following: Future | None = None
-        """What makes the wanted controller, and the one for the next episode."""
+        """What makes the wanted controller."""
         self.controller: Controller | None = None
         self.x: State = (0.0,) * 8
         self.force = (0.0, 0.0)
@@ -55,10 +37,8 @@ class Runner:
         self.arrived = False
         """Whether the goal of a first-exit task is reached."""
         self.trace: deque[tuple[float, float]] = deque(maxlen=TRACE_STEPS)
-        self.samples: deque[Sample] = deque(maxlen=TRACE_STEPS)
         self._task, self._nominal = task, params
         self._controller_start = 0
-        self._act_seconds = 0.0
         self._simulator = make_simulator(physics, params, task.control_dt)
         self.set_plant(Randomization())
         self.begin(self.x)
@@ -78,41 +58,22 @@ class Runner:
 
     def begin(self, x: State) -> None:
         """Starts an episode in state x (8,)."""
-        self.place(x)
-        self.trace.clear()
-        self.samples.clear()
-        self._disturbance.begin(self._drawn)
-        self.restart_cost()
-
-    def restart_cost(self) -> None:
-        """Starts an episode where the robot is."""
-        self.cost = 0.0
-        self._states: list[State] = [self.x]
-        self._forces: list[tuple[float, float]] = []
-
-    def place(self, x: State) -> None:
-        """Puts the robot upright, or however x (8,) says."""
-        self.x, self.force = x, (0.0, 0.0)
+        self.x, self.force, self.cost = x, (0.0, 0.0), 0.0
         self.violated, self.arrived = "", False
         self._simulator.reset(x)
+        self.trace.clear()
+        self._disturbance.begin(self._drawn)
+        self._states: list[State] = [x]
+        self._forces: list[tuple[float, float]] = []
 
     def take_controller(self, controller: Controller | None, step: int) -> None:
         """Goes on under another controller, that was reset for this step, counted from the opening of the playground."""
         self.controller, self._controller_start = controller, step
 
-    def seconds_of_controller(self, step: int) -> float:
-        """How long ago the controller was reset, s, at a step."""
-        return (step - self._controller_start) * self._task.control_dt
-
     def rest_of_plan(self, step: int) -> np.ndarray | None:
         """(n, 8) states of the plan that its controller tracks, from a step on; None if it tracks none."""
         plan = getattr(self.controller, "plan", None)
         return None if plan is None else plan.trajectory.x[min(step - self._controller_start, len(plan.trajectory.u)) :]
-
-    def expected(self, step: int, ahead: int) -> State:
-        """The state (8,) in which it will be some control steps after a step, as far as its controller knows."""
-        rest = self.rest_of_plan(step)
-        return self.x if rest is None else tuple(rest[min(ahead, len(rest) - 1)].tolist())
 
     def has_no_plan_left(self, step: int) -> bool:
         """Whether it is on its way, but its controller has come to the end of the plan within which it predicts."""
@@ -139,9 +100,8 @@ class Runner:
         """
         assert self.controller is not None
         seen = self._plant.sensed(self.x, noise, self._drawn, 0.0) if self._plant.is_noisy else self.x
-        began = time.perf_counter()
-        u = np.asarray(self.controller.act(self.seconds_of_controller(step), np.array(seen)), np.float64)
-        self._act_seconds = time.perf_counter() - began
+        t = (step - self._controller_start) * self._task.control_dt
+        u = np.asarray(self.controller.act(t, np.array(seen)), np.float64)
         if u.shape != (2,) or not np.isfinite(u).all():
             raise FloatingPointError(f"{self.name} commands {u} N")
         limit = self._nominal.force_limit
@@ -167,7 +127,7 @@ class Runner:
             c: constants of the episode.
             seconds_left: s, of the episode after this step: what a failure costs.
         """
-        task, dt = self._task, self._task.control_dt
+        task = self._task
         if any(push):
             self.x = self._states[-1] = tuple(map(float, dynamics.pushed(self.true, self.x, push)))
             self._simulator.reset(self.x)
@@ -181,8 +141,6 @@ class Runner:
         self.arrived = task.first_exit and did.success > 0
         if all(map(math.isfinite, x)):
             self.x = x
-        sample = Sample((step + 1) * dt, dynamics.tilt(self.x), math.hypot(*self.force), self.cost, self._act_seconds)
-        self.samples.append(sample)
         self.trace.append((self.x[0], self.x[1]))
         self._states.append(self.x)
         self._forces.append(self.force)

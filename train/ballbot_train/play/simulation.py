@@ -6,7 +6,7 @@ made and plans are found in the background, while the robots go on under those t
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,11 +20,6 @@ from ballbot_train.play.runner import Runner, failure_word
 from ballbot_train.play.world import PLANT, World, drawn_robot, randomization, severity
 from ballbot_train.report import labels
 
-AtEnd = Literal["go on", "again", "next", "stop"]
-"""What comes after an episode: another one from where the robot is, the same one, another one, or nothing."""
-
-AT_END: tuple[AtEnd, ...] = get_args(AtEnd)
-
 LARGEST_PUSH = 250.0
 """N·s, of a push; larger ones are cut to this length."""
 
@@ -32,9 +27,8 @@ FIRST_PUSH = (79.0, 43.1)
 """N·s: the push with which an episode at rest begins fells LQR. Its length is 90 N·s, as on the page of `ballbot page`."""
 _FIRST_PUSH_AFTER = 1.0  # s
 
-_PAUSE = 1.5  # s, between the end of an episode and the next
+_PAUSE = 1.5  # s, between the end of a robot and its next episode
 _PUSH_SHOWN = 0.3  # s, for which a push is drawn
-_AHEAD = 1.0  # s before the end of an episode at which the plan for the next one is begun
 _EPISODES_KEPT = 100
 _LEAST_COST = 0.01  # of an optimum to which a cost is compared; one that starts at rest costs nothing
 
@@ -78,7 +72,6 @@ class Playground:
         episode: int | Literal["rest"] | None = 0,
         seed: int = 0,
         robot: str = PAPER,
-        policies: Sequence[str] = (),
         other_process: bool = False,
         randomization: str | None = None,
     ):
@@ -93,19 +86,16 @@ class Playground:
             episode: index of a certified episode; "rest" for standing at the origin; None for a random start.
             seed: of random starts, sensor noise and random pushes.
             robot: name in `robots.ROBOTS`.
-            policies: paths of more policies that can be chosen in the tasks that they are made for.
             other_process: whether another process plans, so that planning takes no time from a simulation in real time. A
                 script that asks for it needs the guard `if __name__ == "__main__":`.
             randomization: name of a track: every episode has a robot of it, which the controllers are not told.
 
         Raises:
             ValueError: an unknown task, robot, controller, episode or track.
-            PolicyError: one of `policies` is missing or damaged.
         """
-        world = World(task, robot, policies)
+        world = World(task, robot)
         controller = world.best if controller is None else controller
         world.check_controllers(controller, *ghosts)
-        self.at_end: AtEnd = "go on"
         self.scores: list[Score] = []
         """Of the last episodes of the main robot."""
         self.plant = dict.fromkeys(PLANT, 0.0)
@@ -175,7 +165,7 @@ class Playground:
         if self.ended:
             self._pause_left -= 1
             if not self.ended:
-                self._begin_next()
+                self.restart()
             return True
         self.crew.plan_again()
         if self.crew.preparing:
@@ -293,11 +283,6 @@ class Playground:
 
     def _after_step(self) -> None:
         task, main = self.world.task, self.main
-        ahead = round(_AHEAD / task.control_dt)
-        goes_on = self.at_end == "go on" and not task.first_exit and not main.stands_still
-        if goes_on and self.elapsed == task.steps - ahead:
-            for runner in self.crew.runners:
-                self.crew.order(runner, ahead)
         if self.elapsed < task.steps and not main.stands_still:
             return
         best = self.optimum_cost
@@ -305,22 +290,10 @@ class Playground:
         changed = any(self.plant.values()) or self._track.active
         score = Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated, changed)
         self.scores = [*self.scores, score][-_EPISODES_KEPT:]
-        if goes_on:
-            self.start, self.episode, self.elapsed = (np.array(main.x), self.start[1]), None, 0
-            self._at_rest = False
-            self.crew.go_on()
-        else:
+        if task.first_exit or main.stands_still:
             self._pause_left = round(_PAUSE / task.control_dt)
-
-    def _begin_next(self) -> None:
-        if self.at_end == "stop":
-            self._pause_left = 1  # until the user asks for something
-        elif self.at_end == "next" and self.episode is not None:
-            self.start_certified((self.episode + 1) % self.world.episodes)
-        elif self.at_end == "next":
-            self.start_random()
-        else:
-            self.restart()
+        else:  # another one from where the robot is
+            self._begin((np.array(main.x), self.start[1]), None)
 
     def _take_push(self) -> tuple[float, float]:
         """The push that was asked for, N·s."""

@@ -2,29 +2,16 @@
 
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ballbot_gym import dynamics
 from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
-from ballbot_train.play.runner import Runner, Sample, failure_word
+from ballbot_train.play.runner import Runner, failure_word
 from ballbot_train.play.simulation import Playground
 from ballbot_train.report import labels
 
 _PLAN_POINTS = 60  # of a drawn plan
-
-
-class History(NamedTuple):
-    """What the plots show. A robot that joined later or has failed keeps its first and last values."""
-
-    seconds: np.ndarray
-    """(n,) since the playground was opened."""
-    lines: dict[str, np.ndarray]
-    """(n, 4) tilt, rad, force, N, cost so far and computing time of the controller, s, by the name of the controller, the
-    main robot's first."""
-    optimum: np.ndarray
-    """(n,) what the optimum has cost so far; 0 where that is not known."""
 
 
 def drawing(playground: Playground) -> Drawing:
@@ -32,7 +19,7 @@ def drawing(playground: Playground) -> Drawing:
     main, push = playground.main, playground.shown_push
     robots, paths = [], []
     for i, runner in reversed(list(enumerate(playground.crew.runners))):
-        name, tint = f"ghost {i}" if i else "robot", color(runner, i)
+        name, tint = f"ghost {i}" if i else "robot", _color(runner, i)
         force = np.array(runner.force) if runner is main and not main.violated else None
         alpha = GHOST_OPACITY if i else 1.0
         x, pushed = np.array(runner.x), push if runner is main else None
@@ -41,39 +28,14 @@ def drawing(playground: Playground) -> Drawing:
         if len(runner.trace) > 1:
             paths.append(GroundPath(np.array(runner.trace), tint, name=name))
     if (planned := _plan(playground)) is not None:
-        paths.append(GroundPath(planned, color(main, 0), dashed=True, name="plan"))
+        paths.append(GroundPath(planned, _color(main, 0), dashed=True, name="plan"))
     markers = tuple(playground.world.task.markers(playground.start[1]))
     return Drawing(playground.world.params, tuple(robots), tuple(paths), markers)
 
 
-def color(runner: Runner, i: int) -> str:
+def _color(runner: Runner, i: int) -> str:
     """The colour of the `i`-th robot."""
     return labels.color(Path(runner.name).stem, i)
-
-
-def colors(playground: Playground) -> dict[str, str]:
-    """The colours of the robots by the names of their controllers, the main robot's first."""
-    found: dict[str, str] = {}
-    for i, runner in enumerate(playground.crew.runners):
-        found.setdefault(runner.name, color(runner, i))
-    return found
-
-
-def history(playground: Playground, points: int) -> History:
-    """The last seconds of every robot, at this many times at most."""
-    times = np.array([sample.seconds for sample in playground.main.samples] or [0.0])
-    times = times[np.linspace(0, len(times) - 1, min(points, len(times))).round().astype(int)]
-    lines = {}
-    for runner in playground.crew.runners:
-        rows = np.array(runner.samples or [Sample(times[0], 0.0, 0.0, 0.0, 0.0)])
-        lines.setdefault(runner.name, np.stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:]], axis=1))
-    optimum, costs = np.zeros(len(times)), playground.crew.optimum
-    if costs is not None and playground.elapsed:
-        steps = np.round(times / playground.world.task.control_dt).astype(int) - (
-            playground.crew.steps - playground.elapsed
-        )
-        optimum = np.where(steps >= 0, costs[np.clip(steps, 0, len(costs) - 1)], 0.0)
-    return History(times, lines, optimum)
 
 
 def status(playground: Playground) -> str:

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
-from ballbot_train.evaluation.controllers import is_expert, is_made_for, is_saved_model, made_for, names
+from ballbot_train.evaluation.controllers import is_expert, is_made_for, is_saved_model, names
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.policy_files import BEST, PolicyError, shipped_policies
 
@@ -43,12 +43,8 @@ PLANT: dict[str, Span] = {
 class World:
     """A task for a robot. Whatever is unknown or out of bounds is refused with a ValueError and changes nothing."""
 
-    def __init__(self, task: str, robot: str, policies: Sequence[str] = ()):
-        """A task and a robot by name. `policies` are paths of files that can be chosen where they fit.
-
-        Raises:
-            PolicyError: one of them is missing or damaged.
-        """
+    def __init__(self, task: str, robot: str):
+        """A task and a robot by name."""
         check_names("task", [task], TASKS)
         check_names("robot", [robot], ROBOTS)
         self.task_name, self.robot, self.params = task, robot, named_robot(robot)
@@ -59,9 +55,7 @@ class World:
         self.certified: certified.EvaluationSet | None = None
         with contextlib.suppress(certified.CertificateError):
             self.certified = certified.load(self.task, robot)
-        for policy in policies:
-            made_for(policy)  # whether it can be read
-        self.offer(*policies)
+        self.offer()
 
     @property
     def episodes(self) -> int:

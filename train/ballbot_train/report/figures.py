@@ -30,9 +30,6 @@ from ballbot_train.report.labels import LABELS, color, label
 if TYPE_CHECKING:
     from ballbot_train.evaluation.fresh import Bin, FreshResult  # it imports torch
 
-_MAP_CELLS = 20  # along each axis of a map
-_CELL_EPISODES = 5  # in a cell, at least; the share of fewer is chance
-
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 
 
@@ -222,15 +219,10 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
 
 
 def fresh_figure(result: "FreshResult", bins: "Sequence[Bin]") -> Figure:
-    """Fresh episodes by every quantity that makes them hard: episodes without success, mean cost, and maps of two quantities.
-
-    Bars have 95 % Wilson intervals. A map shows the share of episodes without success by one quantity and the next, where a
-    cell holds at least 5 episodes; others are white.
-    """
+    """Fresh episodes by every quantity that makes them hard: the share without success, with its interval, and mean cost."""
     names = list(result.measures)
-    lines = 3 if len(names) > 1 else 2
-    figure = Figure(figsize=(max(6.0, 3.6 * len(names)), 0.9 + 2.7 * lines), layout="constrained")
-    axes = figure.subplots(lines, len(names), squeeze=False)
+    figure = Figure(figsize=(max(6.0, 3.6 * len(names)), 6.3), layout="constrained")
+    axes = figure.subplots(2, len(names), squeeze=False)
     summary = result.summary()
     figure.suptitle(
         f"{label(result.policy)} on {len(result)} fresh episodes of {result.task.id}:\n"
@@ -240,8 +232,6 @@ def fresh_figure(result: "FreshResult", bins: "Sequence[Bin]") -> Figure:
     for k, name in enumerate(names):
         _plot_bins(axes[0][k], axes[1][k], [entry for entry in bins if entry.measure == name and entry.episodes])
         axes[1][k].set_xlabel(name, fontsize=9)
-        if lines == 3:
-            _plot_map(figure, axes[2][k], result, name, names[(k + 1) % len(names)])
     axes[0][0].set_ylabel("without success, %\n(dark: limit violated)", fontsize=9)
     axes[1][0].set_ylabel("mean cost", fontsize=9)
     return figure
@@ -261,18 +251,6 @@ def _plot_bins(above: Axes, below: Axes, bins: "Sequence[Bin]") -> None:
     below.bar(middles, [entry.cost_mean for entry in bins], widths, color="#1f6fb2")
     for axis in (above, below):
         axis.grid(alpha=0.3)
-
-
-def _plot_map(figure: Figure, axis: Axes, result: "FreshResult", name: str, other: str) -> None:
-    x, y = result.measures[name], result.measures[other]
-    shape = [min(_MAP_CELLS, max(4, len(result) // 100))] * 2
-    count, *edges = np.histogram2d(x, y, shape)
-    missed, *_ = np.histogram2d(x, y, edges, weights=(~result.success).astype(float))
-    share = np.divide(100 * missed, count, out=np.full_like(count, np.nan), where=count >= _CELL_EPISODES)
-    mesh = axis.pcolormesh(*edges, share.T, cmap="YlOrRd", vmin=0, vmax=np.nanmax(share, initial=1.0))
-    figure.colorbar(mesh, ax=axis, label="without success, %")
-    axis.set_xlabel(name, fontsize=9)
-    axis.set_ylabel(other, fontsize=9)
 
 
 def add_circles(axis: Axes, circles: Sequence[Circle]) -> None:

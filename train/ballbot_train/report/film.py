@@ -90,7 +90,7 @@ def _reported(pictures: Iterator[np.ndarray], on_frame: Callable[[], None]) -> I
 
 
 def _mp4(pictures: Iterator[np.ndarray], fps: int, path: Path) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # interrupted, ffmpeg may still write
         unfinished = Path(folder) / path.name
         options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
         try:

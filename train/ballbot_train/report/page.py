@@ -1,14 +1,14 @@
 """One self-contained HTML page: tables that sort, figures, and a replay in 3D.
 
-A page is a list of `Section`s. Everything is embedded, so the file opens offline and can
-be moved. The templates, scripts and styles are in `assets/`. The templates escape all text.
+Everything is embedded, so the file opens offline and can be moved. The templates, scripts and styles are in `assets/`. The
+templates escape all text.
 """
 
 import base64
 import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import jinja2
@@ -25,79 +25,64 @@ _REPLAY_SCRIPTS = ("scene.js", "replay.js")
 _REPLAY_DT = 0.02  # s, between the states in the page
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of the page."""
-
-    title: str
-    body: Markup | str
-    """HTML if it is a `Markup`; a plain string is text, and is escaped."""
-    lead: str = ""
-    """One or two sentences above the body, plain text."""
-    scripts: tuple[str, ...] = ()
-    """The scripts that the body needs, by their names in `assets/`."""
-
-
-def write_report(title: str, sections: Iterable[Section | None], facts: Mapping[str, object], path: Path) -> Path:
-    """Writes the page.
+def write_report(
+    path: Path,
+    title: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    replays: Sequence[Replay],
+    playground: str,
+    pictures: Mapping[str, Sequence[Path]],
+    facts: Mapping[str, object],
+) -> Path:
+    """Writes the page of a leaderboard. What has no data is left out.
 
     Args:
+        path: of the file.
         title: heading of the page.
-        sections: the parts in their order; a part without data is None and is left out.
+        header: names of the table's columns.
+        rows: of the table, which the reader can sort by any column, and filter by the words of its first column.
+        replays: episodes in 3D, one scene for each take, with play, pause and scrubbing.
+        playground: a page that is shown within this one.
+        pictures: PNGs by the title above them, captioned with their names.
         facts: what the results depend on, such as versions; shown at the foot of the page.
-        path: path of the file.
-
-    Returns:
-        path.
     """
-    shown = [section for section in sections if section is not None]
-    names = dict.fromkeys(name for section in shown for name in section.scripts)
+    shown = {
+        name: [{"name": each.stem, "base64": base64.b64encode(files.read(each)).decode()} for each in group]
+        for name, group in pictures.items()
+    }
     page = render(
         "page.html.j2",
         title=title,
-        sections=shown,
+        header=header,
+        rows=rows,
+        word_columns=_WORD_COLUMNS,
+        data=_replay_data(replays),
+        playground=playground,
+        pictures=shown,
         facts=facts,
         style=asset("style.css"),
-        scripts=[asset(name) for name in names],
+        scripts=[asset(name) for name in ("table.js", *_REPLAY_SCRIPTS)],
     )
     return files.write(path, page)
 
 
-def table_section(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], lead: str = "") -> Section:
-    """A table that the reader can sort by any column, and filter by the words of its first column."""
-    table = render("table.html.j2", header=header, rows=rows, word_columns=_WORD_COLUMNS)
-    return Section(title, table, lead, ("table.js",))
-
-
-def pictures_section(title: str, pictures: Iterable[Path], lead: str = "") -> Section | None:
-    """Embedded PNGs one under another, captioned with their names; None if there are none."""
-    shown = [{"name": path.stem, "base64": base64.b64encode(files.read(path)).decode()} for path in pictures]
-    return Section(title, render("pictures.html.j2", pictures=shown), lead) if shown else None
-
-
-def replay_section(title: str, replays: Sequence[Replay], lead: str = "") -> Section | None:
-    """Episodes in 3D, one scene for each take, with play, pause and scrubbing; None if there are no takes."""
-    replays = [replay for replay in replays if replay.takes]
-    if not replays:
-        return None
-    return Section(title, _replays(replays), lead, _REPLAY_SCRIPTS)
-
-
 def replay_page(replay: Replay) -> str:
-    """The same as a page of its own."""
+    """An episode in 3D as a page of its own."""
     page = render(
         "frame.html.j2",
         title=replay.title,
-        body=_replays([replay]),
+        data=_replay_data([replay]),
         style=asset("style.css"),
         scripts=[asset(name) for name in _REPLAY_SCRIPTS],
     )
     return str(page)
 
 
-def _replays(replays: Sequence[Replay]) -> Markup:
-    data = scene_data(replays[0].params) | {"episodes": [_replay_data(replay) for replay in replays]}
-    return render("replay.html.j2", data=data)
+def _replay_data(replays: Sequence[Replay]) -> dict[str, object]:
+    """What replay.html.j2 shows; empty without replays."""
+    episodes = [_episode_data(replay) for replay in replays if replay.takes]
+    return scene_data(replays[0].params) | {"episodes": episodes} if episodes else {}
 
 
 def scene_data(params: BallbotParams) -> dict[str, object]:
@@ -134,7 +119,7 @@ def asset(name: str) -> Markup:
     return Markup((_ASSETS / name).read_text(encoding="utf-8"))
 
 
-def _replay_data(replay: Replay) -> dict[str, object]:
+def _episode_data(replay: Replay) -> dict[str, object]:
     return {
         "title": replay.title,
         "dt": _REPLAY_DT,

@@ -18,6 +18,7 @@ from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.transfer import floor
 from ballbot_train.report import labels
 
@@ -191,6 +192,18 @@ class _SlipRecorder:
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
         self.slips.append(self._env.slip)
         return self._controller.act(t, x)
+
+
+def replay_of(
+    task: str, controllers: Sequence[str], results: Sequence[Result], physics: str, robot: str = PAPER
+) -> Replay:
+    """A telling episode of a task: the first in which one controller fails and another does not, else the first."""
+    failures: dict[int, set[bool]] = {}
+    for result in results:
+        if result.task == task:
+            failures.setdefault(result.episode, set()).add(result.failure)
+    episode = next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
+    return certified_replay(task, controllers, episode, physics, skip_planless=True, robot=robot)
 
 
 def engines_replay(task: str, controller: str, episode: int, physics: Sequence[str], robot: str = PAPER) -> Replay:

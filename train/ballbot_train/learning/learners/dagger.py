@@ -181,15 +181,13 @@ class Dagger:
         params: BallbotParams,
         config: DaggerConfig,
         seed: int = 0,
-        samples: Samples | StreamedDemos | None = None,
+        demos: str | Path | None = None,
+        start: PolicyNetwork | None = None,
         randomization: Randomization | None = None,
         history: int = 0,
     ):
-        """Args: samples: the first samples, such as those of demonstrations; default, none.
-
-        Raises:
-            ValueError: optima are to be found at once, and this task or robot does not allow it; or a track needs that.
-        """
+        """As of `Algorithm.make`. Demonstrations are its first samples."""
+        samples = _first_samples(demos, task, config, seed, randomization is not None or history > 0)
         if randomization is not None and not config.batch_episodes:
             raise ValueError("on a track, optima are found at once: give --batch-episodes 512")
         if config.batch_episodes and not batched.solves(task, params):
@@ -204,16 +202,14 @@ class Dagger:
         none = np.zeros((0, len(task.observation_scale) * (1 + history) + 2 * history))
         self._streamed = samples if isinstance(samples, StreamedDemos) else None
         self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, 2)))
+        if start is not None:
+            check_start(start.spec, self.network.spec)
+            self.network.load_state_dict(started(start, self.network.spec).state_dict())
+            self._warm = True
 
     @property
     def network(self) -> PolicyNetwork:
         return self._fit.network
-
-    def start_from(self, network: PolicyNetwork) -> None:
-        """As of `Shac`."""
-        check_start(network.spec, self.network.spec)
-        self.network.load_state_dict(started(network, self.network.spec).state_dict())
-        self._warm = True
 
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes
@@ -568,33 +564,25 @@ class Dagger:
         return Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights)
 
 
-def make(
-    task: Task,
-    params: BallbotParams,
-    config: DaggerConfig,
-    seed: int,
-    demos: str | Path | None,
-    start: PolicyNetwork | None = None,
-    randomization: Randomization | None = None,
-    history: int = 0,
-) -> Dagger:
-    """Makes the learner; demonstrations, if given, are its first samples. Raises a ValueError where they do not fit."""
-    samples: Samples | StreamedDemos | None = None
-    if demos is not None and (randomization is not None or history):
+def _first_samples(
+    demos: str | Path | None, task: Task, config: DaggerConfig, seed: int, on_track: bool
+) -> Samples | StreamedDemos | None:
+    """Demonstrations, if there are any; raises a ValueError where they do not fit."""
+    if demos is None:
+        if config.gathering_iterations:
+            return None
+        raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
+    if on_track:
         raise ValueError(
             "demonstrations show no past and no track; leave out --demos, or --randomization and --history"
         )
-    if demos is not None and is_set(demos):
+    if is_set(demos):
         if config.gathering_iterations:
             raise ValueError(f"{demos} is a set of shards, which dagger only clones: give --gathering-iterations 0")
-        samples = StreamedDemos(demos, task, seed)
-    elif demos is not None:
-        loaded = load_demos(demos, task)
-        weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))
-        samples = Samples.of(loaded.observations, loaded.actions, weights)
-    elif not config.gathering_iterations:
-        raise ValueError('gathering_iterations 0 needs demonstrations: give --demos a dataset of "ballbot demos"')
-    learner = Dagger(task, params, config, seed, samples, randomization, history)
-    if start is not None:
-        learner.start_from(start)
-    return learner
+        return StreamedDemos(demos, task, seed)
+    loaded = load_demos(demos, task)
+    weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))
+    return Samples.of(loaded.observations, loaded.actions, weights)
+
+
+make = Dagger

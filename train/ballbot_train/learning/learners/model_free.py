@@ -26,6 +26,7 @@ from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.datasets import Demos
 from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
+from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
 
@@ -70,6 +71,9 @@ _CLONE_ITERATIONS, _CLONE_STEPS, _CLONE_BATCH, _CLONE_RATE = 60, 300, 1024, 2e-3
 _WAITING_PROGRESS = 0.2  # share of their course at which schedules wait until training backwards has come to the task
 _SETTLED_LEARNING_RATE = 7e-4  # when it has come there, from where it falls to the same end
 _WARMUP_ITERATIONS = 15  # of the critic alone, after a warm start: an untrained one would undo what the actor knows
+
+
+_STATE = ("iteration", "_average", "_imitation", "_settled", "_env", "_random")
 
 
 class ModelFree(ABC):
@@ -209,35 +213,24 @@ class ModelFree(ABC):
     def state_dict(self) -> dict[str, Any]:
         model = self._model
         return {
-            "iteration": self.iteration,
+            **state_of(self, _STATE),
             "policy": model.policy.state_dict(),
-            "average": self._average.state_dict(),
             "optimizers": [optimizer.state_dict() for optimizer in self._optimizers],
-            "imitation": self._imitation and self._imitation.state_dict(),
             "env_steps": model.num_timesteps,
             "gamma": model.gamma,
-            "settled": self._settled,
-            "env": self._env.state_dict(),
             "observations": torch.as_tensor(model._last_obs),
             "starts": torch.as_tensor(model._last_episode_starts),
-            "random": self._random.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         model = self._model
-        self.iteration = state["iteration"]
+        load_state(self, _STATE, state)
         model.policy.load_state_dict(state["policy"])
-        self._average.load_state_dict(state["average"])
         for optimizer, old in zip(self._optimizers, state["optimizers"], strict=True):
             optimizer.load_state_dict(old)
-        if self._imitation is not None:
-            self._imitation.load_state_dict(state["imitation"])
         model.num_timesteps = state["env_steps"]
         self._take_gamma(state["gamma"])
-        self._settled = state["settled"]
-        self._env.load_state_dict(state["env"])
         model._last_obs, model._last_episode_starts = state["observations"].numpy(), state["starts"].numpy()
-        self._random.load_state_dict(state["random"])
 
     @property
     def _share_done(self) -> float:

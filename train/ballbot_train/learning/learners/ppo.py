@@ -23,7 +23,7 @@ from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
-from ballbot_train.learning.datasets import Demos, load_demos
+from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
 from ballbot_train.policy import PolicyNetwork, PolicySpec
 
@@ -136,31 +136,15 @@ _WARM_CRITIC_RATE = 1e-3  # learning rate of the critic throughout after a warm 
 class RelativeRollouts(RolloutBuffer):
     """A rollout buffer of advantages relative to the cost to go."""
 
-    def __init__(
-        self, *args: Any, living: Callable[[float], float], potential: Callable[[], np.ndarray], **kwargs: Any
-    ):
-        """Makes an empty one.
-
-        Args:
-            living: from a discount factor to the value of living for ever without cost.
-            potential: the scaled potentials (n_envs,), by which rewards are shaped, of the states before the last step.
-        """
-        self._living, self._potential = living, potential
+    def __init__(self, *args: Any, living: Callable[[float], float], **kwargs: Any):
+        """Args: living: from a discount factor to the value of living for ever without cost; the others are SB3's."""
+        self._living = living
         super().__init__(*args, **kwargs)
-
-    def reset(self) -> None:
-        super().reset()
-        self.potentials = np.zeros((self.buffer_size, self.n_envs), np.float32)
-
-    def add(self, *args: Any, **kwargs: Any) -> None:
-        self.potentials[self.pos] = self._potential()
-        super().add(*args, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
         super().compute_returns_and_advantage(last_values, dones)
         returns, values = torch.as_tensor(self.returns), torch.as_tensor(self.values)
-        living = self._living(self.gamma) - torch.as_tensor(self.potentials)
-        self.advantages = relative_advantages(returns, values, living).numpy()
+        self.advantages = relative_advantages(returns, values, self._living(self.gamma)).numpy()
 
 
 class MeanAction(torch.nn.Module):
@@ -252,25 +236,24 @@ class Ppo(ModelFree):
         params: BallbotParams,
         config: PpoConfig,
         seed: int = 0,
-        demos: Demos | None = None,
+        demos: str | Path | None = None,
         start: PolicyNetwork | None = None,
         randomization: Randomization | None = None,
         history: int = 0,
     ):
-        """Takes demonstrations to imitate, or a policy to start from, which then says the shape of the actor.
-
-        Raises:
-            ValueError: the task does not have what the settings ask for.
-        """
+        """As of `Algorithm.make`. A policy to start from says the shape of the actor."""
         warm = demos is not None or start is not None
         if warm and config.backwards:
             raise ValueError("backwards goes from scratch alone; give --no-backwards with --demos or --start")
+        if config.backwards and config.relative_advantages:
+            raise ValueError("backwards shapes rewards, which tell no cost to go: give --no-relative-advantages too")
         spec = spec_for(task, config.symmetry, config.hidden, history=history)
         if start is not None:
             start = started(start, spec)
             spec = start.spec
         world: dict[str, Any] = {"randomization": randomization, "history": history}
-        super().__init__(task, params, config, demos, warm, backwards=config.backwards, **world)
+        given = None if demos is None else load_demos(demos, task)
+        super().__init__(task, params, config, given, warm, backwards=config.backwards, **world)
         self.config = config
         model = PPO(
             BranchedPolicy,
@@ -290,14 +273,7 @@ class Ppo(ModelFree):
                 "warm": warm,
             },
             rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
-            rollout_buffer_kwargs=(
-                {
-                    "living": self._value_of_living,
-                    "potential": lambda: self._reward_scale * self._env.batch.last_potential.numpy(),
-                }
-                if config.relative_advantages
-                else None
-            ),
+            rollout_buffer_kwargs={"living": self._value_of_living} if config.relative_advantages else None,
             seed=seed,
             device="cpu",
         )
@@ -330,21 +306,4 @@ class Ppo(ModelFree):
         return self.config.imitation_weight * float(self._log_std.detach().exp()[0]) ** -2
 
 
-def make(
-    task: Task,
-    params: BallbotParams,
-    config: PpoConfig,
-    seed: int,
-    demos: str | Path | None = None,
-    start: PolicyNetwork | None = None,
-    randomization: Randomization | None = None,
-    history: int = 0,
-) -> Ppo:
-    """Makes the learner.
-
-    Raises:
-        ValueError: the demonstrations are of another task, or the task does not have what the settings ask for.
-    """
-    return Ppo(
-        task, params, config, seed, None if demos is None else load_demos(demos, task), start, randomization, history
-    )
+make = Ppo

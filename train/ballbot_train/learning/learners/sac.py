@@ -30,6 +30,7 @@ from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
+from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork, centred
 from ballbot_train.policy_files import Mirrors
 
@@ -206,45 +207,34 @@ class Critics(ContinuousCritic):
             self.add_module(f"qf{index}", critic)
 
 
+class CentredMean(torch.nn.Module):
+    """The mean action of an actor in a frame, which keeps the frame's steady motion exactly; see `PolicyNetwork`."""
+
+    def __init__(self, mlp: torch.nn.Module, frame: Frame):
+        super().__init__()
+        self.mlp, self._steady = mlp, frame.steady
+
+    def raw(self, features: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
+        """(n, 2) before it is squashed, of features (n, size) and what the network gives for them."""
+        assert self._steady is not None
+        of = output, features.unbind(-1), self.mlp, self._steady
+        return centred(*of, "tanh_in_frame", lambda values: torch.stack(values, -1))
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.raw(features, self.mlp(features)))
+
+
 class CentredActor(Actor):
-    """SB3's actor in a frame, whose mean action keeps the frame's steady motion exactly; see `PolicyNetwork`."""
+    """SB3's actor with a centred mean."""
 
     def __init__(self, *args: Any, frame: Frame, **kwargs: Any):
         """Args: frame: that the envs show; the others are SB3's."""
         super().__init__(*args, **kwargs)
-        self._frame = frame
+        self.mean = CentredMean(torch.nn.Sequential(*self.latent_pi, self.mu), frame)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        mean, log_std, more = super().get_action_dist_params(obs)
-        return _centred(mean, cast(torch.Tensor, obs), self._mlp, self._frame), log_std, more
-
-    def mean_action(self) -> "CentredMean":
-        """The mean of its actions, with the same layers."""
-        return CentredMean(torch.nn.Sequential(*self.latent_pi, self.mu), self._frame)
-
-    def _mlp(self, features: torch.Tensor) -> torch.Tensor:
-        return self.mu(self.latent_pi(features))
-
-
-class CentredMean(torch.nn.Module):
-    """The mean action of a centred actor."""
-
-    def __init__(self, mlp: torch.nn.Module, frame: Frame):
-        super().__init__()
-        self.mlp, self._frame = mlp, frame
-
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(_centred(self.mlp(features), features, self.mlp, self._frame))
-
-
-def _centred(
-    output: torch.Tensor, features: torch.Tensor, network: Callable[[torch.Tensor], torch.Tensor], frame: Frame
-) -> torch.Tensor:
-    """(n, 2) centred output of a network for features (n, size), before it is squashed."""
-    assert frame.steady is not None
-    return centred(
-        output, features.unbind(-1), network, frame.steady, "tanh_in_frame", lambda values: torch.stack(values, -1)
-    )
+        output, log_std, more = super().get_action_dist_params(obs)
+        return self.mean.raw(cast(torch.Tensor, obs), output), log_std, more
 
 
 class OwnPolicy(SACPolicy):
@@ -297,24 +287,21 @@ class Sac(ModelFree):
         params: BallbotParams,
         config: SacConfig,
         seed: int = 0,
-        demos: Demos | None = None,
+        demos: str | Path | None = None,
         start: PolicyNetwork | None = None,
     ):
-        """Takes demonstrations to learn from as well, or a policy of SAC's to start from.
-
-        Raises:
-            ValueError: the task has not what the settings ask for, or the policy is of another shape.
-        """
+        """As of `Algorithm.make`. Demonstrations are kept beside its own steps, and a policy must be one of SAC's."""
         if demos is not None and config.n_steps > 1:
             raise ValueError("n_steps must be 1 with demonstrations, which are single steps")
         self._spec = spec_for(task, config.symmetry, config.hidden)
         frame = None if self._spec.frame is None else FRAMES[self._spec.frame]
-        if demos is not None and task.first_exit:
-            demos = demos.without_pay(task, FAILURE_PRICE)
-        if demos is not None and frame is not None:
-            demos = demos_in_frame(demos, frame)
+        given = None if demos is None else load_demos(demos, task)
+        if given is not None and task.first_exit:
+            given = given.without_pay(task, FAILURE_PRICE)
+        if given is not None and frame is not None:
+            given = demos_in_frame(given, frame)
         warm = demos is not None or start is not None
-        super().__init__(task, params, config, demos, warm, frame, None if warm else _CONTROL_DT)
+        super().__init__(task, params, config, given, warm, frame, None if warm else _CONTROL_DT)
         self.config = config
         value = self._value_of_living(self._gamma)
         networks = {
@@ -333,7 +320,7 @@ class Sac(ModelFree):
             gradient_steps=config.gradient_steps,
             replay_buffer_class=SymmetricReplay,
             replay_buffer_kwargs={
-                "demos": demos,
+                "demos": given,
                 "reward_scale": self._reward_scale,
                 "mirrors": self._spec.mirrors,
                 "n_steps": config.n_steps,
@@ -364,7 +351,7 @@ class Sac(ModelFree):
         self._model: SAC
         self._set_model(
             model,
-            actor.mean_action()
+            actor.mean
             if isinstance(actor, CentredActor)
             else torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
             (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
@@ -388,13 +375,12 @@ class Sac(ModelFree):
         return as_policy(self._kept.modules(), self._task, activation="silu", squash=squash, **symmetry)
 
     def state_dict(self) -> dict[str, Any]:
-        own = {"log_ent_coef": self._log_ent_coef.detach(), "replay": self._replay.state_dict()}
-        return super().state_dict() | own
+        return super().state_dict() | {"log_ent_coef": self._log_ent_coef.detach()} | state_of(self, ["_replay"])
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
         self._log_ent_coef.data.copy_(state["log_ent_coef"])
-        self._replay.load_state_dict(state["replay"])
+        load_state(self, ["_replay"], state)
 
     def _highest(self) -> float:
         """The most that a value can be."""
@@ -413,17 +399,4 @@ class Sac(ModelFree):
         return _IMITATION_WEIGHT
 
 
-def make(
-    task: Task,
-    params: BallbotParams,
-    config: SacConfig,
-    seed: int,
-    demos: str | Path | None = None,
-    start: PolicyNetwork | None = None,
-) -> Sac:
-    """Makes the learner.
-
-    Raises:
-        ValueError: the demonstrations are of another task, or the policy to start from is of another shape.
-    """
-    return Sac(task, params, config, seed, None if demos is None else load_demos(demos, task), start)
+make = Sac

@@ -29,6 +29,7 @@ from ballbot_train.learning.actors import RoutedSymmetry, check_start, spec_for,
 from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
+from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.learning.whole_episodes import WholeEpisodes
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.routes import Routes
@@ -102,6 +103,10 @@ _SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
 _DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
 _ENDLESS = 10**6  # control steps: longer than any episode in training
 _HARD_AMONG = 16  # episodes that are drawn for each hard one
+_STATE = (
+    *("iteration", "_network", "critic", "target", "_policy_optimizer", "_critic_optimizer"),
+    *("_batch", "_drawn", "_start", "_random"),
+)
 
 
 class _Record(NamedTuple):
@@ -248,30 +253,10 @@ class Shac:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "iteration": self.iteration,
-            "network": self._network.state_dict(),
-            "critic": self.critic.state_dict(),
-            "target": self.target.state_dict(),
-            "policy_optimizer": self._policy_optimizer.state_dict(),
-            "critic_optimizer": self._critic_optimizer.state_dict(),
-            "batch": list(self._state),
-            "drawn": None if self._drawn is None else list(cast(BatchState, self._drawn.state)),
-            "start": self._start,
-            "random": self._random.get_state(),
-        }
+        return state_of(self, _STATE)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.iteration = state["iteration"]
-        self._network.load_state_dict(state["network"])
-        self.critic.load_state_dict(state["critic"])
-        self.target.load_state_dict(state["target"])
-        self._policy_optimizer.load_state_dict(state["policy_optimizer"])
-        self._critic_optimizer.load_state_dict(state["critic_optimizer"])
-        self._batch.state, self._start = BatchState(*state["batch"]), state["start"]
-        self._random.set_state(state["random"])
-        if self._drawn is not None:
-            self._drawn.state = BatchState(*state["drawn"])
+        load_state(self, _STATE, state)
 
     @property
     def _state(self) -> BatchState:
@@ -372,15 +357,13 @@ def make(
     seed: int,
     demos: None = None,
     start: PolicyNetwork | None = None,
-    randomization: Randomization | None = None,
-    history: int = 0,
+    **world: Any,
 ) -> Shac | WholeEpisodes:
-    """Makes the learner, without demonstrations; raises a ValueError where the task, a setting or a policy does not fit."""
+    """As of `Algorithm.make`, without demonstrations."""
     for name in ("margin_clearance", "one_way"):
         if getattr(config, name) and not config.margin_penalty:
             raise ValueError(f"{name} needs margin_penalty above 0")
-    kind = Shac if config.horizon else WholeEpisodes
-    learner = kind(task, params, config, seed, randomization, history)
+    learner = (Shac if config.horizon else WholeEpisodes)(task, params, config, seed, **world)
     if start is not None:
         learner.start_from(start)
     return learner

@@ -242,16 +242,3 @@ function robotsOf(scenario, driver = null) {
   const controllers = driver ? [driver, learned] : [learned, new Lqr(scenario.lqr)];
   return controllers.map((controller) => new Robot(controller, scenario));
 }
-
-/** What a link to an episode holds after its "#": task, certified episode and regret, %. */
-function challengeText({ task, episode }, regret) {
-  return `${task}-${episode}-${regret.toFixed(1)}`;
-}
-
-/** The scenario and the regret of such a link; null for anything else. Links are strangers', so only known values pass. */
-function challengeOf(hash) {
-  const found = /^#([a-z]{1,20})-(\d{1,3})-(\d{1,6}\.\d)$/.exec(hash);
-  if (!found) return null;
-  const index = DATA.scenarios.findIndex(({ task, episode }) => task === found[1] && episode === Number(found[2]));
-  return index < 0 ? null : { index, regret: Number(found[3]) };
-}

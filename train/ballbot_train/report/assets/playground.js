@@ -3,7 +3,6 @@
 
 const find = (selector) => document.querySelector(selector);
 const DEGREES = 180 / Math.PI;
-const SHOWN_SECONDS = 6; // of the tilts
 const PUSH_SHOWN = 0.5; // s of the episode, for which a push's arrow stays
 const STRONGEST = 250; // N·s
 const NEAR = 3.6; // m: the camera's distance from robots that are together
@@ -33,7 +32,6 @@ class Playground {
     find(".reset").onclick = () => this.open(this.index, this.driver !== null);
     find(".episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
     find(".drive").onclick = () => this.open(this.index, this.driver === null);
-    find(".share").onclick = () => this.share();
     find(".theme").onclick = () => this.setTheme(!this.dark);
     const night = matchMedia("(prefers-color-scheme: dark)");
     night.onchange = () => this.setTheme(night.matches);
@@ -43,22 +41,8 @@ class Playground {
       button.onclick = () => this.pushOnScreen(Number(button.dataset.x), Number(button.dataset.y));
     }
     this.listen();
-    this.openLink();
-    window.addEventListener("hashchange", () => this.openLink());
+    this.open(0);
     requestAnimationFrame((now) => this.tick(now));
-  }
-
-  /** Opens what the page's address names: an episode that somebody has driven. */
-  openLink() {
-    const challenge = challengeOf(location.hash);
-    if (!challenge) {
-      this.open(0);
-      if (location.hash.length > 1) this.say("This link names no episode of this page.");
-      return;
-    }
-    this.open(challenge.index, true);
-    this.say(`Somebody drove this episode with a regret of ${challenge.regret.toFixed(1)} %. Press Play and beat it.`);
-    this.setPlaying(false);
   }
 
   say(text) {
@@ -96,7 +80,6 @@ class Playground {
       ? "You drive against the optimum: the stick is the robot's lean. Arrow keys or W A S D, or drag in the picture."
       : this.scenario.text;
     this.say("");
-    find(".share").hidden = find(".link").hidden = true;
     find(".drive").setAttribute("aria-pressed", driven);
     find(".pushes").hidden = find(".strength").hidden = driven;
     find(".hint").textContent = driven ? "Drag anywhere: that is your stick." : "Drag a robot to push it. Drag the floor to look around.";
@@ -141,7 +124,6 @@ class Playground {
     this.time = 0;
     this.late = 0; // s of the episode that are not computed yet
     this.shown = null; // the push whose arrow is shown: {impulse, until}
-    this.tilts = this.everyone.map(() => []);
   }
 
   /** Draws for a while even if time stands still: what is shown has changed, and the camera comes after it. */
@@ -163,11 +145,7 @@ class Playground {
       this.due = null;
       this.hit([impulse * Math.cos(bearing), impulse * Math.sin(bearing)]);
     }
-    this.everyone.forEach((robot, i) => {
-      robot.advance();
-      this.tilts[i].push([this.time, robot.tilt * DEGREES]);
-      if (this.tilts[i].length > SHOWN_SECONDS / DATA.dt) this.tilts[i].shift();
-    });
+    for (const robot of this.everyone) robot.advance();
     this.time += DATA.dt;
     if (this.driver && this.isOver(this.robots[0])) this.finish();
   }
@@ -184,21 +162,6 @@ class Playground {
     if (mine.failed) return this.say(`You ${verdict(mine)} after ${(mine.steps * DATA.dt).toFixed(1)} s. Restart to try again.`);
     const policy = this.regret(this.robots[1]);
     this.say(`Your regret is ${this.share100(mine).toFixed(1)} %.${policy ? ` The policy's: ${policy.replace("regret ", "")}.` : ""}`);
-    find(".share").hidden = false;
-  }
-
-  /** Shows a link to this episode and its score, and hands it to the device or the clipboard. */
-  async share() {
-    const address = `${location.href.split("#")[0]}#${challengeText(this.scenario, this.share100(this.robots[0]))}`;
-    find(".link").value = address;
-    find(".link").hidden = false;
-    find(".link").select();
-    try {
-      if (navigator.share) await navigator.share({ title: document.title, url: address });
-      else await navigator.clipboard.writeText(address);
-    } catch {
-      this.say("Copy the link below."); // the browser does not let the page share or copy
-    }
   }
 
   /** A push for everyone. Where somebody has fallen, all start again first. */
@@ -244,7 +207,6 @@ class Playground {
   draw(elapsed) {
     const states = this.everyone.map((robot) => this.between(robot));
     this.showNumbers();
-    this.drawTilts();
     if (!this.scene) return;
     this.follow(states, elapsed);
     const pull = this.drag?.pull ?? (this.shown && this.time < this.shown.until ? this.shown.impulse : null);
@@ -322,34 +284,6 @@ class Playground {
     const over = this.isOver(robot);
     const share = 100 * (robot.cost / (over ? this.scenario.optimum : this.best.cost) - 1);
     return over ? Math.max(0, share) : share;
-  }
-
-  drawTilts() {
-    const canvas = find(".tilts");
-    const ratio = window.devicePixelRatio || 1;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    if (canvas.width !== Math.round(width * ratio)) [canvas.width, canvas.height] = [width * ratio, height * ratio].map(Math.round);
-    const pen = canvas.getContext("2d");
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.clearRect(0, 0, width, height);
-    const start = Math.max(0, this.time - SHOWN_SECONDS);
-    const across = (t) => 26 + ((t - start) / SHOWN_SECONDS) * (width - 30);
-    const up = (tilt) => height - 6 - (tilt / 90) * (height - 14);
-    pen.font = "11px system-ui, sans-serif";
-    pen.textBaseline = "middle";
-    for (const tilt of [0, 30, 60, 90]) {
-      pen.fillStyle = this.dark ? "#98a2b3" : "#667085";
-      pen.fillText(String(tilt), 4, up(tilt));
-      pen.fillStyle = this.dark ? "#2d3543" : "#e4e7ec";
-      pen.fillRect(26, up(tilt), width - 30, 1);
-    }
-    this.tilts.forEach((line, i) => {
-      pen.strokeStyle = this.tint(this.looks[i].color);
-      pen.lineWidth = 2;
-      pen.beginPath();
-      line.forEach(([t, tilt], k) => (k ? pen.lineTo(across(t), up(tilt)) : pen.moveTo(across(t), up(tilt))));
-      pen.stroke();
-    });
   }
 
   /** Pointers and keys. A drag that begins at a robot pushes, any other turns the camera; time stands still while one pulls. */
