@@ -38,6 +38,7 @@ MARGIN = 2e-5
 _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by a millionth
 _LEAST_CURVATURE = 1e-9  # of the cost along an action, so that steps of no length have a best one
 _LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
+_ALIKE = 20  # problems whose numbers of steps share a multiple of these are solved together
 _REST = 8 + 36 + 1  # parameters of `Ilqr.ends`
 _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
 
@@ -183,21 +184,45 @@ class Ilqr:
         """
         jobs, n = a.shape[:2]
         x, a = np.array(x, np.float64, order="C"), np.array(a, np.float64, order="C")
-        gains, slopes = np.zeros((jobs, n, 2, self.states)), np.zeros((jobs, n, self.states))
-        costs, missed = np.zeros(jobs), np.zeros(jobs)
-        status, iterations = np.zeros(jobs, np.int64), np.zeros(jobs, np.int64)
-        each = (np.ascontiguousarray(np.broadcast_to(steps, jobs), np.int64), *self._given(jobs, lengths, given))
-        each_options = [options] * jobs if isinstance(options, Options) else options
-        settings = np.array([astuple(one) for one in each_options], np.float64).reshape(jobs, -1)
+        steps, (lengths, given) = np.broadcast_to(steps, jobs), self._given(jobs, lengths, given)
+        each = [options] * jobs if isinstance(options, Options) else options
+        numbers = {one: astuple(one) for one in set(each)}
+        settings = np.array([numbers[one] for one in each], np.float64).reshape(jobs, len(fields(Options)))
         m, e = np.zeros((jobs, n, self._sizes["PATH"])), np.zeros((jobs, self._sizes["END"]))
         if multipliers is None:
             m[:], e[:] = settings[:, -1:, None], settings[:, -1:]
         else:
             m[:], e[:] = multipliers, end_multipliers
+        gains, slopes = np.zeros((jobs, n, 2, self.states)), np.zeros((jobs, n, self.states))
+        found = Solutions(x, a, gains, slopes, np.zeros(jobs), np.zeros(jobs, bool), m, e)
+        alike = -(-steps // _ALIKE)
+        for group in np.unique(alike):
+            rows = np.flatnonzero(alike == group)
+            self._solve_alike(found, rows, min(n, group * _ALIKE), steps, lengths, given, settings)
+        return found
+
+    def _solve_alike(self, found: Solutions, rows: np.ndarray, n: int, *given: np.ndarray) -> None:
+        """Solves some problems, of at most n steps, in place; the number of steps, length, parameters and options of all."""
+        some = found.some(rows)
+        x, a, gains, slopes, m = (
+            np.ascontiguousarray(part[:, : n + more])
+            for part, more in ((some.x, 1), (some.a, 0), (some.gains, 0), (some.slopes, 0), (some.multipliers, 0))
+        )
+        missed, status, iterations = np.zeros(len(rows)), *np.zeros((2, len(rows)), np.int64)
+        steps, lengths, parameters, settings = (part[rows] for part in given)
         # named, because all have to live as long as the call
-        arrays = (settings, *each, x, a, m, e, gains, slopes, costs, missed, status, iterations)
-        self._solve(jobs, n, *(array.ctypes.data for array in arrays))
-        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, m, e)
+        arrays = (settings, np.ascontiguousarray(steps, np.int64), lengths, parameters, x, a, m, some.end_multipliers)
+        arrays += (gains, slopes, some.costs, missed, status, iterations)
+        self._solve(len(rows), n, *(array.ctypes.data for array in arrays))
+        for kept, values in zip(
+            (found.x, found.a, found.gains, found.slopes, found.multipliers), (x, a, gains, slopes, m), strict=True
+        ):
+            kept[rows, : values.shape[1]] = values
+        found.costs[rows], found.solved[rows], found.end_multipliers[rows] = (
+            some.costs,
+            status == OPTIMAL,
+            some.end_multipliers,
+        )
 
     def follow(
         self, x0: np.ndarray, length: float, given: np.ndarray, paths: np.ndarray, settings: tuple[float, float]
