@@ -60,7 +60,7 @@ class BatchState(NamedTuple):
     """Everything that a batch of B environments remembers."""
 
     x: torch.Tensor
-    """(8, B) states; order and units in `dynamics.STATE`."""
+    """(8, B) states; order and units in `dynamics.STATE`; with wheels (11, B), in `dynamics.OMNI_STATE`."""
     c: torch.Tensor
     """(nc, B) constants of the running episodes."""
     steps: torch.Tensor
@@ -265,7 +265,7 @@ class BallbotBatch:
     ) -> BatchState:
         """The state in which `reset` with these arguments would start; changes nothing."""
         self._check_mask(mask)
-        self._check_given(x, 8, "x")
+        self._check_given(x, self.params.state_size, "x")
         if c is not None:
             self._check_given(c, len(self.task.constant_names), "c")
             for distinct in np.unique(c.detach().cpu().double().numpy(), axis=1).T:
@@ -320,12 +320,12 @@ class BallbotBatch:
         """Holds forces for one control step; see `transition`. Call `reset` first.
 
         Raises:
-            ValueError: actions that are no tensor of real numbers of shape (B, 2).
+            ValueError: actions that are no tensor of real numbers of shape (B, 2), or (B, 3) with wheels.
         """
         state = self.state
         if state is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
-        self._check_tensor(actions, (self.num_envs, 2), "actions")
+        self._check_tensor(actions, (self.num_envs, self.params.action_size), "actions")
         try:
             self.state, result = self._run(state, actions)
         except Exception as error:
@@ -445,19 +445,21 @@ class BallbotBatch:
         z = counter_rng.uniforms(key, count, self.dtype)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
         constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
-        state = task.draw_state(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
+        state = task.start(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
         zero = torch.zeros_like(episode)
         drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
-        actuator = (still,) * (2 + 2 * self._past_steps) if noise.varies_actuator else ()
+        forces = self.params.action_size
+        actuator = (still,) * (forces + forces * self._past_steps) if noise.varies_actuator else ()
         begun = _Rows(state, constants, zero, episode, seed, drawn, actuator, ())
-        return begun._replace(past=self.history * (*self._seen(begun), still, still)) if self.history else begun
+        return begun._replace(past=self.history * (*self._seen(begun), *(still,) * forces)) if self.history else begun
 
     def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
         """Force (2) that the actuator applies, and its new memory."""
         if not self.randomization.varies_actuator:
             return command, now.actuator
-        pairs = tuple(zip(now.actuator[::2], now.actuator[1::2], strict=True))
+        forces = self.params.action_size
+        pairs = tuple(now.actuator[i : i + forces] for i in range(0, len(now.actuator), forces))
         for strength in now.drawn[6:7]:
             command = tuple(strength * part for part in command)
         force = actuate(command, pairs[1:], pairs[0], now.drawn[4], now.drawn[5])
@@ -477,7 +479,7 @@ class BallbotBatch:
             time = now.steps.to(self.dtype) * self.task.control_dt
             x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
         c = self.task.at(now.c, now.steps.to(self.dtype) * self.task.control_dt) if self.task.clock else now.c
-        return tuple(self.task.observe(x, c))
+        return tuple(self.task.seen(x, c))
 
     def _stacked(self, rows: _Rows) -> BatchState:
         """The rows as tensors."""
@@ -514,8 +516,8 @@ def run_episodes(
         rows = torch.as_tensor(drawn.T, dtype=batch.dtype, device=batch.device).contiguous()
         batch.state = batch.state._replace(drawn=rows)
         if batch.history:  # the past before the episode has the drawn errors of sensors too
-            seen = batch.observe(batch.state).T[: len(batch.task.observation_scale)]
-            begun = torch.cat([seen, torch.zeros_like(seen[:2])])
+            seen = batch.observe(batch.state).T[: batch.task.observation_size(batch.params)]
+            begun = torch.cat([seen, torch.zeros_like(seen[: batch.params.action_size])])
             batch.state = batch.state._replace(past=begun.repeat(batch.history, 1))
         observation = batch.observe(batch.state)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)

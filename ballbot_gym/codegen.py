@@ -84,23 +84,29 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
         NotImplementedError: the task has an operation that is not known here.
         Exception: whatever a task raises that cannot compute with CasADi's symbols.
     """
-    x, c = _symbols("x", 8), _symbols("c", len(task.constant_names))
+    x, c = _symbols("x", params.state_size), _symbols("c", len(task.constant_names))
     z = _symbols("z", task.constant_draws), _symbols("y", task.state_draws)
-    action, taken = _symbols("a", 2), _symbols("t", 1)
+    action, taken = _symbols("a", params.action_size), _symbols("t", 1)
     now = task.at(c, taken[0] * task.control_dt)
     blocks = [
         block(
             "advance", (("x", x), ("c", c), ("a", action), ("t", taken)), _advance(task, params, x, c, action, taken[0])
         ),
-        block("look", (("x", x), ("c", c), ("t", taken)), (("seen", task.observe(x, now)), ("tilt", (_tilt(x),)))),
+        block(
+            "look",
+            (("x", x), ("c", c), ("t", taken)),
+            (("seen", ops.components(task.seen(x, now))), ("tilt", (_tilt(x),))),
+        ),
         block("draw_constants", (("z", z[0]),), (("c", task.draw_constants(z[0], params)),)),
-        block("draw_state", (("z", z[1]), ("c", c)), (("x", task.draw_state(z[1], c, params)),)),
+        block("draw_state", (("z", z[1]), ("c", c)), (("x", task.start(z[1], c, params)),)),
     ]
     sizes = {
         "DOUBLE": int(double),
         "LANES": LANES,
         "CONSTANTS": len(c),
-        "SEEN": len(task.observation_scale),
+        "STATES": len(x),
+        "ACTIONS": len(action),
+        "SEEN": task.observation_size(params),
         "GRIP": 4 if params.grips else 0,
         "FLAGS": len(FLAGS),
         "SURVIVAL_REWARD": float(task.survival_reward * task.control_dt),  # per step
@@ -185,7 +191,9 @@ def _advance(
         grip = (*floor[0], casadi.fmax(*(dynamics.needed_friction(force) for force in floor)))
     did = outcome(task, x, u, end, c, taken + 1, kept)
     reward = task.survival_reward * task.control_dt - did.running + did.goal
-    clipped = casadi.logic_or(casadi.fabs(action[0]) > 1, casadi.fabs(action[1]) > 1)
+    clipped = casadi.fabs(action[0]) > 1
+    for part in action[1:]:
+        clipped = casadi.logic_or(clipped, casadi.fabs(part) > 1)
     return (
         ("end", end),
         ("force", u),

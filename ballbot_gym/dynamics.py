@@ -20,13 +20,16 @@ where the paper's ball has Q_γ = Q_θ = 0: the paper's robot is r = 0, I_b = 0.
 
 The floor acts on the ball with the horizontal force f and the normal force N. The ball's rolling, I_b ω̇ = T − r e_z × f,
 gives f = F − (I_b/r²) p̈. The height of the body's centre, with h n_z = m·height, gives N = (M + m) g + h n̈_z.
+
+`omni` has the equations of a robot with wheels. Its state has 11 components, the 8 above first, and its input three, the
+forces of its wheels on the ball, N.
 """
 
 import math
 from collections.abc import Iterable
 from typing import Any
 
-from ballbot_gym import ops
+from ballbot_gym import omni, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 
@@ -42,6 +45,9 @@ STATE = (
 )
 """Name and unit of each state component, in order."""
 
+OMNI_STATE = (*STATE, ("ψ", "rad"), ("ψ̇", "rad/s"), ("ω_z", "rad/s"))
+"""The same of a robot with wheels: the body's turn about its axis, its speed, and the ball's spin about the vertical."""
+
 LEAST_NORMAL_FORCE = 0.02
 """Least normal force of a robot that has to grip, as a fraction of its weight."""
 
@@ -49,8 +55,10 @@ RK4_STEP = 0.01
 """Longest RK4 step, s. At 10 ms the model follows the exact solution to 1e-6 over 0.3 s at high lean."""
 
 
-def accelerations(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any, Any, Any]:
-    """(ẍ, ÿ, γ̈, θ̈) in m/s² and rad/s² for state x (..., 8) and force u (..., 2)."""
+def accelerations(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, ...]:
+    """(ẍ, ÿ, γ̈, θ̈) in m/s² and rad/s² for state x (..., 8) and force u (..., 2); with wheels as `omni.accelerations`."""
+    if params.wheels is not None:
+        return omni.accelerations(params, x, u)
     _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)
     fx, fy = ops.components(u)
     sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
@@ -96,12 +104,9 @@ def contact(params: BallbotParams, x: Vector, u: Vector) -> tuple[Any, Any, Any]
     return _contact(params, x, u, accelerations(params, x, u))
 
 
-def _contact(
-    params: BallbotParams, x: Vector, u: Vector, acceleration: tuple[Any, Any, Any, Any]
-) -> tuple[Any, Any, Any]:
-    _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)
-    fx, fy = ops.components(u)
-    ax, ay, gamma_ddot, theta_ddot = acceleration
+def _contact(params: BallbotParams, x: Vector, u: Vector, acceleration: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot, *_ = ops.components(x)
+    ax, ay, gamma_ddot, theta_ddot, *_ = acceleration
     sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
     n_z_ddot = (
         2 * sin_g * sin_t * gamma_dot * theta_dot
@@ -110,6 +115,18 @@ def _contact(
         - cos_g * cos_t * (gamma_dot * gamma_dot + theta_dot * theta_dot)
     )
     normal = params.weight + params.first_moment * n_z_ddot
+    if params.wheels is not None:  # whatever drives it, the floor's force moves the whole robot
+        rates2 = gamma_dot * gamma_dot + theta_dot * theta_dot
+        n_x_ddot = (
+            cos_g * cos_t * gamma_ddot
+            - sin_g * sin_t * theta_ddot
+            - sin_g * cos_t * rates2
+            - 2 * cos_g * sin_t * gamma_dot * theta_dot
+        )
+        n_y_ddot = cos_t * theta_ddot - sin_t * theta_dot * theta_dot
+        mass, h = params.total_mass, params.first_moment
+        return mass * ax + h * n_x_ddot, mass * ay + h * n_y_ddot, normal
+    fx, fy = ops.components(u)
     if not params.rolls:
         return fx, fy, normal
     rolling = params.moving_mass - params.total_mass
@@ -124,9 +141,9 @@ def held_contact(
     The leans at the end are extrapolated with their accelerations, so that nothing is integrated for them. In between, a
     force that is held while the robot falls or rises needs up to twice the friction that it needs at first.
     """
-    _, _, gamma, theta, vx, vy, gamma_dot, theta_dot = parts = ops.components(x)
+    _, _, gamma, theta, vx, vy, gamma_dot, theta_dot, *turning = parts = ops.components(x)
     acceleration = accelerations(params, x, u)
-    *_, gamma_ddot, theta_ddot = acceleration
+    _, _, gamma_ddot, theta_ddot, *_ = acceleration
     end = ops.stack(
         (
             *parts[:2],
@@ -136,6 +153,7 @@ def held_contact(
             vy,
             gamma_dot + hold * gamma_ddot,
             theta_dot + hold * theta_ddot,
+            *turning,
         ),
         like=x,
     )
@@ -196,7 +214,8 @@ def needed_friction(force: tuple[Any, Any, Any]) -> Any:
 
 def derivative(params: BallbotParams, x: Vector, u: Vector) -> Vector:
     """dx/dt (..., 8) of state x (..., 8) under force u (..., 2)."""
-    return ops.stack(ops.components(x)[4:] + accelerations(params, x, u), like=x)
+    parts, found = ops.components(x), accelerations(params, x, u)
+    return ops.stack(parts[4:8] + found[:4] + parts[9:10] + found[4:], like=x)
 
 
 def step(params: BallbotParams, x: Vector, u: Vector, dt: Any, substeps: int = 2) -> Vector:
@@ -224,9 +243,16 @@ def pushed(params: BallbotParams, x: Vector, impulse: Vector) -> Vector:
     M Δq̇ = Jᵀ p, with the mass matrix M of `energy` and the Jacobian J of the centre of mass's horizontal position.
     """
     px, py = ops.components(impulse)
-    *place, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)
+    *place, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
     a, b, d = ops.cos(gamma) * ops.cos(theta), -ops.sin(gamma) * ops.sin(theta), ops.cos(theta)  # of n, as in `energy`
     h, mass, inertia = params.first_moment, params.moving_mass, params.pivot_inertia
+    if params.wheels is not None:
+        psi, psi_dot, spin = ops.components(x)[8:]
+        height, columns = params.com_height, omni.relative_turning(params, x)[1]
+        moved = [px, py, height * a * px, height * (b * px + d * py), 0.0 * px, 0.0 * px]
+        changes = omni.solved(omni.mass_matrix(params, x, columns), moved)
+        speeds = [v + change for v, change in zip((vx, vy, gamma_dot, theta_dot), changes, strict=False)]
+        return ops.stack((*place, gamma, theta, *speeds, psi, psi_dot + changes[4], spin + changes[5]), like=x)
     lean_inertia = inertia * d * d + params.axial_inertia * (1 - d * d)
     # the ball's speeds eliminated, two equations for the lean rates are left
     lever, coupling = params.com_height - h / mass, h * h / mass
@@ -258,9 +284,11 @@ def _advance(x: tuple, dt: Any, slope: tuple) -> tuple:
 
 def energy(params: BallbotParams, x: Vector) -> Any:
     """Total mechanical energy, J, of state x (..., 8); zero potential at the height of the ball's centre."""
-    _, _, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)
+    _, _, gamma, theta, vx, vy, gamma_dot, theta_dot, *_ = ops.components(x)
     sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
     h, inertia = params.first_moment, params.pivot_inertia
+    if params.wheels is not None:
+        return omni.kinetic_energy(params, x) + h * params.gravity * cos_g * cos_t
     com_vx = cos_g * cos_t * gamma_dot - sin_g * sin_t * theta_dot  # of n, 1/s
     com_vy = cos_t * theta_dot
     lean_inertia = inertia * cos_t * cos_t + params.axial_inertia * sin_t * sin_t

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, omni
 from ballbot_gym.checks import (
     check_constant_names,
     check_history,
@@ -32,6 +32,7 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.viewer import PageScene
 
+_YAW_RATE = 2.0  # rad/s: how fast `TwoForces` turns the body back
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
@@ -42,7 +43,7 @@ class EnvState(NamedTuple):
 
     task: Task
     x: State
-    """(8,) state; order and units in `dynamics.STATE`."""
+    """(8,) state; order and units in `dynamics.STATE`, or (11,) as `dynamics.OMNI_STATE`."""
     constants: State
     """(nc,) constants of the episode."""
     steps_left: int
@@ -69,7 +70,7 @@ class BallbotEnv(gymnasium.Env):
 
     | key | meaning |
     |---|---|
-    | state | (8,) float64 state x; order and units in `dynamics.STATE` |
+    | state | (8,) float64 state x; order and units in `dynamics.STATE`; with wheels (11,), in `dynamics.OMNI_STATE` |
     | cost | what this step cost, a failure's price included (0 after `reset`): the objective, and no constraint's cost |
     | reward_survive | part of the reward: survival_reward · control_dt |
     | reward_cost | part of the reward: −cost rate · control_dt |
@@ -80,7 +81,7 @@ class BallbotEnv(gymnasium.Env):
     | failure | a limit is violated: the robot fell, touched something or left the arena |
     | violated | the index of that limit in `limit_names`, as of "tilt", "arena" or "obstacle 2"; else −1 |
     | constraint_cost | 1.0 where a limit is violated, else 0.0: the cost of safe reinforcement learning |
-    | force | (2,) N, applied in this step (0 after `reset`) |
+    | force | (2,) N, applied in this step (0 after `reset`); with wheels (3,), the pull of each at standstill |
     | clipped | the action was outside [−1, 1] and was clipped |
     | constants | (nc,) the episode's constants, named in the task's `constant_names` |
     | grip | (4,) f_x, f_y, N of the floor on the ball as the step began, and the friction it needs (0 after `reset`) |
@@ -139,19 +140,19 @@ class BallbotEnv(gymnasium.Env):
         self._spec: EnvSpec | None = None
         self._scene: PictureScene | Window | PageScene | None = None
         self._state: State = ()  # until the first reset
-        physics = default_physics() if physics is None else physics
+        self.params = checked_robot(robot, params)
+        physics = default_physics(self.params) if physics is None else physics
         if not isinstance(physics, str) or physics not in PHYSICS:
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
         check_render_mode(render_mode)
-        self.params = checked_robot(robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
         self.render_mode = render_mode
         fps = round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_modes": usable_render_modes(), "render_fps": fps}
-        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
         self.randomization = checked_randomization(randomization)
         self._disturbance = (
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
@@ -159,8 +160,8 @@ class BallbotEnv(gymnasium.Env):
         self._noisy = self.randomization.is_noisy
         self.history = check_history(history)
         self.observation_space = observation_space(self.task, self.params, self.history)
-        own = len(self.task.observation_scale)
-        self._past = np.zeros(own + self.history * (own + 2), np.float32) if self.history else None
+        own, forces = self.task.observation_size(self.params), self.params.action_size
+        self._past = np.zeros(own + self.history * (own + forces), np.float32) if self.history else None
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: Judge | None = None  # in machine code
@@ -214,10 +215,11 @@ class BallbotEnv(gymnasium.Env):
         """Holds a force for one control step.
 
         Args:
-            action: (2,) force in units of the robot's force limit; clipped to [−1, 1].
+            action: (2,) force in units of the robot's force limit; clipped to [−1, 1]. With wheels (3,), the torque of each
+                motor at standstill in units of its stall torque.
 
         Raises:
-            ValueError: an action that is not of real, finite numbers or not of shape (2,).
+            ValueError: an action that is not of real, finite numbers or not of the action space's shape.
             gymnasium.error.ResetNeeded: before `reset`, or after the end of an episode.
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
@@ -268,17 +270,17 @@ class BallbotEnv(gymnasium.Env):
 
     def _forget(self) -> None:
         """Makes the past what it is when an episode begins."""
-        past, own = self._past, len(self.task.observation_scale)
+        past, own = self._past, self.task.observation_size(self.params)
         assert past is not None
-        past[own:] = np.tile(np.append(past[:own], (0.0, 0.0)), self.history)
+        past[own:] = np.tile(np.append(past[:own], (0.0,) * self.params.action_size), self.history)
 
     def _note(self, action: Any) -> None:
         """Moves what was observed, and the action on it, into the past."""
-        past, own = self._past, len(self.task.observation_scale)
+        past, own, forces = self._past, self.task.observation_size(self.params), self.params.action_size
         assert past is not None
-        past[2 * own + 2 :] = past[own : -(own + 2)].copy()
+        past[2 * own + forces :] = past[own : -(own + forces)].copy()
         past[own : 2 * own] = past[:own]
-        past[2 * own : 2 * own + 2] = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        past[2 * own : 2 * own + forces] = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
 
     @property
     def limit_names(self) -> tuple[str, ...]:
@@ -416,8 +418,8 @@ class BallbotEnv(gymnasium.Env):
         """Takes machine code if there is some; if start, it is made in the background. `_set_constants` must follow."""
         if isinstance(self._simulator, Rk4Simulator):
             self._simulator.use_code(start)
-        if self._judge is None and (code := Judge.made(self.task, start)) is not None:
-            self._judge = Judge(code, self.task)
+        if self._judge is None and (code := Judge.made(self.task, self.params, start)) is not None:
+            self._judge = Judge(code, self.task, self.params)
 
     def _restore_simulator(self, memory: tuple[float, ...] = ()) -> None:
         """Puts the simulator into the env's state, and what it remembers besides into its memory."""
@@ -425,7 +427,7 @@ class BallbotEnv(gymnasium.Env):
             self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state, memory)
 
-    def _grip(self, x: State, total: tuple[float, float]) -> tuple[tuple[float, ...], bool]:
+    def _grip(self, x: State, total: tuple[float, ...]) -> tuple[tuple[float, ...], bool]:
         """What the floor gives in a step from state x, and whether the closed form asks for more than it can give."""
         simulated = self._simulator.floor_force()
         if simulated is not None:
@@ -439,7 +441,7 @@ class BallbotEnv(gymnasium.Env):
         """Who judged a start, if machine code did, and its tilt, rad. Raises a ValueError if it is out of range."""
         if self._judge is not None:
             self._judge.set_constants(c)
-            judged = self._judge.judge(x, (0.0, 0.0), x, 0, 0.0)
+            judged = self._judge.judge(x, (0.0,) * self.params.action_size, x, 0, 0.0)
             if judged is not None and judged[7] < 0:
                 return self._judge, judged[8]
             if self._state:  # its episode goes on where this one cannot start
@@ -451,7 +453,7 @@ class BallbotEnv(gymnasium.Env):
             if not limit >= 0
         ]
         if violated:
-            values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.STATE, x, strict=True))
+            values = ", ".join(f"{name} = {value:g}" for (name, _), value in zip(dynamics.OMNI_STATE, x, strict=False))
             raise ValueError(
                 f"{task.id}: the start state is out of range: it violates the limit of {', '.join(violated)} ({values}; "
                 f"tilt {math.degrees(dynamics.tilt(x)):.1f}° of at most {math.degrees(task.max_tilt):.1f}°)"
@@ -469,8 +471,8 @@ class BallbotEnv(gymnasium.Env):
             given = finite_array(constants, (len(task.constant_names),), "constants")
             task.check_constants(given, self.params)
             c = _floats(given)
-        x = _floats(task.draw_state(tuple(draws[task.constant_draws :]), c, self.params))
-        return x if state is None else _floats(finite_array(state, (8,), "state")), c
+        x = _floats(task.start(tuple(draws[task.constant_draws :]), c, self.params))
+        return x if state is None else _floats(finite_array(state, (self.params.state_size,), "state")), c
 
     def _replaced(self, c: State, named: dict[str, float]) -> list[Any]:
         """The drawn constants c, of which some are replaced by name."""
@@ -478,22 +480,22 @@ class BallbotEnv(gymnasium.Env):
         check_constant_names(self.task, named)
         return [named.get(name, value) for name, value in zip(names, c, strict=True)]
 
-    def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, float], bool]:
+    def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, ...], bool]:
         """The force, N, of an action, and whether it was clipped."""
-        ax, ay = real_array(action, "action", (2,)).tolist()
+        parts = real_array(action, "action", self.action_space.shape).tolist()
         limit = self._force_limit
-        if -1.0 <= ax <= 1.0 and -1.0 <= ay <= 1.0:
-            return (limit * ax, limit * ay), False
-        if not (math.isfinite(ax) and math.isfinite(ay)):
-            raise ValueError(f"action must be finite, not {[ax, ay]}")
-        return (limit * min(max(ax, -1.0), 1.0), limit * min(max(ay, -1.0), 1.0)), True
+        if max(parts) <= 1.0 and min(parts) >= -1.0:
+            return tuple([limit * part for part in parts]), False
+        if not all(map(math.isfinite, parts)):
+            raise ValueError(f"action must be finite, not {parts}")
+        return tuple([limit * min(max(part, -1.0), 1.0) for part in parts]), True
 
     def _observed(self) -> tuple[float, ...]:
         """(no) observation of the present state, with the sensors' noise."""
         x = self._state
         if self._disturbance is not None:
             x = self._disturbance.sensed(x, self.np_random, self._taken * self.task.control_dt)
-        return self.task.observe(x, self.task.at(self._constants, self._taken * self.task.control_dt))
+        return self.task.seen(x, self.task.at(self._constants, self._taken * self.task.control_dt))
 
     def _shown(
         self,
@@ -505,7 +507,7 @@ class BallbotEnv(gymnasium.Env):
         goal: float = 0.0,
         success: bool = False,
         violated: int = -1,
-        force: tuple[float, float] = (0.0, 0.0),
+        force: tuple[float, ...] | None = None,
         clipped: bool = False,
         grip: tuple[float, ...] = _NO_GRIP,
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -529,7 +531,7 @@ class BallbotEnv(gymnasium.Env):
             "failure": failure,
             "violated": violated,
             "constraint_cost": 1.0 if failure else 0.0,
-            "force": np.array(force) if judge is None else judge.force.copy(),
+            "force": np.array(force or (0.0,) * self.params.action_size) if judge is None else judge.force.copy(),
             "clipped": clipped,
             "constants": self._constants_array.copy(),
         }
@@ -538,6 +540,32 @@ class BallbotEnv(gymnasium.Env):
         if self._disturbance is not None and self.randomization.varies_episodes:
             info["drawn"] = np.array(self._disturbance.get_state().drawn)
         return seen, info
+
+
+class TwoForces(gymnasium.ActionWrapper):
+    """Gives a robot with wheels the action of the others, (2,): a force Fx, Fy.
+
+    Its unit is what the wheels together give in every direction at standstill, `omni.LEAST_FORCE` times the pull of one.
+    The wheels' torque on the ball is that of a rolling robot. A small feedback holds the heading ψ at 0.
+    """
+
+    def __init__(self, env: gymnasium.Env):
+        """Args: env: a `BallbotEnv` of a robot with wheels, wrapped or not."""
+        super().__init__(env)
+        ballbot: Any = env.unwrapped
+        if not isinstance(ballbot, BallbotEnv) or ballbot.params.wheels is None:
+            raise ValueError("TwoForces takes a BallbotEnv of a robot with wheels, as robot='omni'")
+        self._ballbot = ballbot
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """The wheels' action (3,) for an action (2,)."""
+        params, x = self._ballbot.params, self._ballbot.get_state().x
+        force = (
+            omni.LEAST_FORCE * params.force_limit * real_array(action, "action", (2,)).astype(np.float64).clip(-1, 1)
+        )
+        yaw_torque = -params.axial_inertia * (_YAW_RATE**2 * math.sin(x[8]) + 2 * _YAW_RATE * x[9])
+        return np.array(omni.wheel_forces(params, x, tuple(force.tolist()), yaw_torque)) / params.force_limit
 
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
@@ -550,7 +578,9 @@ GRIP = "grip"
 def observation_space(task: Task, params: BallbotParams, history: int = 0) -> spaces.Box:
     """What a robot can observe in a task, with so many earlier observations and actions."""
     own = task.observation_bounds(params)
-    bounds = np.array((*own, *(history * (*own, 1.0, 1.0))), np.float32)
+    if params.wheels is not None:  # as `Task.seen` adds
+        own = (*own, 1.0, 1.0, 1e6, 1e6)
+    bounds = np.array((*own, *(history * (*own, *(1.0,) * params.action_size))), np.float32)
     return spaces.Box(-bounds, bounds, dtype=np.float32)
 
 

@@ -44,7 +44,7 @@ static void rows_copy(int rows, int64_t count, const real *from, int64_t sfrom, 
 static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t *seed, const int64_t *episode, int given,
                   real *x, real *c) {
     for (int64_t m = 0; m < count; m += LANES) {
-        real z[AT_LEAST_1(DRAWS) * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, xs[8 * LANES];
+        real z[AT_LEAST_1(DRAWS) * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, xs[STATES * LANES];
         for (int k = 0; k < LANES && m + k < count; ++k) {
             const int64_t n = which[m + k];
             const uint32_t word = key(seed[n], episode[n]); /* of step 0 */
@@ -58,7 +58,7 @@ static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t 
         draw_state(z + CONSTANT_DRAWS * LANES, LANES, cs, LANES, xs, LANES);
         for (int k = 0; k < LANES && m + k < count; ++k) {
             const int64_t n = which[m + k];
-            for (int i = 0; i < 8; ++i)
+            for (int i = 0; i < STATES; ++i)
                 x[i * B + n] = xs[i * LANES + k];
             for (int i = 0; i < CONSTANTS; ++i)
                 c[i * B + n] = cs[i * LANES + k];
@@ -70,10 +70,10 @@ static void begin(int64_t B, int64_t count, const int64_t *which, const int64_t 
 static void look_at(int64_t B, int64_t count, const int64_t *which, const int64_t *steps, const real *x, const real *c,
                     real *seen, real *tilt) {
     for (int64_t m = 0; m < count; m += LANES) {
-        real xs[8 * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, taken[LANES] = {0}, ss[SEEN * LANES], ts[LANES];
+        real xs[STATES * LANES] = {0}, cs[AT_LEAST_1(CONSTANTS) * LANES] = {0}, taken[LANES] = {0}, ss[SEEN * LANES], ts[LANES];
         for (int k = 0; k < LANES && m + k < count; ++k) {
             taken[k] = (real)steps[which[m + k]];
-            for (int i = 0; i < 8; ++i)
+            for (int i = 0; i < STATES; ++i)
                 xs[i * LANES + k] = x[i * B + which[m + k]];
             for (int i = 0; i < CONSTANTS; ++i)
                 cs[i * LANES + k] = c[i * B + which[m + k]];
@@ -91,7 +91,7 @@ static void look_at(int64_t B, int64_t count, const int64_t *which, const int64_
 enum { CHUNK = 32 * LANES };
 
 /* Rows of what is told of a robot: state, tilt, force, the floor's grip. */
-enum { TILT = 8, FORCE = 9, GRIPPED = 11, TOLD = 11 + GRIP };
+enum { TILT = STATES, FORCE = STATES + 1, GRIPPED = FORCE + ACTIONS, TOLD = GRIPPED + GRIP };
 
 /* Rows of flags, after those of codegen.FLAGS; and of pay. */
 enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
@@ -150,14 +150,14 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
     const int64_t B = m->B;
     const real *const action = m->action + n * m->env;
     real *const told = m->told + n;
-    real taken[LANES] = {0}, after[LANES] = {0}, acts[2 * LANES] = {0}, paid[2 * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
+    real taken[LANES] = {0}, after[LANES] = {0}, acts[ACTIONS * LANES] = {0}, paid[2 * LANES], marks[FLAGS * LANES], limit[LANES], off = 0;
     for (int64_t k = 0; k < count; ++k) {
-        acts[k] = action[k * m->env];
-        acts[LANES + k] = action[k * m->env + m->component];
+        for (int i = 0; i < ACTIONS; ++i)
+            acts[i * LANES + k] = action[k * m->env + i * m->component];
         taken[k] = (real)m->steps[n + k];
         after[k] = taken[k] + 1;
     }
-    for (int k = 0; k < 2 * LANES; ++k)
+    for (int k = 0; k < ACTIONS * LANES; ++k)
         off += acts[k] - acts[k]; /* not a number, unless all are finite */
     if (!(off == 0))
         __atomic_store_n(&m->bad, 1, __ATOMIC_RELAXED);
@@ -167,9 +167,9 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
         look(told, B, m->c + n, B, after, LANES, m->seen + n, B, told + TILT * B, B);
         tell(m, n, LANES, paid, marks, limit);
     } else {
-        real in[(8 + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
-        real *const cs = in + 8 * LANES, *const ss = out + TOLD * LANES;
-        rows_copy(8, count, m->x + n, B, in, LANES);
+        real in[(STATES + CONSTANTS) * LANES] = {0}, out[(TOLD + SEEN) * LANES];
+        real *const cs = in + STATES * LANES, *const ss = out + TOLD * LANES;
+        rows_copy(STATES, count, m->x + n, B, in, LANES);
         rows_copy(CONSTANTS, count, m->c + n, B, cs, LANES);
         advance(in, LANES, cs, LANES, acts, LANES, taken, LANES, out, LANES, out + FORCE * LANES, LANES,
                 out + GRIPPED * LANES, LANES, paid, LANES, marks, LANES, limit, LANES);

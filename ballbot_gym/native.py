@@ -87,7 +87,7 @@ class BallbotNative:
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
-        self._seen_rows = len(task.observation_scale)
+        self._seen_rows = task.observation_size(params)
         self._spares = self._written()
 
     @property
@@ -104,7 +104,7 @@ class BallbotNative:
         """
         if state is not None:
             size = self.num_envs
-            arrays = {"x": (8, size), "c": (len(self.task.constant_names), size)}
+            arrays = {"x": (self.params.state_size, size), "c": (len(self.task.constant_names), size)}
             arrays |= dict.fromkeys(("steps", "episode", "seed"), (size,))
             given = state._asdict()
             for name, shape in arrays.items():
@@ -191,12 +191,12 @@ class BallbotNative:
         self._run(memory)
         if memory.bad:  # what was written is forgotten
             check_finite(given)
-        self._state = old._replace(x=told[:8], c=c, steps=steps, episode=episode)
+        self._state = old._replace(x=told[: self.params.state_size], c=c, steps=steps, episode=episode)
         observation = seen.astype(np.float32, copy=False).T
         terminated, truncated, _, _, _, done = flags
         ended = done.nonzero()[0]
-        now = _info(told, pay[1:], flags[2:5], violated, c)
-        end = _info(end_told, end_pay, end_flags, violated, old.c) if restart else now
+        now = self._info(told, pay[1:], flags[2:5], violated, c)
+        end = self._info(end_told, end_pay, end_flags, violated, old.c) if restart else now
         fields: Any = {
             "observation": observation,
             "reward": pay[0],
@@ -216,6 +216,18 @@ class BallbotNative:
         }
         return BatchStep(**fields), now, end, ended
 
+    def _info(
+        self, told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray, c: np.ndarray
+    ) -> StepInfo:
+        """Rows that native.c has written, as an info names them."""
+        success, failure, clipped = flags
+        tilt = self.params.state_size
+        grip = tilt + 1 + self.params.action_size
+        force = told[tilt + 1 : grip]
+        return StepInfo(
+            told[:tilt], pay[0], pay[1:], told[tilt], force, success, failure, violated, clipped, c, told[grip:]
+        )
+
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""
         if self.state is None:
@@ -225,7 +237,9 @@ class BallbotNative:
     def _unstarted(self) -> State:
         """A state before the first episodes, with random seeds."""
         size = self.num_envs
-        x, c, none = (np.zeros((rows, size), self.dtype) for rows in (8, len(self.task.constant_names), 0))
+        x, c, none = (
+            np.zeros((rows, size), self.dtype) for rows in (self.params.state_size, len(self.task.constant_names), 0)
+        )
         seeds = np.array(seeds_of(self._entropy, size))
         fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none, none)
         return BatchState(*fields)
@@ -249,7 +263,8 @@ class BallbotNative:
 
     def _written(self) -> list[Spares]:
         """What a step writes, in the order of `_Memory`: 6 arrays always, 2 where episodes begin, 4 where they ended."""
-        size, rows, real = self.num_envs, 11 + (4 if self.params.grips else 0), self.dtype
+        size, real, robot = self.num_envs, self.dtype, self.params
+        rows = robot.state_size + 1 + robot.action_size + (4 if robot.grips else 0)
         kinds: list[tuple[tuple[int, ...], Any]] = [
             ((rows, size), real),
             ((self._seen_rows, size), real),
@@ -296,12 +311,6 @@ class _Memory(ctypes.Structure):
     )  # fmt: skip
 
 
-def _info(told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray, c: np.ndarray) -> StepInfo:
-    """Rows that native.c has written, as an info names them."""
-    success, failure, clipped = flags
-    return StepInfo(told[:8], pay[0], pay[1:], told[8], told[9:11], success, failure, violated, clipped, c, told[11:])
-
-
 def _pointers(*arrays: np.ndarray) -> list[int]:
     return [_pointer(array) for array in arrays]
 
@@ -327,7 +336,8 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
         NativeUnavailableError: see `BallbotNative`.
     """
     code, dtype = _code(task, params, double), np.float64 if double else np.float32
-    actions = np.asfortranarray([[0.1, -0.2], [-0.3, 0.4], [1.2, 0.5], [-0.6, -1.2]], dtype)
+    actions = [[0.1, -0.2, 0.3], [-0.3, 0.4, -0.5], [1.2, 0.5, 0.1], [-0.6, -1.2, 0.2]]
+    actions = np.asfortranarray(np.array(actions, dtype)[:, : params.action_size])
     own = BallbotNative(task, len(actions), dtype, params, code=code)
     kind = torch.float64 if double else torch.float32
     batch = BallbotBatch(task, len(actions), dtype=kind, compile=False, params=params)

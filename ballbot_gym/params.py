@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ballbot_gym import files
+from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number, is_positive
 
 _PACKAGE = Path(__file__).parent
@@ -18,6 +19,8 @@ URDF_PATH = URDF_FOLDER / "ballbot.urdf"
 """The URDF of the paper's robot."""
 ROLLING_URDF_PATH = URDF_FOLDER / "rolling.urdf"
 """The URDF of the paper's robot with a ball that rolls."""
+OMNI_URDF_PATH = URDF_FOLDER / "omni.urdf"
+"""The URDF of a robot with three omni-wheels."""
 
 STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
 
@@ -36,10 +39,15 @@ _ROLLING_CHAIN = {
     "gamma": ("continuous", (0.0, 1.0, 0.0), "hub", "yoke"),
     "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "body"),
 }
+_OMNI_CHAIN = _ROLLING_CHAIN | {
+    "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "frame"),
+    "psi": ("continuous", (0.0, 0.0, 1.0), "frame", "body"),
+}
 _NO_NUMBER = (str, bytes, bool, dict, list, tuple, type(None))
 _FILE_LIMIT = 16 * 2**20  # bytes
 _MASSLESS_LINKS = ("slide", "yoke")
 _ROLLING_MASSLESS_LINKS = ("slide_x", "slide_y", "hub", "yoke")
+_OMNI_MASSLESS_LINKS = (*_ROLLING_MASSLESS_LINKS, "frame")
 
 
 class UrdfError(ValueError):
@@ -61,8 +69,10 @@ class BallbotParams:
     | rolls | whether the ball rolls without slipping, driven by a torque between it and the body; the paper's translates | |
     | ball_inertia | of a rolling ball about its centre; 0 where the ball does not roll | kg·m² |
     | friction | coefficient between ball and floor; the paper's floor gives whatever force is asked, which is inf | |
+    | wheels | of a robot that three omni-wheels drive; None for an ideal torque, and a body that does not yaw | |
 
-    A force F on the ball of a rolling robot stands for the torque r e_z × F that the body applies to it.
+    A force F on the ball of a rolling robot stands for the torque r e_z × F that the body applies to it. With wheels
+    force_limit is the largest pull of each wheel on the ball, at standstill.
 
     Raises:
         ValueError: a field is no number, or not positive and finite; the message names it.
@@ -81,13 +91,22 @@ class BallbotParams:
     rolls: bool = False
     ball_inertia: float = 0.0
     friction: float = math.inf
+    wheels: Wheels | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.rolls, bool):
             raise ValueError(f"BallbotParams: rolls must be True or False, not {self.rolls!r}")
+        if isinstance(self.wheels, dict):  # as `dataclasses.asdict` makes it
+            object.__setattr__(self, "wheels", Wheels(**self.wheels))
+        if self.wheels is not None and not (isinstance(self.wheels, Wheels) and self.rolls):
+            raise ValueError(
+                f"BallbotParams: wheels must be Wheels of a robot with rolls=True, or None, not {self.wheels!r}"
+            )
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "rolls" or (field.name == "friction" and is_number(value) and value == math.inf):
+            if field.name in ("rolls", "wheels") or (
+                field.name == "friction" and is_number(value) and value == math.inf
+            ):
                 continue
             if isinstance(value, _NO_NUMBER):
                 raise ValueError(f"BallbotParams: {field.name} must be a number, not {value!r}")
@@ -100,6 +119,21 @@ class BallbotParams:
             # batches of robots hold tensors, whose values are not looked at
             if is_number(value) and not is_positive(value):
                 raise ValueError(f"BallbotParams: {field.name} must be positive and finite, not {value}")
+
+    def __repr__(self) -> str:
+        """All fields, but wheels only where there are some: records of robots without name them by this."""
+        told = (f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if f.name != "wheels" or self.wheels)
+        return f"{type(self).__name__}({', '.join(told)})"
+
+    @property
+    def state_size(self) -> int:
+        """Components of a state: those of `dynamics.STATE`, or `dynamics.OMNI_STATE` with wheels."""
+        return 8 if self.wheels is None else 11
+
+    @property
+    def action_size(self) -> int:
+        """Components of a force or action: x and y, or one for each wheel."""
+        return 2 if self.wheels is None else 3
 
     @cached_property
     def total_mass(self) -> float:
@@ -136,7 +170,8 @@ class BallbotParams:
         """Reads the parameters from a URDF with the paper's chain of links and joints, or with that of a rolling ball.
 
         A joint 'roll' makes it a rolling ball's: world → x → y → z prismatic, hub; from the hub the ball on the spherical
-        joint 'roll', and gamma, yoke, theta, body. So only the ball rolls, and the body does not yaw.
+        joint 'roll', and gamma, yoke, theta, body. So only the ball rolls, and the body does not yaw. An element <wheels>
+        adds three omni-wheels, and a frame between theta and the body, which then turns about its own axis on joint 'psi'.
 
         Args:
             path: the URDF; without one, the robot of the paper.
@@ -147,10 +182,13 @@ class BallbotParams:
                 chain differs from the one that the closed-form dynamics describe.
         """
         urdf = _Urdf(Path(path))
-        rolls = urdf.has_joint("roll")
-        for joint, (kind, axis, parent, child) in (_ROLLING_CHAIN if rolls else _CHAIN).items():
+        rolls, wheels = urdf.has_joint("roll"), urdf.wheels()
+        chain, massless = (_ROLLING_CHAIN, _ROLLING_MASSLESS_LINKS) if rolls else (_CHAIN, _MASSLESS_LINKS)
+        if wheels is not None:
+            chain, massless = _OMNI_CHAIN, _OMNI_MASSLESS_LINKS
+        for joint, (kind, axis, parent, child) in chain.items():
             urdf.check_joint(joint, kind, axis, parent, child)
-        for link in _ROLLING_MASSLESS_LINKS if rolls else _MASSLESS_LINKS:
+        for link in massless:
             urdf.check_massless(link)
         ball_mass = urdf.positive_mass("ball")
         ball_inertias = urdf.principal_inertias("ball")
@@ -173,11 +211,15 @@ class BallbotParams:
             rolls=rolls,
             ball_inertia=ball_inertias[0] if rolls else 0.0,
             friction=urdf.friction("ball"),
+            wheels=wheels,
         )
 
     def to_urdf(self) -> str:
         """The URDF text of this robot: a packaged file with this robot's numbers. `from_urdf` reads it back exactly."""
-        urdf = _Urdf(ROLLING_URDF_PATH if self.rolls else URDF_PATH)
+        urdf = _Urdf(OMNI_URDF_PATH if self.wheels else ROLLING_URDF_PATH if self.rolls else URDF_PATH)
+        if self.wheels is not None:
+            for field in fields(Wheels):
+                urdf.find("wheels").set(field.name, repr(getattr(self.wheels, field.name)))
         urdf.find("link[@name='ball']/inertial/mass").set("value", repr(self.ball_mass))
         urdf.find("link[@name='body']/inertial/mass").set("value", repr(self.body_mass))
         body_inertia = urdf.find("link[@name='body']/inertial/inertia")
@@ -225,6 +267,10 @@ class ModelNumbers(NamedTuple):
     ball_radius: Any
     friction: Any
     grips: bool
+    com_height: Any = None
+    ball_inertia: Any = None
+    force_limit: Any = None
+    wheels: Wheels | None = None
 
     @classmethod
     def of(cls, params: BallbotParams) -> "ModelNumbers":
@@ -242,6 +288,10 @@ class ModelNumbers(NamedTuple):
             ball_radius=params.ball_radius,
             friction=params.friction,
             grips=BallbotParams.grips.func(params),
+            com_height=params.com_height,
+            ball_inertia=params.ball_inertia,
+            force_limit=params.force_limit,
+            wheels=params.wheels,
         )
 
 
@@ -313,6 +363,16 @@ class _Urdf:
 
     def has_joint(self, name: str) -> bool:
         return self.root.find(f"joint[@name='{name}']") is not None
+
+    def wheels(self) -> Wheels | None:
+        """Those of the element <wheels>, if there is one."""
+        element = self.root.find("wheels")
+        if element is None:
+            return None
+        try:
+            return Wheels(**{f.name: self._number(element, f.name, "wheels") for f in fields(Wheels)})
+        except ValueError as error:
+            raise error if isinstance(error, UrdfError) else self.error(str(error)) from None
 
     def friction(self, link: str) -> float:
         """The coefficient of a link's <contact>, which Bullet reads too; without one, inf."""

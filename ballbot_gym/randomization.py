@@ -233,13 +233,14 @@ class Randomization:
             time: since the episode began, s.
         """
         seen = tuple(
-            value + std * normal if std else value for value, std, normal in zip(x, self.noise, normals(z), strict=True)
-        )
+            value + std * normal if std else value
+            for value, std, normal in zip(x, self.noise, normals(z), strict=False)
+        ) + tuple(x[8:])
         if not self.is_biased:
             return seen
         drift, lean, rate = drawn[8:10], drawn[10:12], drawn[12:14]
         errors = (*(time * part for part in drift), *lean, *drift, *rate)
-        return tuple(value + error for value, error in zip(seen, errors, strict=True))
+        return tuple(value + error for value, error in zip(seen, errors, strict=False)) + seen[8:]
 
 
 def track_of(randomization: Randomization) -> str:
@@ -273,9 +274,9 @@ class DisturbanceState(NamedTuple):
 
     drawn: tuple[float, ...]
     """What `Randomization.draw` drew for the episode."""
-    force: tuple[float, float]
+    force: tuple[float, ...]
     """N, applied last."""
-    past: tuple[tuple[float, float], ...]
+    past: tuple[tuple[float, ...], ...]
     """N, earlier commands, the latest first."""
 
 
@@ -295,7 +296,8 @@ class Disturbance:
 
     def begin(self, drawn: tuple[float, ...]) -> None:
         """Starts an episode with what `Randomization.draw` drew."""
-        self.set_state(DisturbanceState(drawn, (0.0, 0.0), ((0.0, 0.0),) * self._past_steps))
+        none = (0.0,) * self._nominal.action_size
+        self.set_state(DisturbanceState(drawn, none, (none,) * self._past_steps))
 
     def get_state(self) -> DisturbanceState:
         """What it remembers, after `reset`."""
@@ -308,14 +310,14 @@ class Disturbance:
         if self._randomization.varies_robot:
             self.params = self._randomization.robot(self._nominal, self._drawn)
 
-    def actuate(self, command: tuple[float, float]) -> tuple[float, float]:
+    def actuate(self, command: tuple[float, ...]) -> tuple[float, ...]:
         """The force, N, that the actuator applies in the control step that begins with this command, N."""
-        command = (self._strength * command[0], self._strength * command[1])
+        command = tuple([self._strength * part for part in command])
         self._force = actuate(command, self._past, self._force, self._gain, self._delay)
         self._past = (command, *self._past)[: self._past_steps]
         return self._force
 
-    def pushed(self, force: tuple[float, float], rng: np.random.Generator) -> tuple[float, float]:
+    def pushed(self, force: tuple[float, ...], rng: np.random.Generator) -> tuple[float, ...]:
         """The force, N, plus the push of this control step, if there is one."""
         if not self._randomization.pushes:
             return force
@@ -331,8 +333,8 @@ class Disturbance:
 
 
 def actuate(
-    command: tuple[Any, Any], past: tuple[tuple[Any, Any], ...], force: tuple[Any, Any], gain: Any, delay: Any
-) -> tuple[Any, Any]:
+    command: tuple[Any, ...], past: tuple[tuple[Any, ...], ...], force: tuple[Any, ...], gain: Any, delay: Any
+) -> tuple[Any, ...]:
     """Force (2), N, that the actuator applies in the next control step.
 
     Args:

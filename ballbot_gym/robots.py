@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym.checks import from_fields
-from ballbot_gym.params import ROLLING_URDF_PATH, URDF_FOLDER, URDF_PATH, BallbotParams
+from ballbot_gym.params import OMNI_URDF_PATH, ROLLING_URDF_PATH, URDF_FOLDER, URDF_PATH, BallbotParams
 
 
 @dataclass(frozen=True)
@@ -192,4 +192,26 @@ register_robot(
         "weave": {"ball_radius": 0.129},
     },
     about="Kugle V1 of Aalborg University, by its published numbers",
+)
+register_robot(
+    "omni",
+    OMNI_URDF_PATH,
+    {
+        "stabilize": {"start_position": 1.0, "start_speed": 1.0, "start_lean": 0.1, "start_lean_rate": 0.2},
+        "turn": {"min_speed": 0.5, "max_speed": 1.5},
+        "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15},
+        "weave": {"ball_radius": 0.129},
+    },
+    about="Kugle V1 with its three omni-wheels and motors: it yaws, and its torque falls with speed",
+)
+register_robot(
+    "omni_strong",
+    URDF_FOLDER / "omni_strong.urdf",
+    {
+        "stabilize": {"start_position": 1.0, "start_speed": 2.0, "start_lean": 0.3, "start_lean_rate": 0.5},
+        "turn": {"min_speed": 1.0, "max_speed": 4.0},
+        "orbit": {"max_steady_tilt": 0.52},
+        "weave": {"ball_radius": 0.129},
+    },
+    about="the same with motors for leans of 30°",
 )

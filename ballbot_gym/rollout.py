@@ -60,10 +60,10 @@ class ActionController:
         self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        seen = self._task.observe(tuple(np.asarray(x).tolist()), self._task.at(self._c, t))
+        seen = self._task.seen(tuple(np.asarray(x).tolist()), self._task.at(self._c, t))
         own = np.array(seen, np.float32)
         if self._begins:
-            self._past = np.tile(np.append(own, np.zeros(2, np.float32)), self._history)
+            self._past = np.tile(np.append(own, np.zeros(self._params.action_size, np.float32)), self._history)
         observation = np.concatenate([own, self._past]) if self._history else own
         action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
@@ -172,7 +172,7 @@ def simulate(
 
     `physics` is "bullet", "mujoco" or "rk4"; default, the first that is installed, as for environments.
     """
-    simulator = make_simulator(default_physics() if physics is None else physics, params, control_dt)
+    simulator = make_simulator(default_physics(params) if physics is None else physics, params, control_dt)
     x = np.asarray(x0, np.float64)
     simulator.reset(tuple(x.tolist()))
     controller.reset(0.0, x, np.zeros(0))

@@ -27,16 +27,21 @@ from ballbot_gym.tasks.transition import outcome
 
 _log = logging.getLogger(__name__)
 
-_ROBOT = ("moving_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "ball_radius")
+_ROBOT = (
+    "moving_mass",
+    "first_moment",
+    "pivot_inertia",
+    "axial_inertia",
+    "gravity",
+    "ball_radius",
+    "ball_inertia",
+    "force_limit",
+)
 """What the equations of motion take of a robot."""
 
 _TRIALS = 64
 _YIELD = 1e-4  # s, at every reset until the code is there
-_HELD, _MOVED = struct.Struct("10d"), struct.Struct("8d")  # a state and a force, and the state after it
-_JUDGED = struct.Struct("9d")  # an outcome, and the tilt
-_STEP = struct.Struct(
-    "20d"
-)  # states before and after, between them the force; the number of steps, and whether grip is kept
+_JUDGED = 9  # an outcome, and the tilt
 
 State = tuple[float, ...]
 
@@ -55,11 +60,12 @@ class _Work:
     `pack` writes the first arguments, `call` calls it, `unpack` reads the first results, and check[0] is 0 if all are finite.
     """
 
-    def __init__(self, code: Code, given: struct.Struct, told: struct.Struct, in_place: bool = False):
+    def __init__(self, code: Code, given: int, told: int, in_place: bool = False):
         self.first = 1 if in_place else 1 + code.results  # of the arguments
         memory = bytearray(8 * (self.first + code.arguments))
         self.numbers, self.check = np.frombuffer(memory), memoryview(memory).cast("d")
-        self.pack, self.unpack = partial(given.pack_into, memory, 8 * self.first), partial(told.unpack_from, memory, 8)
+        self.pack = partial(struct.Struct(f"{given}d").pack_into, memory, 8 * self.first)
+        self.unpack = partial(struct.Struct(f"{told}d").unpack_from, memory, 8)
         self.call = partial(code.call, ctypes.c_void_p(self.numbers.ctypes.data))
 
 
@@ -67,28 +73,32 @@ class Motion:
     """RK4 steps of the closed form."""
 
     def __init__(self, code: Code, params: BallbotParams, dt: float, substeps: int):
-        work = _Work(code, _HELD, _MOVED, in_place=True)
+        states, held = params.state_size, params.state_size + params.action_size  # numbers of a state; with a force
+        work = _Work(code, held, states, in_place=True)
         self._pack, self._call, self._check, self._unpack = work.pack, work.call, work.check, work.unpack
         self._numbers = work.numbers
         self._substeps = range(substeps)
-        self._numbers[11] = dt / substeps
+        self._numbers[1 + held] = dt / substeps
+        self._robot = self._numbers[2 + held :]
         self.set_params(params)
 
     @staticmethod
-    def made(rolls: bool, start: bool) -> Code | None:
-        """The code for robots whose ball rolls, or does not; see `_code`."""
+    def made(params: BallbotParams, start: bool) -> Code | None:
+        """The code for robots of the same kind, with the same wheels; see `_code`."""
+        kind = {"rolls": params.rolls, "wheels": params.wheels}
 
         def compute(x: tuple, u: tuple, dt: tuple, robot: tuple) -> tuple:
-            params: Any = SimpleNamespace(rolls=rolls, **dict(zip(_ROBOT, robot, strict=True)))
-            return dynamics.step(params, x, u, dt[0], 1)
+            model: Any = SimpleNamespace(**kind, **dict(zip(_ROBOT, robot, strict=True)))
+            return dynamics.step(model, x, u, dt[0], 1)
 
-        return _code(("motion", rolls), compute, (8, 2, 1, len(_ROBOT)), True, start)
+        sizes = params.state_size, params.action_size, 1, len(_ROBOT)
+        return _code(("motion", *kind.values()), compute, sizes, True, start)
 
     def set_params(self, params: BallbotParams) -> None:
-        """Replaces the robot by one whose ball rolls as well, or as little."""
-        self._numbers[12:] = [getattr(params, name) for name in _ROBOT]
+        """Replaces the robot by one of the same kind."""
+        self._robot[:] = [getattr(params, name) for name in _ROBOT]
 
-    def step(self, x: State, u: tuple[float, float]) -> State | None:
+    def step(self, x: State, u: tuple[float, ...]) -> State | None:
         """The state after the force u, N, was held; None where Python must compute it."""
         self._pack(*x, *u)
         for _ in self._substeps:
@@ -100,33 +110,39 @@ class Judge:
     """What a task says of control steps.
 
     Of the step that was judged last, `seen` is the (no) observation without noise, `x` the (8,) state after it, and `force`
-    (2,) in N. They are overwritten by the next.
+    (2,) in N; they are longer with wheels. They are overwritten by the next.
     """
 
-    def __init__(self, code: Code, task: Task):
-        work = _Work(code, _STEP, _JUDGED)
+    def __init__(self, code: Code, task: Task, params: BallbotParams):
+        states, held = params.state_size, params.state_size + params.action_size
+        # states before and after, between them the force; the number of steps, and whether grip is kept
+        given = held + states + 2
+        work = _Work(code, given, _JUDGED)
         self._pack, self._call, self._check, self._unpack = work.pack, work.call, work.check, work.unpack
-        self.seen = work.numbers[10 : 10 + len(task.observation_scale)]
-        _, self.force, self.x, _, self._constants = np.split(work.numbers[work.first :], (8, 10, 18, 20))
+        self.seen = work.numbers[10 : 10 + task.observation_size(params)]
+        ends = (states, held, held + states, given)
+        _, self.force, self.x, _, self._constants = np.split(work.numbers[work.first :], ends)
 
     @staticmethod
-    def made(task: Task, start: bool) -> Code | None:
-        """The code for a task; see `_code`."""
+    def made(task: Task, params: BallbotParams, start: bool) -> Code | None:
+        """The code for a task, and robots with as large states; see `_code`."""
 
         def compute(before: tuple, u: tuple, x: tuple, step: tuple, c: tuple) -> tuple:
             steps, kept = step
             did = outcome(task, before, u, x, c, steps, (kept,))
             c = task.at(c, steps * task.control_dt)
             finite = (*task.limits(x, c), *task.goal(x, c))  # an outcome does not tell
-            return (*did, dynamics.tilt(x), *task.observe(x, c), *finite)
+            return (*did, dynamics.tilt(x), *task.seen(x, c), *finite)
 
-        return _code(task, compute, (8, 2, 8, 2, len(task.constant_names)), False, start)
+        states, forces = params.state_size, params.action_size
+        sizes = states, forces, states, 2, len(task.constant_names)
+        return _code((task, states), compute, sizes, False, start)
 
     def set_constants(self, c: State) -> None:
         """Makes c the constants of the episode."""
         self._constants[:] = c
 
-    def judge(self, before: State, force: tuple[float, float], x: State, steps: int, kept: float) -> State | None:
+    def judge(self, before: State, force: tuple[float, ...], x: State, steps: int, kept: float) -> State | None:
         """(9,) what a force, N, did that led from one state to the state x: an `Outcome`, and the tilt at its end, rad.
 
         None where Python must compute it.
@@ -192,7 +208,7 @@ def _checked(compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_pl
         given = rng.uniform(-1.5, 1.5, sum(counts))
         expected = compute(*(tuple(part.tolist()) for part in np.split(given, ends)))
         code = code._replace(results=len(expected))
-        work = _Work(code, _MOVED, _MOVED, in_place)
+        work = _Work(code, 1, 1, in_place)
         work.numbers[work.first : work.first + len(given)] = given
         work.call()
         if work.check[0] == 0 and work.numbers[1 : 1 + len(expected)].tobytes() != np.array(expected, float).tobytes():

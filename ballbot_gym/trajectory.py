@@ -23,7 +23,7 @@ class Trajectory(Moving):
 
     t: (N+1,) s. x: (N+1, 8); order and units in `dynamics.STATE`. u: (N, 2) N where each force is held until the next
     time, or (N+1, 2) where it runs linearly between times. xdot: (N+1, 8) slopes of x, if known: with them x is
-    interpolated by cubics, else linearly.
+    interpolated by cubics, else linearly. Of a robot with wheels x is (N+1, 11), and u has three columns.
 
     Raises:
         TrajectoryError: shapes that do not fit, times that do not increase, or values that are not finite.
@@ -43,10 +43,11 @@ class Trajectory(Moving):
                 except ValueError as error:
                     raise TrajectoryError(str(error)) from None
         n = self.t.size - 1
-        if n < 0 or self.t.shape != (n + 1,) or self.x.shape != (n + 1, 8):
+        if n < 0 or self.t.shape != (n + 1,) or self.x.shape not in ((n + 1, 8), (n + 1, 11)):
             raise TrajectoryError(f"t {self.t.shape} and x {self.x.shape} must be (N+1,) and (N+1, 8)")
-        if self.u.shape not in ((n, 2), (n + 1, 2)):
-            raise TrajectoryError(f"u {self.u.shape} must be ({n}, 2), held, or ({n + 1}, 2), linear")
+        forces = 2 if self.x.shape[1] == 8 else 3
+        if self.u.shape not in ((n, forces), (n + 1, forces)):
+            raise TrajectoryError(f"u {self.u.shape} must be ({n}, {forces}), held, or ({n + 1}, {forces}), linear")
         if self.xdot is not None and self.xdot.shape != self.x.shape:
             raise TrajectoryError(f"xdot {self.xdot.shape} must have the shape of x, {self.x.shape}")
         if not (np.diff(self.t) > 0).all():
@@ -63,7 +64,7 @@ class Trajectory(Moving):
             "states": f"{len(self.t)}",
             "peak tilt": f"{np.degrees(self.tilt.max()):.1f}°",
             "peak speed": f"{np.hypot(self.x[:, 4], self.x[:, 5]).max():.2f} m/s",
-            "peak force": f"{np.hypot(*self.u.T).max(initial=0.0):.0f} N",
+            "peak force": f"{np.linalg.norm(self.u, axis=1).max(initial=0.0):.0f} N",
         }
 
     @property

@@ -162,7 +162,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         fps = round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._ended = np.zeros(self.num_envs, np.bool_)  # whose episodes have ended and not begun anew
-        self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
         self.single_observation_space = observation_space(self.task, self.params, self.history)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -224,7 +224,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self._ended = self._ended & ~mask
         size, (x_now, c_now) = self.num_envs, self._x_and_c()
         tilt = self._array(tilt).astype(self._dtype, copy=False)
-        force, grip = np.zeros((2, size), self._dtype), np.zeros((4 * self.params.grips, size), self._dtype)
+        force, grip = (
+            np.zeros((self.params.action_size, size), self._dtype),
+            np.zeros((4 * self.params.grips, size), self._dtype),
+        )
         success, failure, clipped = np.zeros((3, size), bool)
         parts = np.zeros((4, size))
         flags = success, failure, self._none, clipped
@@ -236,7 +239,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
 
         Args:
-            actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1].
+            actions: (B, 2) forces in units of the robot's force limit; clipped to [−1, 1]. With wheels (B, 3).
 
         Raises:
             ValueError: actions that are not of real, finite numbers or not of shape (B, 2).
@@ -244,7 +247,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             gymnasium.error.ClosedEnvironmentError: after `close`.
         """
         self._check_open()
-        actions = real_array(actions, "actions", (self.num_envs, 2))
+        actions = real_array(actions, "actions", (self.num_envs, self.params.action_size))
         if actions.dtype != self._dtype:
             check_finite(actions)
             actions = actions.clip(-2.0, 2.0).astype(
@@ -488,7 +491,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
         """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
         drawn, c = self._array(state.x), self._array(state.c)
-        wanted = finite_array(given, (self.num_envs, 8), "state", broadcast=True).T
+        wanted = finite_array(given, (self.num_envs, self.params.state_size), "state", broadcast=True).T
         x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
         safe = np.all([limit >= 0 for limit in self.task.limits(tuple(x), self.task.at(tuple(c), 0.0))], axis=0)
         if not safe[mask].all():

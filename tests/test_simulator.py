@@ -75,14 +75,17 @@ def decimal_commas(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_robots_move_the_same_bit_for_bit_where_decimals_have_commas(name, physics, decimal_commas):
     robot, varied = named_robot(name), replace(named_robot(name), com_height=0.55)
+    if robot.wheels is not None and physics == "bullet":
+        pytest.skip("Bullet has no wheels")
+    start, force = (*GENTLE, 0.0, 0.0, 0.0)[: robot.state_size], (5.0, -3.0, 1.0)[: robot.action_size]
     ends = []
     for changes in (lambda: None, decimal_commas):
         changes()
         simulator = make_simulator(physics, robot, 0.02)
         for params in (robot, varied):  # the second one loads a URDF again
             simulator.set_params(params)
-            simulator.reset(GENTLE)
-            ends.append([simulator.step((5.0, -3.0)) for _ in range(5)])
+            simulator.reset(start)
+            ends.append([simulator.step(force) for _ in range(5)])
         simulator.close()
     assert ends[:2] == ends[2:]
     assert locale.localeconv()["decimal_point"] == ","  # as it was

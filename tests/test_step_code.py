@@ -121,11 +121,11 @@ def test_goals_limits_and_ends_are_those_of_python(task):
 
 @needs_compiler
 def test_numbers_that_are_not_finite_are_left_to_python(params):
-    Motion.made(False, start=True)
-    Judge.made(Stabilize(), start=True)
+    Motion.made(params, start=True)
+    Judge.made(Stabilize(), params, start=True)
     wait()
-    codes: Any = Motion.made(False, start=False), Judge.made(Stabilize(), start=False)
-    motion, judge = Motion(codes[0], params, 0.02, 2), Judge(codes[1], Stabilize())
+    codes: Any = Motion.made(params, start=False), Judge.made(Stabilize(), params, start=False)
+    motion, judge = Motion(codes[0], params, 0.02, 2), Judge(codes[1], Stabilize(), params)
     good, bad = (0.1,) * 8, (0.1,) * 4 + (math.inf,) + (0.1,) * 3
     assert motion.step(good, (1.0, 2.0)) == dynamics.step(params, good, (1.0, 2.0), 0.02, 2)
     assert motion.step(bad, (1.0, 2.0)) is None

@@ -6,7 +6,13 @@ from collections.abc import Callable
 from ballbot_gym.engines.bullet import BulletContactSimulator, BulletSimulator
 from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, has_pybullet, import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
-from ballbot_gym.engines.mujoco import MujocoContactSimulator, MujocoSimulator, has_mujoco, import_mujoco
+from ballbot_gym.engines.mujoco import (
+    MujocoContactSimulator,
+    MujocoOmniSimulator,
+    MujocoSimulator,
+    has_mujoco,
+    import_mujoco,
+)
 from ballbot_gym.engines.simulator import Simulator, State
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
@@ -22,12 +28,13 @@ __all__ = [
     "make_simulator",
 ]
 
-PHYSICS: dict[str, tuple[Callable[..., Simulator], Callable[..., Simulator]]] = {
-    "bullet": (BulletSimulator, BulletContactSimulator),
-    "mujoco": (MujocoSimulator, MujocoContactSimulator),
-    "rk4": (Rk4Simulator, Rk4Simulator),
+PHYSICS: dict[str, tuple[Callable[..., Simulator], Callable[..., Simulator], Callable[..., Simulator] | None]] = {
+    "bullet": (BulletSimulator, BulletContactSimulator, None),
+    "mujoco": (MujocoSimulator, MujocoContactSimulator, MujocoOmniSimulator),
+    "rk4": (Rk4Simulator, Rk4Simulator, Rk4Simulator),
 }
-"""Simulators by the name that `gymnasium.make(..., physics=name)` takes: of a ball that translates, and of one that rolls.
+"""Simulators by the name that `gymnasium.make(..., physics=name)` takes: of a ball that translates, of one that rolls, and of
+one that wheels drive.
 
 The first that is installed is the default.
 """
@@ -52,9 +59,13 @@ def check_installed(physics: str) -> None:
         import_mujoco()
 
 
-def default_physics() -> str:
-    """What `physics` is by default: the first that is installed. "rk4" comes with one warning per process."""
-    best = installed_physics()[0]
+def default_physics(params: BallbotParams | None = None) -> str:
+    """What `physics` is by default: the first that is installed, and that can simulate the robot, if one is given.
+
+    "rk4" comes with one warning per process.
+    """
+    kind = 0 if params is None else _kind(params)
+    best = next(name for name in installed_physics() if PHYSICS[name][kind] is not None)
     if best == "rk4" and not _noticed:
         _noticed.append(True)
         warnings.warn(
@@ -68,5 +79,17 @@ def default_physics() -> str:
 def make_simulator(
     physics: str, params: BallbotParams, control_dt: float, physics_dt: float | None = None
 ) -> Simulator:
-    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`."""
-    return PHYSICS[physics][params.rolls](params, control_dt, physics_dt)
+    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`.
+
+    Raises:
+        ValueError: this physics cannot simulate the robot.
+    """
+    make = PHYSICS[physics][_kind(params)]
+    if make is None:
+        raise ValueError(f'physics={physics!r} has no robot with wheels; give physics="mujoco" or "rk4"')
+    return make(params, control_dt, physics_dt)
+
+
+def _kind(params: BallbotParams) -> int:
+    """Which of the simulators of `PHYSICS` a robot needs."""
+    return params.rolls if params.wheels is None else 2

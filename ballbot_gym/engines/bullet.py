@@ -3,7 +3,7 @@
 import weakref
 
 from ballbot_gym.engines.bullet_client import connect, import_pybullet, joint_indices, load_robot, set_surface
-from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_rolling, whole_substeps
+from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
 from ballbot_gym.params import BallbotParams
 
 _0 = (0.0, 0.0)
@@ -54,7 +54,7 @@ class BulletSimulator(Simulator):
             self._robot, body, mass=params.body_mass, localInertiaDiagonal=inertia, physicsClientId=client
         )
 
-    def step(self, u: tuple[float, float]) -> State:
+    def step(self, u: tuple[float, ...]) -> State:
         bullet, client, robot, joints = self._bullet, self._client, self._robot, self._joints
         # PyBullet takes twice as long for keywords. No targets and gains matter to a torque.
         bullet.setJointMotorControlArray(robot, joints[:2], bullet.TORQUE_CONTROL, _0, _0, u, _0, _0, client)
@@ -66,7 +66,7 @@ class BulletSimulator(Simulator):
         self._release()
 
     def _reload(self, params: BallbotParams) -> None:
-        check_rolling(params, self._params.rolls)
+        check_kind(params, self._params)
         self._bullet.removeBody(self._robot, physicsClientId=self._client)
         self._robot, self._joints = load_robot(self._bullet, self._client, params)
         self._params = params
@@ -102,7 +102,7 @@ class BulletContactSimulator(BulletSimulator):
         self._reload(params)  # in any case, so that nothing of the contact's settings is lost; see `set_surface`
         self._set_ball()
 
-    def step(self, u: tuple[float, float]) -> State:
+    def step(self, u: tuple[float, ...]) -> State:
         bullet, client, robot, radius = self._bullet, self._client, self._robot, self._params.ball_radius
         tx, ty = -radius * u[1], radius * u[0]
         bullet.applyExternalTorque(robot, self._ball, (tx, ty, 0.0), bullet.WORLD_FRAME, client)

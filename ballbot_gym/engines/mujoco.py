@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_rolling, whole_substeps
+from ballbot_gym import omni
+from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
 
@@ -53,10 +54,10 @@ class MujocoSimulator(Simulator):
             self._positions[place], self._velocities[place] = x[i], x[i + 4]
 
     def set_params(self, params: BallbotParams) -> None:
-        check_rolling(params, self._params.rolls)
+        check_kind(params, self._params)
         self._make(params)
 
-    def step(self, u: tuple[float, float]) -> State:
+    def step(self, u: tuple[float, ...]) -> State:
         self._pushed[0], self._pushed[1] = u  # a third of the time that a slice takes
         self._mj_step(self._model, self._data, self._substeps)
         return (*self._positions.tolist(), *self._velocities.tolist())
@@ -117,7 +118,7 @@ class MujocoContactSimulator(MujocoSimulator):
         if not memory:
             radius = self._params.ball_radius
             self._positions[2] = _PRESSED
-            self._velocities[5:] = (-x[5] / radius, x[4] / radius, 0.0)
+            self._velocities[-3:] = (-x[5] / radius, x[4] / radius, 0.0)
 
     def memory(self) -> tuple[float, ...]:
         """MuJoCo's whole state: how the ball turns and slips, and where its solver starts."""
@@ -167,24 +168,113 @@ class MujocoContactSimulator(MujocoSimulator):
             solimp=(0.9999, 0.9999, 0.0001, 0.5, 2),
         )
 
-    def step(self, u: tuple[float, float]) -> State:
+    def step(self, u: tuple[float, ...]) -> State:
         """Takes MuJoCo's steps one by one.
 
         MuJoCo's friction wants to stop a slip within solreffriction, and its convex cone lifts the ball off the floor where
         friction is too weak for that. So friction is given the time that it needs under the robot's weight.
         """
-        robot, least, softness, twisted = self._params, 2 * self._dt, self._model.pair_solreffriction[0], self._twisted
-        radius = robot.ball_radius
+        twisted, radius = self._twisted, self._params.ball_radius
         twisted[_BALL, 3], twisted[_BALL, 4] = -radius * u[1], radius * u[0]
         twisted[_BODY, 3], twisted[_BODY, 4] = radius * u[1], -radius * u[0]
-        strength = min(robot.friction, MOST_FRICTION) * robot.weight * robot.ball_radius**2 / robot.ball_inertia
-        softness[1] = 1
         for _ in range(self._substeps):
-            softness[0] = max(least, 2 * math.hypot(*self.slip()) / strength)
+            self._soften()
             self._mj_step(self._model, self._data)
         x, y, _, gamma, theta, *_ = self._positions.tolist()
         vx, vy, _, dgamma, dtheta, *_ = self._velocities.tolist()
         return x, y, gamma, theta, vx, vy, dgamma, dtheta
+
+    def _soften(self) -> None:
+        robot, softness = self._params, self._model.pair_solreffriction[0]
+        strength = min(robot.friction, MOST_FRICTION) * robot.weight * robot.ball_radius**2 / robot.ball_inertia
+        softness[0], softness[1] = max(2 * self._dt, 2 * math.hypot(*self.slip()) / strength), 1
+
+
+class MujocoOmniSimulator(MujocoContactSimulator):
+    """A robot with three omni-wheels in MuJoCo, on a floor: the ball may slip, and leave the floor.
+
+    A wheel is an actuator between body and ball, whose force falls with its speed, and so is the floor's torque against the
+    ball's spin. MuJoCo has no inertia of actuators between bodies. So the rotors' torque is found from the acceleration
+    that it changes itself, which takes a linear system, and is held over a step of MuJoCo.
+    """
+
+    def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
+        """Puts the robot into state x, with a ball that rolls without slipping, unless memory says otherwise."""
+        super().reset(x, memory)
+        if not memory:
+            self._positions[5], self._velocities[5], self._velocities[8] = x[8:]
+        self._brake()
+
+    def step(self, u: tuple[float, ...]) -> State:
+        """Takes MuJoCo's steps one by one, as without wheels."""
+        data = self._data
+        data.ctrl[:3] = u
+        torque = self._twisted[_BALL, 3:].copy()
+        missing = self._rotor_torque() - torque
+        slopes = np.empty((3, 3))
+        for axis, unit in enumerate(np.eye(3)):
+            self._twist(torque + unit)
+            slopes[:, axis] = self._rotor_torque() - (torque + unit) - missing
+        correction, before = np.linalg.inv(slopes), None
+        for _ in range(self._substeps):
+            self._twist(torque)
+            torque = torque - correction @ (self._rotor_torque() - torque)
+            self._twist(torque if before is None else torque + (torque - before) / 2)  # about that of the step's middle
+            before = torque
+            self._soften()
+            self._mj_step(self._model, data)
+            self._brake()
+        x, y, _, gamma, theta, psi, *_ = self._positions.tolist()
+        vx, vy, _, dgamma, dtheta, dpsi, *_ = self._velocities.tolist()
+        return x, y, gamma, theta, vx, vy, dgamma, dtheta, psi, dpsi, self._brake()
+
+    def _brake(self) -> float:
+        """Sets the floor's torque against the ball's spin about the vertical, and returns that spin, rad/s."""
+        turn, wheels = np.empty(9), self._params.wheels
+        assert wheels is not None
+        self._mujoco.mju_quat2Mat(turn, self._positions[6:])
+        spin = float(turn[6:] @ self._velocities[6:])
+        self._model.actuator_biasprm[3, 2] = omni.floor_torque(wheels, spin) / spin if spin else 0.0
+        return spin
+
+    def _twist(self, torque: np.ndarray) -> None:
+        """Applies a torque (3,), N·m, on the ball, and the opposite one on the body."""
+        self._twisted[_BALL, 3:], self._twisted[_BODY, 3:] = torque, -torque
+
+    def _rotor_torque(self) -> np.ndarray:
+        """(3,) N·m, of the rotors on the ball, by the acceleration under all torques that are applied now."""
+        mujoco, model, data, wheels = self._mujoco, self._model, self._data, self._params.wheels
+        assert wheels is not None
+        mujoco.mj_forward(model, data)
+        mujoco.mj_rnePostConstraint(model, data)
+        spins, accelerations = data.cvel[:, :3], data.cacc[:, :3]
+        # of the ball relative to the body, as seen from the body
+        (a, b, c), (p, q, r) = spins[_BODY].tolist(), spins[_BALL].tolist()
+        relative = accelerations[_BALL] - accelerations[_BODY] - (b * r - c * q, c * p - a * r, a * q - b * p)
+        axis = data.xmat[_BODY].reshape(3, 3)[:, 2]
+        felt = omni.ACROSS * relative + (omni.ALONG - omni.ACROSS) * (axis @ relative) * axis
+        return -wheels.mass * self._params.ball_radius**2 * felt
+
+    def _describe(self, spec: Any) -> None:
+        super()._describe(spec)
+        mujoco, robot, wheels = self._mujoco, self._params, self._params.wheels
+        assert wheels is not None
+        body, ball = spec.body("body"), spec.body("ball")
+        body.add_joint(name="psi", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1))
+        for name, place in (("body", body), ("ball", ball), ("floor", spec.worldbody)):
+            place.add_site(name=f"on_{name}")
+        drag = wheels.drag(robot.force_limit)
+        units = [omni.torque(robot.ball_radius, tuple(unit)) for unit in np.eye(3).tolist()]
+        for turning, damping, other in (*((unit, drag, "body") for unit in units), ((0, 0, 1), 0, "floor")):
+            spec.add_actuator(
+                target="on_ball",
+                refsite=f"on_{other}",
+                trntype=mujoco.mjtTrn.mjTRN_SITE,
+                gear=(0, 0, 0, *turning),
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=(0, 0, -damping, *[0] * 7),
+                gainprm=(1, *[0] * 9),
+            )
 
 
 def has_mujoco() -> bool:

@@ -7,7 +7,7 @@ from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams
 
 State = tuple[float, ...]
-"""(8,) state as a tuple of floats; order and units in `dynamics.STATE`."""
+"""(8,) state as a tuple of floats, or (11,) with wheels; order and units in `dynamics.STATE` and `OMNI_STATE`."""
 
 MOST_FRICTION = 1e3
 """What engines of contact take for unlimited friction."""
@@ -21,9 +21,9 @@ class Simulator(Protocol):
         """Puts the robot into state x, and whatever else an engine remembers into what `memory` gave."""
 
     def set_params(self, params: BallbotParams) -> None:
-        """Replaces the robot by one whose ball rolls as well, or as little; call `reset` after it."""
+        """Replaces the robot by one of the same kind; call `reset` after it."""
 
-    def step(self, u: tuple[float, float]) -> State:
+    def step(self, u: tuple[float, ...]) -> State:
         """Holds force u, N, for one control step and returns the state after it."""
         ...
 
@@ -47,10 +47,11 @@ class Simulator(Protocol):
         """Releases what the simulator holds; may be called again."""
 
 
-def check_rolling(params: BallbotParams, rolls: bool) -> None:
-    """Raises a ValueError if a robot is of another kind than that of a simulator."""
-    if params.rolls != rolls:
-        raise ValueError(f"this simulator is of a ball with rolls={rolls}; make another with make_simulator()")
+def check_kind(params: BallbotParams, own: BallbotParams) -> None:
+    """Raises a ValueError if a robot is of another kind than a simulator's own."""
+    if (params.rolls, params.wheels is None) != (own.rolls, own.wheels is None):
+        kind = f"rolls={own.rolls}" + (" and wheels" if own.wheels else "")
+        raise ValueError(f"this simulator is of a ball with {kind}; make another with make_simulator()")
 
 
 def whole_substeps(control_dt: float, physics_dt: float) -> int:

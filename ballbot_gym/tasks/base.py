@@ -40,7 +40,8 @@ class Task(ABC):
     arriving. For every episode, however it ends, return + cost = `survival_pay`. So the greatest return is the least cost,
     whatever survival_reward is.
 
-    x is a state (..., 8), u a force (..., 2) in N, c the episode's constants (..., nc). Cost, margins, goal and observation
+    x is a state (..., 8), u a force (..., 2) in N, c the episode's constants (..., nc). With wheels x is (..., 11) and u is
+    (..., 3); a task reads the first eight components, `ops.components(x)[:8]`. Cost, margins, goal and observation
     are written with `ops`, so that NumPy, CasADi and torch evaluate the same lines; they are smooth in x and u.
 
     Where `clock` is True, cost, goal, margins, arena and observation also depend on the episode's time: they find it, s, as
@@ -147,10 +148,15 @@ class Task(ABC):
     def draw_state(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
         """The initial state (8) that `state_draws` uniform numbers z stand for, in an episode with constants c."""
 
+    def start(self, z: tuple[Any, ...], c: tuple[Any, ...], params: BallbotParams) -> tuple[Any, ...]:
+        """As `draw_state`, with all components that the robot has: with wheels it neither turns nor spins at the start."""
+        x = self.draw_state(z, c, params)
+        return (*x, *(0.0 * x[0],) * (params.state_size - len(x)))
+
     def sample(self, rng: np.random.Generator, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
         """Draws an episode: initial state (8,) and constants (nc,)."""
         c = self.draw_constants(tuple(rng.random(self.constant_draws).tolist()), params)
-        x = self.draw_state(tuple(rng.random(self.state_draws).tolist()), c, params)
+        x = self.start(tuple(rng.random(self.state_draws).tolist()), c, params)
         return np.array(x, np.float64), np.array(c, np.float64)
 
     def goal_distance(self, x: Vector, c: Vector) -> Any:
@@ -213,6 +219,19 @@ class Task(ABC):
     def observe(self, x: Vector, c: Vector) -> Vector:
         """Observation (..., no), each quantity divided by its `observation_scale`; no running statistics."""
 
+    def seen(self, x: Vector, c: Vector) -> Vector:
+        """`observe`, and of a robot with wheels also cos ψ, sin ψ, ψ̇ and ω_z, these two divided by 5 rad/s."""
+        observed = self.observe(x, c)
+        more = ops.components(x)[8:]
+        if not more:
+            return observed
+        psi, psi_dot, spin = more
+        return ops.stack((*ops.components(observed), ops.cos(psi), ops.sin(psi), psi_dot / 5.0, spin / 5.0), like=x)
+
+    def observation_size(self, params: BallbotParams) -> int:
+        """Numbers that a robot observes."""
+        return len(self.observation_scale) + (0 if params.wheels is None else 4)
+
     def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         """What optimizers keep ≥ 0. Every task has the tilt limit; obstacles add theirs."""
         return (dynamics.cos_tilt(x) - math.cos(self.max_tilt),)
@@ -256,12 +275,15 @@ class Task(ABC):
         most, so √(2T/µ) grows by F/µ per second at most. It is also at least ½κ(γ̇² + θ̇²) with κ = min(J − h²/m_total,
         axial inertia). The start may bring 100 m/s. The step that leaves the arena or the tilt limit goes on for one
         control step. Everything is doubled, for randomized robots, for sensor noise and for the integrator's error. The
-        torque that drives a rolling ball adds F r |ω| to the power, and |ω| is at most √(µ/κ) times √(2T/µ).
+        torque that drives a rolling ball adds F r |ω| to the power, and |ω| is at most √(µ/κ) times √(2T/µ). Wheels pull
+        with three forces, and turn the ball too.
         """
         h, inertia = params.first_moment, params.pivot_inertia
         felt = params.moving_mass - h * h / inertia
         least_inertia = min(inertia - h * h / params.moving_mass, params.axial_inertia)
-        force = math.sqrt(2) * params.force_limit
+        force = (math.sqrt(2) if params.wheels is None else 3) * params.force_limit
+        if params.wheels is not None:
+            least_inertia = min(least_inertia, params.ball_inertia)
         if params.rolls:
             force *= 1 + params.ball_radius * math.sqrt(felt / least_inertia)
         speed = 2 * (100.0 + force * self.duration / felt)

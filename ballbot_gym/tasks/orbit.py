@@ -143,7 +143,7 @@ class Orbit(Task):
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
         radius_error, vx_error, vy_error = self._errors(x, c)
-        *_, gamma_dot, theta_dot = ops.components(x)
+        *_, gamma_dot, theta_dot = ops.components(x)[:8]
         return (
             self.radius_weight * squared(radius_error)
             + self.velocity_weight * squared(vx_error, vy_error)
@@ -204,7 +204,7 @@ class Orbit(Task):
         return [c[0] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)]
 
     def observe(self, x: Vector, c: Vector) -> Vector:
-        parts = (*ops.components(x), *self._errors(x, c), *ops.components(c))
+        parts = (*ops.components(x)[:8], *self._errors(x, c), *ops.components(c))
         return scaled(parts, self.observation_scale, like=x)
 
     def markers(self, c: np.ndarray) -> list[Marker]:
@@ -212,7 +212,7 @@ class Orbit(Task):
 
     def _errors(self, x: Vector, c: Vector) -> tuple[Any, Any, Any]:
         """Radius error, m, and velocity error, m/s: polynomials, so smooth at the origin too."""
-        px, py, _, _, vx, vy, _, _ = ops.components(x)
+        px, py, _, _, vx, vy, *_ = ops.components(x)
         radius, speed = ops.components(c)
         rate = speed / radius
         return (squared(px, py) - radius * radius) / (2 * radius), vx + rate * py, vy - rate * px

@@ -89,7 +89,7 @@ class Stabilize(Task):
 
     def measures(self, x: np.ndarray, c: np.ndarray, params: BallbotParams) -> dict[str, float]:
         """Distance, speeds and leans of the start."""
-        px, py, gamma, theta, vx, vy, gamma_dot, theta_dot = map(float, x)
+        px, py, gamma, theta, vx, vy, gamma_dot, theta_dot = map(float, x[:8])
         # across the ground, of the length sin(tilt): the direction in which the body leans
         lean_x, lean_y = math.sin(gamma) * math.cos(theta), math.sin(theta)
         length = math.hypot(lean_x, lean_y)
@@ -102,7 +102,7 @@ class Stabilize(Task):
         }
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
-        px, py, *rest = ops.components(x)
+        px, py, *rest = ops.components(x)[:8]
         return (
             self.position_weight * squared(px, py)
             + self.rest_weight * squared(*rest)
@@ -128,7 +128,7 @@ class Stabilize(Task):
         return [then_stay(path, self.steps)]
 
     def observe(self, x: Vector, c: Vector) -> Vector:
-        return scaled(ops.components(x), self.observation_scale, like=x)
+        return scaled(ops.components(x)[:8], self.observation_scale, like=x)
 
     def markers(self, c: np.ndarray) -> list[Marker]:
         return [Marker((0.0, 0.0), 0.3, 0.01, (0.1, 0.6, 0.3, 1.0))]
@@ -136,7 +136,7 @@ class Stabilize(Task):
 
 def at_rest(x: Vector, x_goal: Any = 0.0, y_goal: Any = 0.0) -> tuple[Any, ...]:
     """≤ 0 iff within 0.1 m of a point, slower than 0.1 m/s, tilted < 2° and turning slower than 0.1 rad/s."""
-    px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)
+    px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
     return (
         squared(px - x_goal, py - y_goal) / 0.1**2 - 1,
         squared(vx, vy) / 0.1**2 - 1,

@@ -119,7 +119,7 @@ class Turn(Task):
         return (zero + _START[0], zero + _START[1], zero, zero, zero, speed, zero, zero)
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
-        _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)
+        _, _, gamma, theta, _, _, gamma_dot, theta_dot = ops.components(x)[:8]
         return (
             self.time_weight
             + self.lean_weight * squared(gamma, theta, gamma_dot, theta_dot)
@@ -136,7 +136,7 @@ class Turn(Task):
         return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
 
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
-        px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)
+        px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
         (speed,) = ops.components(c)
         return (
             squared(px - _GATE[0], py - _GATE[1]) / 0.2**2 - 1,
@@ -179,7 +179,7 @@ class Turn(Task):
         return paths
 
     def observe(self, x: Vector, c: Vector) -> Vector:
-        px, py, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)
+        px, py, gamma, theta, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
         (speed,) = ops.components(c)
         parts = (px - _GATE[0], py - _GATE[1], gamma, theta, vx - speed, vy, gamma_dot, theta_dot, speed)
         return scaled(parts, self.observation_scale, like=x)

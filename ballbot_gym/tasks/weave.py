@@ -144,7 +144,7 @@ class Weave(Task):
         return (zero, between(z[0], -0.3, 0.3), zero, zero, zero, zero, zero, zero)
 
     def cost(self, x: Vector, u: Vector, c: Vector) -> Any:
-        px, py, *rest = ops.components(x)
+        px, py, *rest = ops.components(x)[:8]
         x_goal, y_goal, *_ = ops.components(c)
         return (
             self.position_weight * squared(px - x_goal, py - y_goal)
@@ -244,7 +244,7 @@ class Weave(Task):
         return then_stay(np.column_stack([along, catmull_rom(knots_x, knots_y, along)]), self.steps)
 
     def observe(self, x: Vector, c: Vector) -> Vector:
-        px, py, *rest = ops.components(x)
+        px, py, *rest = ops.components(x)[:8]
         x_goal, y_goal, *obstacles = ops.components(c)
         parts = [px - x_goal, py - y_goal, *rest]
         for i in range(MAX_OBSTACLES):

@@ -1,0 +1,245 @@
+"""A robot that three omni-wheels drive: its body yaws, its ball spins, and its motors weaken with speed.
+
+The wheels touch the ball at 45° of zenith angle and at azimuths α of 0, 120 and 240° about the body's axis. In the body's
+frame wheel i has the contact normal n_i = (s cos α, s sin α, c) and drives the ball along t_i = (−sin α, cos α, 0), with
+s = sin 45° and c = cos 45°; its rollers let the ball pass across. The state has three components more than that
+of `dynamics`: ψ, by which the body is turned about its own axis after γ and θ, ψ̇, and ω_z, the ball's spin about the vertical.
+
+The ball turns at ω = (−ẏ/r, ẋ/r, ω_z). Seen from the frame B of the leans, in which the body turns by ψ alone, it turns
+relative to the body at
+
+    w₁ = −cos γ ẏ/r − sin γ ω_z + θ̇
+    w₂ = sin γ sin θ ẏ/r + cos θ ẋ/r − cos γ sin θ ω_z − cos θ γ̇
+    w₃ = −sin γ cos θ ẏ/r + sin θ ẋ/r + cos γ cos θ ω_z − sin θ γ̇ − ψ̇,
+
+which is w = J v for the speeds v = (ẋ, ẏ, γ̇, θ̇, ψ̇, ω_z). With a_i = r (n_i × t_i) and w in the body's own frame, the
+surface of wheel i moves at s_i = a_i · w, and pulls the ball with the force
+
+    f_i = u_i − d s_i − m ṡ_i,    d = (τ/ω₀ + b)/R²,    m = I/R².
+
+u_i is the motor's pull at standstill, N, in proportion to the voltage that is applied. R is the wheel's radius, τ = R max u_i
+the stall torque, ω₀ the no-load speed, b viscous friction, and I the inertia of rotor, gear and wheel, all at the wheel's
+axis. So the torque falls linearly with speed, from the stall torque to 0 at the no-load speed. The ball feels the torque
+Σ a_i f_i, and the body the opposite one. Their power is that torque times w, so the generalized forces are Jᵀ Σ a_i f_i. In
+every frame that turns about the body's axis Σ a_i a_iᵀ = r² D with D = 3/2 diag(c², c², 2 s²). So with ẇ, as an observer on
+the body sees it,
+
+    Σ a_i f_i = Σ a_i u_i − d r² D w − m r² D ẇ,    ẇ = J v̇ + (J̇ v − ψ̇ e₃ × w).
+
+The other terms are those of `dynamics`, with the body's spin γ̇ sin θ + ψ̇ about its axis in place of γ̇ sin θ, the ball's energy
+½ I_b ω_z², and a torque of the floor against the ball's spin, which is smooth where dry friction jumps. All that makes six
+linear equations M v̇ = q. The body and D are the same about all axes across the body's, so that ψ matters to u alone.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from ballbot_gym import ops
+from ballbot_gym.ops import Vector, is_number
+
+_SIN = _COS = math.sqrt(0.5)  # of the zenith angle of the wheels' contacts
+_AZIMUTHS = tuple(math.radians(degrees) for degrees in (0, 120, 240))
+ACROSS, ALONG = 1.5 * _COS**2, 3 * _SIN**2
+"""D, across and along the body's axis."""
+LEAST_FORCE = math.sqrt(3) * _COS
+"""What the wheels together give at standstill in any direction, as a share of the pull of one."""
+_SPIN_SPEED = 1.0  # rad/s: a slower spin meets friction in proportion to it
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """Three omni-wheels and their motors. `BallbotParams.force_limit` is a motor's pull at standstill on the ball, N.
+
+    | field | meaning | unit |
+    |---|---|---|
+    | radius | of a wheel | m |
+    | no_load_speed | of a wheel, at which its motor has no torque left | rad/s |
+    | inertia | of rotor, gear and wheel, at the wheel's axis | kg·m² |
+    | damping | viscous friction of motor, gear and wheel, at the wheel's axis | N·m·s |
+    | spin_friction | torque of the floor on a ball that spins about the vertical | N·m |
+
+    Raises:
+        ValueError: a field is no number or out of its range; the message names it.
+    """
+
+    radius: float
+    no_load_speed: float
+    inertia: float
+    damping: float
+    spin_friction: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not is_number(value):
+                raise ValueError(f"Wheels: {field.name} must be a number, not {value!r}")
+            positive = field.name in ("radius", "no_load_speed")
+            if not (0 < value < math.inf if positive else 0 <= value < math.inf):
+                raise ValueError(
+                    f"Wheels: {field.name} must be {'positive' if positive else 'at least 0'} and finite, not {value}"
+                )
+
+    def drag(self, force_limit: Any) -> Any:
+        """d, N·s/m: by how much a wheel's pull falls per speed of its surface, of a motor with this pull at standstill, N."""
+        return force_limit / (self.radius * self.no_load_speed) + self.damping / self.radius**2
+
+    @property
+    def mass(self) -> float:
+        """m, kg: the inertia as felt at the wheel's surface."""
+        return self.inertia / self.radius**2
+
+
+def torque(radius: float, u: Vector, psi: Any = None) -> tuple[Any, Any, Any]:
+    """Σ a_i u_i, N·m, of a ball's radius, m, and the wheels' forces u (..., 3), N, in the body's frame.
+
+    With psi, rad, in frame B, in which the body turns.
+    """
+    a, b, c = ops.components(u)
+    across = -_COS * radius
+    t1, t2, t3 = across * (a - 0.5 * (b + c)), across * math.sqrt(0.75) * (b - c), _SIN * radius * (a + b + c)
+    if psi is None:
+        return t1, t2, t3
+    cos, sin = ops.cos(psi), ops.sin(psi)
+    return cos * t1 - sin * t2, sin * t1 + cos * t2, t3
+
+
+def wheel_forces(params: Any, x: Vector, force: Vector, yaw_torque: Any = 0.0) -> Vector:
+    """u (..., 3), N, that turns the ball as the force (..., 2), N, of a rolling robot without wheels: by r e_z × force.
+
+    It makes up for the motors' loss of torque at the present speeds, and is not clipped.
+
+    Args:
+        params: the robot.
+        x: (..., 11) state.
+        force: (..., 2), N.
+        yaw_torque: N·m, from the ball on the body about its axis, in addition.
+    """
+    _, _, gamma, theta, *_, psi, _, _ = ops.components(x)
+    fx, fy = ops.components(force)
+    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+    # in the frame of the leans, N
+    t1, t2, t3 = -cos_g * fy, sin_g * sin_t * fy + cos_t * fx, -sin_g * cos_t * fy + sin_t * fx
+    (w1, w2, w3), _ = relative_turning(params, x)
+    drag = params.ball_radius * params.wheels.drag(params.force_limit)
+    t1, t2, t3 = t1 + ACROSS * drag * w1, t2 + ACROSS * drag * w2, t3 + ALONG * drag * w3
+    cos, sin = ops.cos(psi), ops.sin(psi)
+    t1, t2, t3 = cos * t1 + sin * t2, cos * t2 - sin * t1, t3 - yaw_torque / params.ball_radius
+    parts = [t3 / (3 * _SIN) - 2 / (3 * _COS) * (math.cos(a) * t1 + math.sin(a) * t2) for a in _AZIMUTHS]
+    return ops.stack(tuple(parts), like=force)
+
+
+def relative_turning(params: Any, x: Vector) -> tuple[tuple[Any, Any, Any], tuple[tuple[Any, ...], ...]]:
+    """w, rad/s, of a state x (..., 11), and J by columns: six of three entries."""
+    _, _, gamma, theta, *_ = parts = ops.components(x)
+    r = params.ball_radius
+    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+    columns = (
+        (0.0, cos_t / r, sin_t / r),
+        (-cos_g / r, sin_g * sin_t / r, -sin_g * cos_t / r),
+        (0.0, -cos_t, -sin_t),
+        (1.0, 0.0, 0.0),
+        (0.0, 0.0, -1.0),
+        (-sin_g, -cos_g * sin_t, cos_g * cos_t),
+    )
+    speeds = (*parts[4:8], *parts[9:])
+    return tuple(_dot(row, speeds) for row in zip(*columns, strict=True)), columns
+
+
+def mass_matrix(params: Any, x: Vector, columns: tuple[tuple[Any, ...], ...]) -> list[list[Any]]:
+    """M (6, 6) at state x (..., 11), with J by columns."""
+    _, _, gamma, theta, *_ = ops.components(x)
+    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+    mass, h, inertia, axial = params.moving_mass, params.first_moment, params.pivot_inertia, params.axial_inertia
+    rotors = params.wheels.mass * params.ball_radius**2
+    weighted = [(ACROSS * rotors * a, ACROSS * rotors * b, ALONG * rotors * c) for a, b, c in columns]
+    m = [[_dot(a, b) if i <= j else 0.0 for j, b in enumerate(columns)] for i, a in enumerate(weighted)]
+    lean_inertia = inertia * cos_t * cos_t + axial * sin_t * sin_t
+    own = {
+        (0, 0): mass, (0, 2): h * cos_g * cos_t, (0, 3): -h * sin_g * sin_t, (1, 1): mass, (1, 3): h * cos_t,
+        (2, 2): lean_inertia, (2, 4): axial * sin_t, (3, 3): inertia, (4, 4): axial, (5, 5): params.ball_inertia,
+    }  # fmt: skip
+    for (i, j), value in own.items():
+        m[i][j] = m[i][j] + value
+    return [[m[min(i, j)][max(i, j)] for j in range(6)] for i in range(6)]
+
+
+def equations(params: Any, x: Vector, u: Vector) -> tuple[list[list[Any]], list[Any]]:
+    """M (6, 6) and q (6) of M v̇ = q for state x (..., 11) and the wheels' forces u (..., 3), N."""
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, spin = ops.components(x)
+    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+    r, wheels = params.ball_radius, params.wheels
+    w, columns = relative_turning(params, x)
+    w1, w2, w3 = w
+    # ẇ without J v̇: the ball's turning, constant in the world, seen from frame B, less that of the body
+    rate2, rate3 = cos_t * gamma_dot, sin_t * gamma_dot  # of frame B, whose rate about its first axis is −θ̇
+    b1, b2, b3 = w1 - theta_dot, w2 + rate2, w3 + rate3 + psi_dot  # the ball's turning
+    bias1 = rate3 * b2 - rate2 * b3 + psi_dot * w2
+    bias2 = -rate3 * b1 - theta_dot * b3 + gamma_dot * sin_t * theta_dot - psi_dot * w1
+    bias3 = rate2 * b1 + theta_dot * b2 - gamma_dot * cos_t * theta_dot
+    t1, t2, t3 = torque(r, u, psi)
+    drag, rotors = r * r * wheels.drag(params.force_limit), r * r * wheels.mass
+    pulls = (
+        t1 - ACROSS * (drag * w1 + rotors * bias1),
+        t2 - ACROSS * (drag * w2 + rotors * bias2),
+        t3 - ALONG * (drag * w3 + rotors * bias3),
+    )
+    h, axial = params.first_moment, params.axial_inertia
+    half_slope = (axial - params.pivot_inertia) * sin_t * cos_t
+    rates2, product = gamma_dot * gamma_dot + theta_dot * theta_dot, gamma_dot * theta_dot
+    q = (
+        h * (sin_g * cos_t * rates2 + 2 * cos_g * sin_t * product),
+        h * sin_t * theta_dot * theta_dot,
+        h * params.gravity * sin_g * cos_t - 2 * half_slope * product - axial * cos_t * theta_dot * psi_dot,
+        h * params.gravity * cos_g * sin_t + gamma_dot * (half_slope * gamma_dot + axial * cos_t * psi_dot),
+        -axial * cos_t * product,
+        floor_torque(wheels, spin),
+    )
+    q = [own + _dot(column, pulls) for own, column in zip(q, columns, strict=True)]
+    return mass_matrix(params, x, columns), q
+
+
+def floor_torque(wheels: Wheels, spin: Any) -> Any:
+    """Of the floor on a ball that spins about the vertical, rad/s: N·m."""
+    return -wheels.spin_friction * spin / ops.sqrt(spin * spin + _SPIN_SPEED**2)
+
+
+def solved(m: list[list[Any]], q: list[Any]) -> tuple[Any, ...]:
+    """v with M v = q, for a symmetric and positive definite M; both are overwritten."""
+    n = len(q)
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = m[k][i] / m[k][k]
+            for j in range(i, n):
+                m[i][j] = m[i][j] - factor * m[k][j]
+            q[i] = q[i] - factor * q[k]
+    for i in reversed(range(n)):
+        q[i] = (q[i] - _dot(m[i][i + 1 :], q[i + 1 :])) / m[i][i]
+    return tuple(q)
+
+
+def accelerations(params: Any, x: Vector, u: Vector) -> tuple[Any, ...]:
+    """(ẍ, ÿ, γ̈, θ̈, ψ̈, ω̇_z) in m/s² and rad/s² for state x (..., 11) and the wheels' forces u (..., 3), N."""
+    return solved(*equations(params, x, u))
+
+
+def kinetic_energy(params: Any, x: Vector) -> Any:
+    """J, of state x (..., 11): of ball, body, rotors and wheels."""
+    parts = ops.components(x)
+    speeds = (*parts[4:8], *parts[9:])
+    m = mass_matrix(params, x, relative_turning(params, x)[1])
+    return 0.5 * _dot([_dot(row, speeds) for row in m], speeds)
+
+
+def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    """The sum of products, from left to right, without those with a factor that is always 0."""
+    total: Any = 0.0
+    for p, q in zip(a, b, strict=True):
+        if not _is_zero(p) and not _is_zero(q):
+            total = p * q if _is_zero(total) else total + p * q
+    return total
+
+
+def _is_zero(value: Any) -> bool:
+    return isinstance(value, float) and value == 0

@@ -1,0 +1,244 @@
+"""A robot with three omni-wheels: its equations, its contact, and its engines."""
+
+import dataclasses
+import math
+
+import casadi
+import numpy as np
+import pytest
+
+from ballbot_baselines.lqr import discrete_lqr
+from ballbot_gym import dynamics, omni
+from ballbot_gym.engines import make_simulator
+from ballbot_gym.env import BallbotEnv, TwoForces
+from ballbot_gym.omni import Wheels
+from ballbot_gym.robots import named_robot
+from ballbot_gym.tasks import Stabilize
+
+SPREAD = np.array([1, 1, 0.8, 0.8, 2, 2, 2, 2, 3, 3, 5.0])
+
+
+@pytest.fixture
+def robot():
+    return named_robot("omni")
+
+
+def random_states(rng, n=5):
+    return zip(rng.uniform(-1, 1, (n, 11)) * SPREAD, rng.uniform(-40, 40, (n, 3)), strict=True)
+
+
+def lagrange(p):
+    """Lagrange's equations with a multiplier for every constraint, by differentiation.
+
+    Coordinates are x, y, γ, θ, ψ, three Euler angles of the ball, and the angles of the wheels relative to the body. The ball
+    rolls, and no wheel slips in its driving direction.
+    """
+    q, v, u = casadi.SX.sym("q", 11), casadi.SX.sym("v", 11), casadi.SX.sym("u", 3)
+    x, y, gamma, theta, psi, *ball, _, _, _ = casadi.vertsplit(q)
+
+    def turn(axis, angle):
+        kernel = casadi.skew(casadi.DM(axis))
+        return casadi.SX.eye(3) + casadi.sin(angle) * kernel + (1 - casadi.cos(angle)) * kernel @ kernel
+
+    def turning(matrix):
+        """Angular velocity in the world's frame."""
+        return casadi.inv_skew(casadi.reshape(casadi.jtimes(casadi.vec(matrix), q, v), 3, 3) @ matrix.T)
+
+    body = turn((0, 1, 0), gamma) @ turn((-1, 0, 0), theta) @ turn((0, 0, 1), psi)
+    of_ball = turning(turn((0, 0, 1), ball[0]) @ turn((0, 1, 0), ball[1]) @ turn((1, 0, 0), ball[2]))
+    of_body = turning(body)
+    centre = casadi.vertcat(x, y, 0) + p.com_height * body[:, 2]
+    speed, own = casadi.jtimes(centre, q, v), body.T @ of_body
+    inertia = casadi.DM([p.inertia, p.inertia, p.axial_inertia])
+    kinetic = p.ball_mass * casadi.sumsqr(v[:2]) + p.body_mass * casadi.sumsqr(speed) + casadi.dot(inertia, own**2)
+    kinetic = (kinetic + p.ball_inertia * casadi.sumsqr(of_ball) + p.wheels.inertia * casadi.sumsqr(v[8:])) / 2
+    lagrangian = kinetic - p.body_mass * p.gravity * centre[2]
+
+    surfaces = []
+    for azimuth in np.radians((0, 120, 240)):
+        drive = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+        normal = np.array([np.cos(azimuth), np.sin(azimuth), 1]) / np.sqrt(2)
+        surfaces.append(p.ball_radius * np.cross(normal, drive))
+    relative = casadi.DM(np.array(surfaces)) @ (body.T @ (of_ball - of_body))
+    r = p.ball_radius
+    kept = casadi.vertcat(v[0] - r * of_ball[1], v[1] + r * of_ball[0], p.wheels.radius * v[8:] - relative)
+    stall = p.force_limit * p.wheels.radius
+    motors = p.wheels.radius * u - (stall / p.wheels.no_load_speed + p.wheels.damping) * v[8:]
+    spin = of_ball[2]
+    friction = -p.wheels.spin_friction * spin / casadi.sqrt(spin**2 + 1)
+    forces = casadi.vertcat(casadi.SX(8, 1), motors) + casadi.jacobian(spin, v).T * friction
+
+    momentum, a = casadi.gradient(lagrangian, v), casadi.jacobian(kept, v)
+    right = forces + casadi.gradient(lagrangian, q) - casadi.jtimes(momentum, q, v)
+    matrix = casadi.blockcat(casadi.jacobian(momentum, v), a.T, a, casadi.SX(5, 5))
+    found = casadi.solve(matrix, casadi.vertcat(right, -casadi.jtimes(kept, q, v)))[:11]
+    spin_rate = casadi.jtimes(spin, q, v) + casadi.jtimes(spin, v, found)
+    outputs = [casadi.vertcat(found[:5], spin_rate), casadi.jacobian(of_ball, v[5:8]), relative / p.wheels.radius]
+    return casadi.Function("lagrange", [q, v, u], outputs)
+
+
+def test_the_equations_are_lagranges_with_a_multiplier_for_every_constraint(robot, rng):
+    exact = lagrange(robot)
+    for x, u in random_states(rng):
+        q = np.concatenate([x[[0, 1, 2, 3, 8]], rng.uniform(-1, 1, 6)])
+        turning = np.array([-x[5] / robot.ball_radius, x[4] / robot.ball_radius, x[10]])
+        v = np.concatenate([x[[4, 5, 6, 7, 9]], np.zeros(6)])
+        v[5:8] = np.linalg.solve(np.array(exact(q, v, u)[1]), turning)
+        v[8:] = np.array(exact(q, v, u)[2]).ravel()
+        expected = np.array(exact(q, v, u)[0]).ravel()
+        scale = 1 + np.abs(expected).max()
+        np.testing.assert_allclose(dynamics.accelerations(robot, x, u), expected, rtol=0, atol=1e-9 * scale)
+
+
+def test_with_ideal_motors_and_yaw_held_it_is_the_robot_without_wheels(robot, rng):
+    ideal = dataclasses.replace(robot, wheels=Wheels(0.05, 1e15, 0.0, 0.0, 0.0))
+    rolling = dataclasses.replace(robot, wheels=None)
+    for x, force in random_states(rng):
+        x = np.concatenate([x[:9], np.zeros(2)])
+        u = omni.wheel_forces(ideal, x, force[:2])
+        # without the last two equations, because something else holds the body's yaw and the ball's spin
+        matrix, right = (np.array(part, float) for part in omni.equations(ideal, x, u))
+        expected = dynamics.accelerations(rolling, x[:8], force[:2])
+        np.testing.assert_allclose(np.linalg.solve(matrix[:4, :4], right[:4]), expected, rtol=0, atol=1e-9)
+
+
+def test_energy_changes_by_the_power_of_motors_and_friction(robot, rng):
+    x, u = casadi.SX.sym("x", 11), casadi.SX.sym("u", 3)
+    rate = casadi.jtimes(dynamics.energy(robot, x), x, dynamics.derivative(robot, x, u))
+    w, _ = omni.relative_turning(robot, x)
+    pull, drag = omni.torque(robot.ball_radius, u, x[8]), robot.wheels.drag(robot.force_limit) * robot.ball_radius**2
+    lost = drag * (omni.ACROSS * (w[0] ** 2 + w[1] ** 2) + omni.ALONG * w[2] ** 2)
+    power = sum(a * b for a, b in zip(pull, w, strict=True)) - lost + omni.floor_torque(robot.wheels, x[10]) * x[10]
+    function = casadi.Function("powers", [x, u], [rate, power])
+    for state, force in random_states(rng):
+        found, expected = map(float, function(state, force))
+        assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_wheel_at_its_no_load_speed_has_no_torque_left(robot):
+    """A body held still over a ball that spins about the vertical, without friction."""
+    free = dataclasses.replace(robot, wheels=dataclasses.replace(robot.wheels, damping=0.0, spin_friction=0.0))
+    x = np.zeros(11)
+    x[10] = free.wheels.no_load_speed * free.wheels.radius / (free.ball_radius * math.sqrt(0.5))
+    assert np.abs(omni.accelerations(free, x, np.full(3, free.force_limit))).max() < 1e-9
+
+
+def test_the_floor_gives_what_moves_the_whole_robot(robot, rng):
+    """Without wheels the closed form finds the same force from the ball's rolling."""
+    rolling = dataclasses.replace(robot, wheels=None)
+    ideal = dataclasses.replace(robot, wheels=Wheels(0.05, 1e15, 0.0, 0.0, 0.0))
+    for x, force in random_states(rng):
+        x = np.concatenate([x[:2], [x[2], 0.0, x[4], 0.0, x[6], 0.0], np.zeros(3)])  # in a plane it does not yaw
+        u = omni.wheel_forces(ideal, x, (force[0], 0.0))
+        expected = dynamics.contact(rolling, x[:8], (force[0], 0.0))
+        np.testing.assert_allclose(dynamics.contact(ideal, x, u), expected, atol=1e-9)
+
+
+def test_a_push_gives_its_momentum(robot, rng):
+    x, _ = next(random_states(rng))
+    impulse = np.array([2.0, -3.0])
+    after = dynamics.pushed(robot, x, impulse)
+    np.testing.assert_array_equal(after[[0, 1, 2, 3, 8]], x[[0, 1, 2, 3, 8]])
+
+    # the work of a short force: half the sum of the speeds of the centre of mass before and after
+    def speed(x):
+        sin_g, cos_g, sin_t, cos_t = np.sin(x[2]), np.cos(x[2]), np.sin(x[3]), np.cos(x[3])
+        along = np.array([cos_g * cos_t * x[6] - sin_g * sin_t * x[7], cos_t * x[7]])
+        return x[4:6] + robot.com_height * along
+
+    work = impulse @ (speed(x) + speed(after)) / 2
+    assert dynamics.energy(robot, after) - dynamics.energy(robot, x) == pytest.approx(work, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [("radius", 0.0, "radius must be positive"), ("inertia", -1.0, "at least 0"), ("damping", "1", "must be a number")],
+)
+def test_wheels_that_none_can_be_are_refused(robot, name, value, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(robot.wheels, **{name: value})
+
+
+def test_wheels_need_a_ball_that_rolls(robot):
+    with pytest.raises(ValueError, match="wheels must be Wheels"):
+        dataclasses.replace(named_robot("paper"), wheels=robot.wheels)
+
+
+def two_force_gain(robot):
+    """LQR of the robot without its wheels."""
+    return discrete_lqr(Stabilize(), dataclasses.replace(robot, wheels=None), np.zeros(8), np.zeros(2), np.zeros(0))[0]
+
+
+@pytest.mark.parametrize("name", ["omni", "omni_strong"])
+def test_in_grip_mujoco_follows_the_closed_form(name, rng):
+    pytest.importorskip("mujoco")
+    robot = named_robot(name)
+    gain, errors = two_force_gain(robot), []
+    for _ in range(6):
+        x = np.array([0.5, 0.5, 0.1, 0.1, 0.5, 0.5, 0.3, 0.3, 3, 1, 1]) * rng.uniform(-1, 1, 11)
+        exact, simulator = make_simulator("rk4", robot, 0.02, 0.001), make_simulator("mujoco", robot, 0.02)
+        exact.reset(tuple(x))
+        simulator.reset(tuple(x))
+        for _ in range(25):
+            u = omni.wheel_forces(robot, x, -gain @ x[:8]) + rng.normal(0, 3, 3)
+            u = tuple(u.clip(-robot.force_limit, robot.force_limit).tolist())
+            assert dynamics.keeps_grip(robot, dynamics.held_contact(robot, tuple(x), u, 0.02))
+            x, found = np.array(exact.step(u)), np.array(simulator.step(u))
+        errors.append(np.hypot(*(found - x)[:2]))
+        np.testing.assert_allclose(found[[2, 3, 8, 9, 10]], x[[2, 3, 8, 9, 10]], atol=5e-3)
+        np.testing.assert_allclose(simulator.floor_force(), dynamics.contact(robot, x, u), atol=1e-3 * robot.weight)
+    assert max(errors) < 5e-4  # m; measured in 20: 3e-5 in the median, 2e-4 at most
+
+
+def test_mujoco_goes_on_from_what_it_remembers():
+    pytest.importorskip("mujoco")
+    simulator = make_simulator("mujoco", named_robot("omni"), 0.02)
+    simulator.reset((0.0, 0.0, 0.05, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0, 0.5, 0.2))
+    x, memory = simulator.step((5.0, -3.0, 1.0)), simulator.memory()
+    after = simulator.step((1.0, 2.0, 3.0))
+    simulator.reset(x, memory)
+    assert simulator.step((1.0, 2.0, 3.0)) == after
+
+
+def test_bullet_has_no_wheels():
+    pytest.importorskip("pybullet")
+    with pytest.raises(ValueError, match='no robot with wheels; give physics="mujoco" or "rk4"'):
+        BallbotEnv(robot="omni", physics="bullet")
+
+
+@pytest.mark.parametrize("engine", ["torch", "native"])
+def test_batches_move_as_single_envs_do(engine, rng):
+    torch = pytest.importorskip("torch")
+    from ballbot_gym.vector import BallbotVectorEnv
+
+    vector = BallbotVectorEnv(
+        3, robot="omni", engine=engine, dtype=torch.float64, compile=False if engine == "torch" else "auto"
+    )
+    env = BallbotEnv(robot="omni", physics="rk4")
+    _, infos = vector.reset(seed=0)
+    env.reset(options={"state": infos["state"][0]})
+    for actions in rng.uniform(-0.2, 0.2, (5, 3, 3)):
+        seen, reward, _, _, infos = vector.step(actions)
+        alone, own_reward, _, _, info = env.step(actions[0])
+        assert env.observation_space.contains(alone)
+        np.testing.assert_allclose(seen[0], alone, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(infos["state"][0], info["state"], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(infos["force"][0], info["force"], rtol=1e-9)
+        np.testing.assert_allclose(infos["grip"][0], info["grip"], rtol=1e-9)
+        assert reward[0] == pytest.approx(own_reward)
+    np.testing.assert_allclose(
+        alone[8:], [*np.cos(info["state"][8:9]), *np.sin(info["state"][8:9]), *info["state"][9:] / 5], rtol=1e-6
+    )
+
+
+def test_two_forces_balance_it_and_hold_its_heading():
+    env = TwoForces(BallbotEnv(robot="omni", physics="rk4"))
+    gain = two_force_gain(env.unwrapped.params) / (omni.LEAST_FORCE * env.unwrapped.params.force_limit)
+    _, info = env.reset(options={"state": [0.3, -0.2, 0.05, 0.0, 0.1, 0.2, 0.0, 0.0, 0.8, 0.5, 0.0]})
+    terminated = truncated = False
+    while not (terminated or truncated):
+        _, _, terminated, truncated, info = env.step(-gain @ info["state"][:8])
+    assert info["success"]
+    assert np.abs(info["state"][8:]).max() < 0.01
+    with pytest.raises(ValueError, match="takes a BallbotEnv of a robot with wheels"):
+        TwoForces(BallbotEnv(physics="rk4"))
