@@ -309,7 +309,7 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
     task = make_task("stabilize", "rolling")
     refused = [certification.episode(task, rolling, 1, draw)[0] for draw in (0, 1)]
 
-    def found(task, params, x, c, guesses):
+    def found(task, params, x, c, guesses, twice):
         if any((x == start).all() for start in refused):
             raise PlanError("it cannot but slip")
         t = np.array([0.0, 0.02])
