@@ -60,3 +60,9 @@ class DelayedController:
     def act(self, t, x):
         self._pending.append(self._controller.act(t, x))
         return self._pending.pop(0)
+
+
+def task_and_robot(policy):
+    """The names of both in the name of a shipped policy, as TASK-ROBOT-LEARNER."""
+    task, *others = policy.split("-")
+    return task, "rolling" if "rolling" in others else "paper"

@@ -6,6 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
+from builders import task_and_robot
 
 from ballbot_gym import certified, machine_code
 from ballbot_gym.env import BallbotEnv, make_task
@@ -82,10 +83,8 @@ def test_a_compiled_controller_drives_certified_episodes_to_the_same_ends(task, 
     "name", [pytest.param(name, marks=[] if name == "orbit-shac-late" else pytest.mark.slow) for name in SHIPPED_NAMES]
 )
 def test_every_shipped_policy_passes_the_test_in_its_file(name, tmp_path):
-    task, *others, learner = name.split("-")
-    if learner in ("late", "unknown"):
-        others, learner = [], f"{others[-1]}-{learner}"
-    export(learner, task=task, format="c", out=tmp_path / "policy.c", robot=others[0] if others else "paper")
+    task, robot = task_and_robot(name)
+    export(str(SHIPPED / f"{name}.json"), task=task, format="c", out=tmp_path / "policy.c", robot=robot)
     told = subprocess.run([built(tmp_path / "policy.c", tmp_path / "policy", "-DBALLBOT_TEST")], capture_output=True)
     assert told.returncode == 0
     assert told.stdout.startswith(b"PASS")

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from builders import task_and_robot
 
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import named_robot
@@ -45,8 +46,7 @@ def observations_of_an_episode(env, policy):
     "name", [pytest.param(name, marks=[] if name == "orbit-sac" else pytest.mark.slow) for name in SHIPPED_NAMES]
 )
 def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path):
-    task, *others = name.split("-")
-    robot = "rolling" if "rolling" in others else "paper"
+    task, robot = task_and_robot(name)
     export(str(SHIPPED / f"{name}.json"), task=task, out=tmp_path / "policy.onnx", robot=robot)
     runtime = session(tmp_path / "policy.onnx")
     policy = load_policy(SHIPPED / f"{name}.json")

@@ -19,11 +19,11 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import REACH
+from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.escaping import printable
 from ballbot_train.onnx_export import metadata
 from ballbot_train.policy import PolicyController, PolicyError, PolicyNetwork, PolicySpec, load_network
-from ballbot_train.report.printed import c_function, c_number
+from ballbot_train.report.printed import Functions, c_function, c_number, frame_functions
 from ballbot_train.weights import own_defaults
 
 LQR = "lqr"
@@ -120,25 +120,17 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
 def _functions(network: PolicyNetwork, task: Task, seen: int, inputs: int) -> list[str]:
     """The printed functions that the template calls."""
     split = casadi.vertsplit
-    own = {"o": network.spec.observations}
-    functions: dict[str, tuple[Any, dict[str, int]]] = {
+    functions: Functions = {
         "observed": (
             lambda x, c, t: task.observe(tuple(split(x)), task.at(tuple(split(c)), t)),
             {"x": 8, "c": len(task.constant_names), "t": 1},
         )
     }
     if network.spec.frame is not None:
-        functions["features"] = (lambda o: network.features(tuple(split(o)))[0], {"o": seen})
-        functions["back"] = (lambda o, a: network.features(tuple(split(o)))[1]((a[0], a[1])), {"o": seen, "a": 2})
+        frame = FRAMES[network.spec.frame]
+        functions |= frame_functions(frame, network.features, network.spec.observations, seen)
     if network.spec.centred:
         functions["kept"] = (lambda f: sum(network.kept(tuple(split(f))), ()), {"f": inputs})
-    if network.routes is not None:
-        route = network.routes.route
-        functions["layout"] = (lambda o: route.layout(tuple(split(o))), own)
-        functions["chosen_sides"] = (
-            lambda o, farther: route.sides(tuple(split(o)), tuple(split(farther))),
-            {**own, "farther": route.obstacles},
-        )
     return [c_function(name, *function) for name, function in functions.items()]
 
 

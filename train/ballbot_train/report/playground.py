@@ -28,7 +28,7 @@ from ballbot_train.evaluation.controllers import policy_path, task_name
 from ballbot_train.policy_files import BEST, PolicySpec, paths_of, read_description, shipped_policies
 from ballbot_train.report import labels
 from ballbot_train.report.page import asset, render, scene_data
-from ballbot_train.report.printed import javascript_function
+from ballbot_train.report.printed import Functions, frame_functions, javascript_function
 
 LARGEST = 2_000_000
 """Bytes that the page may have."""
@@ -246,30 +246,18 @@ def _task_script(name: str, task: Task, frame: str | None) -> tuple[str, str]:
     """The source of a task's functions, and its line of `MODELS`."""
     constants = len(task.constant_names)
     of_state = {"x": 8, "c": constants}
-    functions = {
+    functions: Functions = {
         "observe": (task.observe, of_state),
         "cost": (task.cost, {"x": 8, "u": 2, "c": constants}),
         "limits": (task.limits, of_state),
         "goal": (task.goal, of_state),
     }
     if frame is not None:
-        route, steady = FRAMES[frame].route, FRAMES[frame].steady
-        alone = {"o": len(task.observation_scale)}
-        seen = alone if route is None else {"o": alone["o"] + route.obstacles}
-        features = FRAMES[frame].features
-        if route is not None:
-            functions["layout"] = (lambda o: route.layout(tuple(casadi.vertsplit(o))), alone)
-            functions["sides"] = (
-                lambda o, farther: route.sides(tuple(casadi.vertsplit(o)), tuple(casadi.vertsplit(farther))),
-                {**alone, "farther": route.obstacles},
-            )
-        if steady is not None:  # the features of the steady motion, and then the action
-            functions["steady"] = (lambda f: sum(steady(tuple(casadi.vertsplit(f))), ()), {"f": FRAMES[frame].size})
-        functions["features"] = (lambda o: features(tuple(casadi.vertsplit(o)))[0], seen)
-        functions["back"] = (
-            lambda o, a: features(tuple(casadi.vertsplit(o)))[1]((a[0], a[1])),
-            {**seen, "a": 2},
-        )
+        own, observations = FRAMES[frame], len(task.observation_scale)
+        seen = observations + (0 if own.route is None else own.route.obstacles)
+        functions |= frame_functions(own, own.features, observations, seen)
+        if (steady := own.steady) is not None:  # the features of the steady motion, and then the action
+            functions["steady"] = (lambda f: sum(steady(tuple(casadi.vertsplit(f))), ()), {"f": own.size})
     sources = [javascript_function(f"{name}_{key}", *function) for key, function in functions.items()]
     entries = ", ".join(f"{key}: {name}_{key}" for key in functions)
     facts = f"limit_names: {json.dumps(task.limit_names)}, first_exit: {json.dumps(task.first_exit)}"

@@ -13,6 +13,7 @@ import casadi
 import numpy as np
 
 from ballbot_gym.codegen import OPERATIONS
+from ballbot_gym.tasks.symmetry import Frame
 
 _SHARED = {
     **OPERATIONS,
@@ -29,6 +30,33 @@ _SHARED = {
     casadi.OP_FMAX: "real_fmax({0}, {1})",
 }
 """Operations of CasADi in C and JavaScript alike, but for the names of the functions."""
+
+
+Functions = dict[str, tuple[Callable[..., Any], Mapping[str, int]]]
+"""Functions of CasADi columns with the sizes of their arguments, by name."""
+
+
+def frame_functions(frame: Frame, features: Callable[..., Any], observations: int, seen: int) -> Functions:
+    """What a policy in a frame computes beside its networks.
+
+    Args:
+        frame: the frame.
+        features: from what the policy sees, a tuple, to features and the way back, as of `Frame`.
+        observations: numbers of an observation.
+        seen: numbers that the policy sees, the sides of a route among them.
+    """
+    split, route = casadi.vertsplit, frame.route
+    functions: Functions = {
+        "features": (lambda o: features(tuple(split(o)))[0], {"o": seen}),
+        "back": (lambda o, a: features(tuple(split(o)))[1]((a[0], a[1])), {"o": seen, "a": 2}),
+    }
+    if route is not None:
+        functions["layout"] = (lambda o: route.layout(tuple(split(o))), {"o": observations})
+        functions["chosen_sides"] = (
+            lambda o, farther: route.sides(tuple(split(o)), tuple(split(farther))),
+            {"o": observations, "farther": route.obstacles},
+        )
+    return functions
 
 
 def javascript_function(name: str, function: Callable[..., Any], arguments: Mapping[str, int]) -> str:

@@ -64,7 +64,7 @@ class Policy {
     const best = outputs.indexOf(Math.max(...outputs));
     const obstacles = Math.log2(outputs.length);
     const farther = Array.from({ length: obstacles }, (_, i) => ((best >> (obstacles - 1 - i)) & 1 ? -1 : 1));
-    return this.model.sides(observation, farther);
+    return this.model.chosen_sides(observation, farther);
   }
 
   sum(inputs) {
