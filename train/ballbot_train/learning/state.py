@@ -1,7 +1,7 @@
 """What learners remember, as tensors and plain values: their `state_dict` and the way back."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -32,4 +32,4 @@ def _saved(value: Any) -> Any:
         return value.state_dict()
     if isinstance(value, torch.Generator):
         return value.get_state()
-    return list(value.state) if isinstance(value, BallbotBatch) else value
+    return list(cast(BatchState, value.state)) if isinstance(value, BallbotBatch) else value

@@ -58,7 +58,8 @@ class Runner:
 
     def begin(self, x: State) -> None:
         """Starts an episode in state x (8,)."""
-        self.x, self.force, self.cost = x, (0.0, 0.0), 0.0
+        self.x, self.cost = x, 0.0
+        self.force = (0.0, 0.0)
         self.violated, self.arrived = "", False
         self._simulator.reset(x)
         self.trace.clear()
