@@ -137,7 +137,8 @@ def _urdf(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]
 
 def _policy(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_gym.env import make_task
-    from ballbot_train.policy import PolicyError, PolicyNetwork, PolicySpec, load_policy, save_policy
+    from ballbot_train.policy import PolicyNetwork, load_policy, save_policy
+    from ballbot_train.policy_files import PolicyError, PolicySpec
 
     network = PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,)))
     path = save_policy(folder / "mine", network, {"measured": {"regret_mean": 0.1}})

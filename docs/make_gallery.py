@@ -19,6 +19,7 @@ from PIL import Image
 
 from ballbot_baselines import CONTROLLERS, find_optimum
 from ballbot_gym import certified, files
+from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
 from ballbot_gym.engines import PHYSICS
 from ballbot_gym.env import make_task
 from ballbot_gym.picture import picture
@@ -30,7 +31,7 @@ from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.submissions import LEADERBOARD, Entry, read_entries
 from ballbot_train.policy_files import SHIPPED
 from ballbot_train.report import figures, labels
-from ballbot_train.report.replay import Ghost, Replay, Take, certified_replay
+from ballbot_train.report.replay import Replay, Take, certified_replay, driven_path
 
 PAGE = Path(__file__).parent / "gallery.md"
 FILMS = make_leaderboard.FILMS
@@ -87,8 +88,8 @@ def _has_motion(row: Entry) -> bool:
     return shipped or (LEADERBOARD / row.file).with_suffix(".npz").exists()
 
 
-def take_of(row: Entry, episode: int) -> Replay:
-    """What a row did in an episode, with the optimum as its ghost."""
+def take_of(row: Entry, episode: int) -> tuple[Replay, Trajectory]:
+    """What a row did in an episode, and the optimum, which is its ghost."""
     path = (LEADERBOARD / row.file).with_suffix(".npz")
     replay = certified_replay(row.task, ["lqr" if path.exists() else row.name], episode, row.physics, robot=row.robot)
     (take,) = replay.takes
@@ -102,7 +103,7 @@ def take_of(row: Entry, episode: int) -> Replay:
         raise PlanError(
             f"{row.task} {episode}: the search found {optimum.cost}, and {known.costs[episode]} is certified"
         )
-    return replace(replay, takes=(replace(take, ghosts=(Ghost("optimum", optimum.trajectory, labels.OPTIMUM),)),))
+    return replace(replay, takes=(take,)), optimum.trajectory
 
 
 def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
@@ -116,12 +117,20 @@ def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
     )
 
 
-def film(replay: Replay) -> bytes:
+def drawing(replay: Replay, optimum: Trajectory, t: float) -> Drawing:
+    """A moment, s, with the optimum as a ghost."""
+    drawn = replay.drawing(replay.takes[0], t)
+    ghost = Robot(optimum.state(t), labels.OPTIMUM, alpha=GHOST_OPACITY, name="ghost")
+    path = GroundPath(driven_path(optimum, t), labels.OPTIMUM, True, "ghost")
+    return replace(drawn, robots=(ghost, *drawn.robots), paths=(*drawn.paths, path))
+
+
+def film(replay: Replay, optimum: Trajectory) -> bytes:
     """An animated WebP."""
     (take,) = replay.takes
     end = min(take.trajectory.duration + (_AFTER if take.failed else 0), _LONGEST)
     first, *others = (
-        Image.fromarray(picture(replay.drawing(take, t), *_SIZE)) for t in np.arange(0, end + 1e-6, 1 / _FPS)
+        Image.fromarray(picture(drawing(replay, optimum, t), *_SIZE)) for t in np.arange(0, end + 1e-6, 1 / _FPS)
     )
     durations = [1000 // _FPS] * len(others) + [_LAST_MS]
     buffer = io.BytesIO()
@@ -152,7 +161,7 @@ def main() -> None:
             continue
         known[name] = {"submission": row.submission, "note": note(row, episode)}
         if not held:
-            files.write(FILMS / name, film(take_of(row, episode)))
+            files.write(FILMS / name, film(*take_of(row, episode)))
             print(f"{name}: {(FILMS / name).stat().st_size / 1000:.0f} kB, {known[name]['note']}", flush=True)
             files.write(MADE, json.dumps(made := made | {name: known[name]}, indent=1) + "\n")
     for path in FILMS.glob("*.webp"):

@@ -38,7 +38,8 @@ from ballbot_train.learning import training
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS, check_settings
-from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy
+from ballbot_train.policy import PolicyNetwork, save_policy
+from ballbot_train.policy_files import PolicySpec
 
 REFUSALS = (ValueError, TypeError, gymnasium.error.Error)
 """What a wrong call may raise."""
@@ -599,7 +600,6 @@ TYPED = [
     ("train shac --test-episodes 201", "test_episodes must be 1 to 200, not 201"),
     ("evaluate dagger --fresh 10", "unknown controller dagger"),  # Stabilize has none
     ("replay stabilize turn", "give one task"),
-    ("replay none.npz --ghosts lqr", "give the ghosts as files too"),
     ("export lqr", "lqr is an expert"),
 ]
 

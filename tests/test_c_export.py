@@ -14,7 +14,8 @@ from ballbot_gym.params import default_params
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.policy import SHIPPED, PolicyController, PolicyNetwork, PolicySpec, save_policy
+from ballbot_train.policy import PolicyController, PolicyNetwork, save_policy
+from ballbot_train.policy_files import SHIPPED, PolicySpec
 from ballbot_train.report.c_export import LARGEST_ERROR, LQR, export_c
 
 COMPILER = machine_code.compiler()

@@ -19,7 +19,8 @@ from ballbot_gym.rollout import PlanError
 from ballbot_train.cli import main
 from ballbot_train.learning.datasets import command_of, load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, Expert, record, write_demos
-from ballbot_train.policy import load_policy, shipped_policies
+from ballbot_train.policy import load_policy
+from ballbot_train.policy_files import shipped_policies
 
 
 def make(out, **changes):

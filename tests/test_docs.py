@@ -17,7 +17,7 @@ from ballbot_train.evaluation.submissions import read_entries
 from ballbot_train.executors import Workers
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import model_free
-from ballbot_train.policy import SHIPPED
+from ballbot_train.policy_files import SHIPPED
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

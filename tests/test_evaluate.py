@@ -21,7 +21,8 @@ from ballbot_train.evaluation import benchmark, evaluate
 from ballbot_train.evaluation.comparison import compare
 from ballbot_train.evaluation.controllers import make_controller, make_packed, packed
 from ballbot_train.evaluation.results import leaderboard, read_results, summarize, write_leaderboard
-from ballbot_train.policy import PolicyNetwork, PolicySpec, save_policy, shipped_policies
+from ballbot_train.policy import PolicyNetwork, save_policy
+from ballbot_train.policy_files import PolicySpec, shipped_policies
 
 
 def test_regret_is_the_cost_above_the_optimum_and_failed_episodes_have_none():

@@ -22,7 +22,8 @@ from ballbot_train.commands.evaluate import evaluate
 from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.learning import training
-from ballbot_train.policy import load_policy, shipped_policies
+from ballbot_train.policy import load_policy
+from ballbot_train.policy_files import shipped_policies
 
 
 def idle(observation):

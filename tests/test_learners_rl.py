@@ -18,7 +18,8 @@ from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, model_free, ppo, sac
 from ballbot_train.learning.learners.model_free import TrainingEnv
-from ballbot_train.policy import PolicyNetwork, load_network, save_policy, shipped_policies
+from ballbot_train.policy import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy_files import shipped_policies
 
 SHARED = {"gamma": 0.995, "final_gamma": 0.999, "iterations": 3, "num_envs": 4, "hidden": (16, 8)}
 RELATIVE = {"relative_advantages": False, "relative_values": False}

@@ -19,8 +19,8 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.policy import PolicyNetwork, PolicySpec, load_network, save_policy
-from ballbot_train.policy_files import BEST, shipped_policies
+from ballbot_train.policy import PolicyNetwork, load_network, save_policy
+from ballbot_train.policy_files import BEST, PolicySpec, shipped_policies
 from ballbot_train.report import playground
 from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
 from ballbot_train.report.printed import javascript_function

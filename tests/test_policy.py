@@ -15,16 +15,8 @@ from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller, names
 from ballbot_train.evaluation.evaluate import evaluate
-from ballbot_train.policy import (
-    PolicyController,
-    PolicyError,
-    PolicyNetwork,
-    PolicySpec,
-    load_policy,
-    read_description,
-    save_policy,
-    shipped_policies,
-)
+from ballbot_train.policy import PolicyController, PolicyNetwork, load_policy, save_policy
+from ballbot_train.policy_files import PolicyError, PolicySpec, read_description, shipped_policies
 
 
 def network_of(task, **fields):

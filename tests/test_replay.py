@@ -1,6 +1,4 @@
-"""Strips and films of episodes, and ghosts in them."""
-
-from dataclasses import replace
+"""Strips and films of episodes."""
 
 import imageio.v2 as imageio
 import numpy as np
@@ -18,7 +16,6 @@ from ballbot_train.report.replay import (
     Take,
     certified_replay,
     file_replay,
-    with_companions,
 )
 
 FALLING = 5  # a certified episode of Stabilize in which LQR falls, at 0.40 s
@@ -101,24 +98,6 @@ def test_the_same_episode_starts_alike_under_every_controller():
         np.testing.assert_array_equal(take.trajectory.x[0], start)
     assert [take.label for take in shown.takes] == ["LQR", "trajectory optimization + TVLQR"]
     assert len(shown.markers) == 2  # the gate's posts
-
-
-def test_ghosts_from_the_start_are_drawn_beside_every_take_but_their_own():
-    shown = certified_replay("stabilize", ["lqr", "ppo"], FALLING, physics="rk4")
-    lqr, ppo = with_companions(shown, Replay("", shown.takes[:1])).takes
-    assert lqr.ghosts == ()
-    (ghost,) = ppo.ghosts
-    assert (ghost.label, ghost.color) == ("LQR", lqr.color)
-    together = replace(shown, takes=(lqr, ppo))
-    beside, alone = together.drawing(ppo, 0.2), together.drawing(lqr, 0.2)
-    assert [robot.alpha < 1 for robot in beside.robots] == [True, False]
-    np.testing.assert_array_equal(beside.robots[0].x, alone.robots[0].x)
-    assert [path.dashed for path in beside.paths] == [False, True]
-    assert together.duration == ppo.trajectory.duration
-    with_ghost, without = (film_frames(replay, [0.2], width=320) for replay in (together, shown))
-    changed = (next(with_ghost) != next(without)).any(axis=2)
-    assert changed[:110, 160:].any()
-    assert not changed[:110, :160].any()
 
 
 def test_files_called_the_same_are_told_apart_by_their_folders(tmp_path):

@@ -12,7 +12,8 @@ from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import whole_episodes
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.policy import load_network, shipped_policies
+from ballbot_train.policy import load_network
+from ballbot_train.policy_files import shipped_policies
 
 
 def made(name, seed=0, **settings):

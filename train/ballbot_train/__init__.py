@@ -16,13 +16,13 @@ Short import paths that stay where they are; each imports what it needs when it 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ballbot_train.evaluation.evaluate import evaluate
-    from ballbot_train.evaluation.fresh import evaluate_fresh
-    from ballbot_train.learning.callbacks import RegretCallback
-    from ballbot_train.learning.sb3 import BallbotVecEnv
-    from ballbot_train.policy import load_policy
-    from ballbot_train.policy_files import shipped_policies
-    from ballbot_train.saved_models import save_vecnormalize
+    from ballbot_train.evaluation.evaluate import evaluate as evaluate
+    from ballbot_train.evaluation.fresh import evaluate_fresh as evaluate_fresh
+    from ballbot_train.learning.callbacks import RegretCallback as RegretCallback
+    from ballbot_train.learning.sb3 import BallbotVecEnv as BallbotVecEnv
+    from ballbot_train.policy import load_policy as load_policy
+    from ballbot_train.policy_files import shipped_policies as shipped_policies
+    from ballbot_train.saved_models import save_vecnormalize as save_vecnormalize
 
 _LAZY = {
     "evaluate": "ballbot_train.evaluation.evaluate:evaluate",
@@ -34,16 +34,6 @@ _LAZY = {
     "RegretCallback": "ballbot_train.learning.callbacks:RegretCallback",
 }
 
-__all__ = [
-    "BallbotVecEnv",
-    "RegretCallback",
-    "evaluate",
-    "evaluate_fresh",
-    "load_policy",
-    "save_vecnormalize",
-    "shipped_policies",
-]
-
 
 def __getattr__(name: str) -> Any:
     if name not in _LAZY:
@@ -54,4 +44,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_LAZY})

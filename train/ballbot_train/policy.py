@@ -23,12 +23,10 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.policy_files import (
     OBSERVATION_VERSION,
-    SHIPPED,
     PolicyError,
     PolicySpec,
     paths_of,
     read_description,
-    shipped_policies,
 )
 from ballbot_train.routes import Routes
 from ballbot_train.weights import checked, own_precision
@@ -39,20 +37,6 @@ try:
     import torch
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
-
-__all__ = [
-    "OBSERVATION_VERSION",
-    "SHIPPED",
-    "PolicyController",
-    "PolicyError",
-    "PolicyNetwork",
-    "PolicySpec",
-    "load_network",
-    "load_policy",
-    "read_description",
-    "save_policy",
-    "shipped_policies",
-]
 
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}
 

@@ -1,33 +1,18 @@
 """The commands of `ballbot`, one file each. A command is imported when it is called.
 
-To add a command, write `NAME.py` with a function of the same name, and add one line to `COMMANDS`.
+To add a command, write `NAME.py` with a function of the same name, and its name to `COMMANDS`.
 """
 
 import ast
 from importlib.util import find_spec
 from pathlib import Path
 
-COMMANDS: dict[str, str] = {
-    "benchmark": "ballbot_train.commands.benchmark:benchmark",
-    "evaluate": "ballbot_train.commands.evaluate:evaluate",
-    "compare": "ballbot_train.commands.compare:compare",
-    "submit": "ballbot_train.commands.submit:submit",
-    "verify": "ballbot_train.commands.verify:verify",
-    "robustness": "ballbot_train.commands.robustness:robustness",
-    "transfer": "ballbot_train.commands.transfer:transfer",
-    "basins": "ballbot_train.commands.basins:basins",
-    "paper": "ballbot_train.commands.paper:paper",
-    "optimize": "ballbot_train.commands.optimize:optimize",
-    "replay": "ballbot_train.commands.replay:replay",
-    "play": "ballbot_train.commands.play:play",
-    "page": "ballbot_train.commands.page:page",
-    "certify": "ballbot_train.commands.certify:certify",
-    "demos": "ballbot_train.commands.demos:demos",
-    "export": "ballbot_train.commands.export:export",
-    "train": "ballbot_train.commands.train:train",
-    "curves": "ballbot_train.commands.curves:curves",
-    "tune": "ballbot_train.commands.tune:tune",
-    "new": "ballbot_train.commands.new:new",
+COMMANDS = {
+    name: f"{__name__}.{name}:{name}"
+    for name in (
+        *("benchmark", "evaluate", "compare", "submit", "verify", "robustness", "transfer", "basins", "paper"),
+        *("optimize", "replay", "play", "page", "certify", "demos", "export", "train", "curves", "tune", "new"),
+    )
 }
 """Every command's function, as `ballbot_gym.lazy.load` takes it."""
 

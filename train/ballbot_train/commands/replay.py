@@ -7,7 +7,7 @@ from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
 from ballbot_train.report.film import Format, film_times, write_film, write_strip
-from ballbot_train.report.replay import Replay, certified_replay, file_replay, with_companions
+from ballbot_train.report.replay import Replay, certified_replay, file_replay
 
 _MOST_FRAMES = 100_000
 _WIDTHS = {"mp4": 1280, "gif": 640, "webp": 640}  # px
@@ -25,7 +25,6 @@ def replay(
     fps: int = 25,
     speed: float = 1.0,
     width: int | None = None,
-    ghosts: tuple[str, ...] = (),
     out: Path = Path("runs/replay"),
     robot: RobotName = PAPER,
     frictions: tuple[float, ...] = (),
@@ -43,7 +42,6 @@ def replay(
         fps: frames per second of a film.
         speed: seconds of the episode per second of film; 0.5 is slow motion.
         width: width of a film, px; default 1280 for mp4, 640 for gif and webp.
-        ghosts: names of controllers or policy files; what they do from the same start is drawn translucent in every picture.
         out: folder of the file. The file is named after task, controllers and episode.
         robot: whose episode; a trajectory file is drawn with the paper's.
         frictions: coefficients of friction of floors, for a robot whose ball rolls: every controller is shown on each of
@@ -55,7 +53,7 @@ def replay(
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
     physics = physics_or_default(physics)
-    shown, name = _read(source, controllers, episode, physics, ghosts, robot, frictions)
+    shown, name = _read(source, controllers, episode, physics, robot, frictions)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"
     if format == "png":
@@ -74,14 +72,12 @@ def _read(
     controllers: tuple[str, ...],
     episode: int,
     physics: str,
-    ghosts: tuple[str, ...],
     robot: str,
     frictions: tuple[float, ...],
 ) -> tuple[Replay, str]:
     """The replay to draw, and the name of its file."""
     if all(Path(entry).suffix == ".npz" for entry in source):
         _check(bool(source), "give the name of a task, or trajectory files")
-        _check(not ghosts, "trajectory files do not say which episode they are of: give the ghosts as files too")
         _check(not frictions, "trajectory files were recorded on one floor: give --frictions with a task")
         paths = [Path(entry) for entry in source]
         return file_replay(paths), "-".join(path.stem for path in paths)
@@ -94,9 +90,6 @@ def _read(
     name = f"{made}-{'-'.join(Path(controller).stem for controller in controllers)}-{episode}"
     if frictions:
         name = f"{name}-on-{'-'.join(f'{friction:g}' for friction in frictions)}"
-    if ghosts:
-        shown = with_companions(shown, certified_replay(task, ghosts, episode, physics, robot=robot))
-        name = f"{name}-beside-{'-'.join(Path(ghost).stem for ghost in ghosts)}"
     return shown, name
 
 

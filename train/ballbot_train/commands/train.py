@@ -149,7 +149,7 @@ def _train_one(learner: str, run: Run, settings: Any, command: str) -> None:
 def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, Any]:
     """The record of a run; it also says how the demonstrations, or the policy to start from, were made."""
     from ballbot_train.learning.datasets import command_of
-    from ballbot_train.policy import read_description
+    from ballbot_train.policy_files import read_description
 
     inputs = [] if run.demos is None else [command_of(run.demos)]
     if run.start is not None:

@@ -32,7 +32,8 @@ from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
-from ballbot_train.policy import PolicyController, read_description, shipped_policies
+from ballbot_train.policy import PolicyController
+from ballbot_train.policy_files import read_description, shipped_policies
 from ballbot_train.weights import own_precision
 
 try:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -268,39 +268,32 @@ def _or_null(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-HEADER = [
-    "task",
-    "controller",
-    "success",
-    "falls",
-    "regret mean",
-    "regret median",
-    "peak tilt",
-    "settle",
-    "mean force",
-    "plan",
-    "per step",
-]
-
-
 def shown(value: float, form: str, unit: str = "") -> str:
     """A figure of a table; a dash where there is none."""
     return format(value, form) + unit if math.isfinite(value) else "–"
 
 
+def _mean_with_interval(row: Row) -> str:
+    ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
+    return shown(row.regret_mean, ".2%") + ends
+
+
+_COLUMNS: dict[str, Callable[[Row], str]] = {
+    "task": lambda row: row.task,
+    "controller": lambda row: Path(row.controller).name,  # a policy may be a long path
+    "success": lambda row: f"{100 * row.success:.1f} %",
+    "falls": lambda row: f"{row.falls}/{row.episodes}",
+    "regret mean": _mean_with_interval,
+    "regret median": lambda row: shown(row.regret_median, ".2%"),
+    "peak tilt": lambda row: shown(row.peak_tilt_median, ".1f", "°"),
+    "settle": lambda row: shown(row.settle_time_median, ".2f", " s"),
+    "mean force": lambda row: shown(row.effort_mean, ".0f", " N"),
+    "plan": lambda row: shown(row.plan_ms_median, ".0f", " ms"),
+    "per step": lambda row: shown(row.step_us_median, ".0f", " µs"),
+}
+HEADER = list(_COLUMNS)
+
+
 def cells(row: Row) -> list[str]:
     """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash."""
-    ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
-    return [
-        row.task,
-        Path(row.controller).name,  # a policy may be a long path
-        f"{100 * row.success:.1f} %",
-        f"{row.falls}/{row.episodes}",
-        shown(row.regret_mean, ".2%") + ends,
-        shown(row.regret_median, ".2%"),
-        shown(row.peak_tilt_median, ".1f", "°"),
-        shown(row.settle_time_median, ".2f", " s"),
-        shown(row.effort_mean, ".0f", " N"),
-        shown(row.plan_ms_median, ".0f", " ms"),
-        shown(row.step_us_median, ".0f", " µs"),
-    ]
+    return [text(row) for text in _COLUMNS.values()]

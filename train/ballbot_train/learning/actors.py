@@ -8,7 +8,8 @@ from torch.optim.swa_utils import AveragedModel
 
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.policy import PolicyNetwork, PolicySpec
+from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy_files import PolicySpec
 
 Symmetry = Literal["none", "odd", "mirrors", "frame", "fine_frame", "centred"]
 """How an actor respects the task's symmetry: opposite observations get opposite actions (odd), its output is averaged over

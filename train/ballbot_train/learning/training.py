@@ -55,7 +55,8 @@ from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate, fresh
 from ballbot_train.learning import VALIDATION_EPISODES
-from ballbot_train.policy import PolicyController, PolicyNetwork, PolicySpec, load_network, save_policy
+from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
+from ballbot_train.policy_files import PolicySpec
 from ballbot_train.provenance import provenance
 from ballbot_train.weights import own_defaults, saved_by_torch
 

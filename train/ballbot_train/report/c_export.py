@@ -22,7 +22,8 @@ from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.escaping import printable
 from ballbot_train.onnx_export import metadata
-from ballbot_train.policy import PolicyController, PolicyError, PolicyNetwork, PolicySpec, load_network
+from ballbot_train.policy import PolicyController, PolicyNetwork, load_network
+from ballbot_train.policy_files import PolicyError, PolicySpec
 from ballbot_train.report.printed import Functions, c_function, c_number, frame_functions
 from ballbot_train.weights import own_defaults
 

@@ -22,7 +22,7 @@ from ballbot_gym.drawing import Drawing
 from ballbot_gym.picture import picture
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
-from ballbot_train.report.replay import LEAST_SLIP, Ghost, Replay
+from ballbot_train.report.replay import LEAST_SLIP, Replay
 
 Format = Literal["png", "mp4", "gif", "webp"]
 
@@ -47,9 +47,9 @@ def write_strip(replay: Replay, path: Path, frames: int, seconds: float) -> Path
         for axis, t in zip(row, np.linspace(0, seconds, frames), strict=True):
             _View(axis, *_STRIP_SIZE).draw(replay.drawing(take, t))
             axis.set_aspect("equal")
-            held = min(t, take.end)
+            held = min(t, take.trajectory.duration)
             axis.set_title(f"{held:.2f} s, {_tilt(take.trajectory.state(held)):.0f}°", fontsize=9)
-        if rows > 1 or take.ghosts:
+        if rows > 1:
             row[0].set_ylabel(f"{take.label}\n{take.note}".strip().replace("; ", "\n"), fontsize=8, color=take.color)
     return figures.save(figure, path)
 
@@ -227,12 +227,6 @@ class _Film:
             self._stages.append(_Stage(view, tilt, note, end))
             self._moving += [view.image, tilt, note, end]
 
-    def _ghosts(self) -> list[Ghost]:
-        """Every ghost once that is no take."""
-        found = {id(ghost.trajectory): ghost for take in self._replay.takes for ghost in take.ghosts}
-        shown = {id(take.trajectory) for take in self._replay.takes}
-        return [ghost for key, ghost in found.items() if key not in shown]
-
     def _add_traces(self, seconds: float) -> None:
         tilt, force, path = (
             self._figure.add_axes((left, 0.075, width, 0.21))
@@ -243,12 +237,6 @@ class _Film:
             tilt.plot(t, np.degrees(take.trajectory.tilt), color=take.color, lw=1.6)
             force.plot(t[: len(u)], np.hypot(*u.T), color=take.color, lw=1.2, drawstyle=_drawstyle(take.trajectory))
             path.plot(*take.trajectory.x[:, :2].T, color=take.color, lw=1.6)
-        for ghost in self._ghosts():
-            look = {"color": ghost.color, "lw": 1.2, "ls": "--", "alpha": 0.7}
-            t, u = ghost.trajectory.t, ghost.trajectory.u
-            tilt.plot(t, np.degrees(ghost.trajectory.tilt), **look)
-            force.plot(t[: len(u)], np.hypot(*u.T), drawstyle=_drawstyle(ghost.trajectory), **look)
-            path.plot(*ghost.trajectory.x[:, :2].T, **look)
         tilt.set(xlim=(0, seconds), xlabel="time, s", title="tilt, deg")
         force.set(xlim=(0, seconds), xlabel="time, s", title="force, N")
         path.set(title="ground path, m")

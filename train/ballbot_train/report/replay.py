@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ballbot_gym import certified
-from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_gym.drawing import Drawing, GroundPath, Robot
 from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
@@ -29,20 +29,10 @@ _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 
 @dataclass(frozen=True)
-class Ghost:
-    """Another controller's trajectory beside a take, from the same start."""
-
-    label: str
-    trajectory: Trajectory
-    color: str
-
-
-@dataclass(frozen=True)
 class Take:
     """One trajectory to watch.
 
-    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle. `ghosts` are drawn translucent
-    beside it.
+    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle.
     """
 
     label: str
@@ -50,7 +40,6 @@ class Take:
     color: str
     note: str = ""
     failed: bool = False
-    ghosts: tuple[Ghost, ...] = ()
     slip: np.ndarray | None = None
     """(n,) speed of the ball's lowest point over the floor as each force begins, m/s, where contact is simulated."""
 
@@ -59,11 +48,6 @@ class Take:
         if self.slip is None or t >= self.trajectory.duration:
             return 0.0
         return float(self.slip[np.searchsorted(self.trajectory.t[:-1], t + 1e-9) - 1])
-
-    @property
-    def end(self) -> float:
-        """The time at which the trajectory and its ghosts have all ended, s."""
-        return max(self.trajectory.duration, *(ghost.trajectory.duration for ghost in self.ghosts), 0.0)
 
 
 @dataclass(frozen=True)
@@ -77,23 +61,18 @@ class Replay:
 
     @property
     def duration(self) -> float:
-        """The duration of the longest take or ghost, s."""
-        return max(take.end for take in self.takes)
+        """The duration of the longest take, s."""
+        return max(take.trajectory.duration for take in self.takes)
 
     def drawing(self, take: Take, t: float) -> Drawing:
-        """One of the takes at time t, s, with its ghosts and the paths so far. After its end a robot stands still."""
+        """One of the takes at time t, s, with its path so far. After its end a robot stands still."""
         u = take.trajectory.force(t) if t < take.trajectory.duration else None
-        robots, paths = [], [GroundPath(_driven_path(take.trajectory, t), take.color)]
-        paths += [GroundPath(points, _SKID, name=f"skid {i}") for i, points in enumerate(_skids(take, t))]
-        for i, ghost in enumerate(take.ghosts):
-            name = f"ghost {i}"
-            robots.append(Robot(ghost.trajectory.state(t), ghost.color, alpha=GHOST_OPACITY, name=name))
-            paths.append(GroundPath(_driven_path(ghost.trajectory, t), ghost.color, True, name))
-        robots.append(Robot(take.trajectory.state(t), take.color, u))
-        return Drawing(self.params, tuple(robots), tuple(paths), self.markers)
+        skids = (GroundPath(points, _SKID, name=f"skid {i}") for i, points in enumerate(_skids(take, t)))
+        paths = GroundPath(driven_path(take.trajectory, t), take.color), *skids
+        return Drawing(self.params, (Robot(take.trajectory.state(t), take.color, u),), paths, self.markers)
 
 
-def _driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
+def driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
     """(n, 2) the ground path until time t, m."""
     return np.concatenate([trajectory.x[trajectory.t < t, :2], trajectory.state(t)[None, :2]])
 
@@ -214,19 +193,6 @@ def engines_replay(task: str, controller: str, episode: int, physics: Sequence[s
         for i, (engine, replay) in enumerate(zip(physics, shown, strict=True))
     ]
     return replace(shown[0], takes=tuple(takes))
-
-
-def with_companions(replay: Replay, others: Replay) -> Replay:
-    """Adds all takes of another replay of the same episode to every take, as ghosts in their own colours.
-
-    A take gets no ghost of its own controller.
-    """
-    ghosts = tuple(Ghost(take.label, take.trajectory, take.color) for take in others.takes)
-    takes = tuple(
-        replace(take, ghosts=(*take.ghosts, *(ghost for ghost in ghosts if ghost.label != take.label)))
-        for take in replay.takes
-    )
-    return replace(replay, takes=takes)
 
 
 def file_replay(paths: Sequence[Path]) -> Replay:

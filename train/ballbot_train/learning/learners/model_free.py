@@ -27,7 +27,8 @@ from ballbot_train.learning.datasets import Demos
 from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy import PolicyNetwork, PolicySpec
+from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy_files import PolicySpec
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
-from ballbot_train.policy import PolicyNetwork, PolicySpec
+from ballbot_train.policy import PolicyNetwork
+from ballbot_train.policy_files import PolicySpec
 
 
 @dataclass(frozen=True)
