@@ -65,7 +65,7 @@ class Runner:
         self.trace.clear()
         self._disturbance.begin(self._drawn)
         self._states: list[State] = [x]
-        self._forces: list[tuple[float, float]] = []
+        self._forces: list[tuple[float, ...]] = []
 
     def take_controller(self, controller: Controller | None, step: int) -> None:
         """Goes on under another controller, that was reset for this step, counted from the opening of the playground."""
