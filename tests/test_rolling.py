@@ -309,7 +309,7 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
     task = make_task("stabilize", "rolling")
     refused = [certification.episode(task, rolling, 1, draw)[0] for draw in (0, 1)]
 
-    def found(task, params, x, c, guesses, twice):
+    def found(task, params, x, c, twice):
         if any((x == start).all() for start in refused):
             raise PlanError("it cannot but slip")
         t = np.array([0.0, 0.02])
@@ -319,12 +319,12 @@ def test_an_episode_without_an_optimum_is_drawn_again(rolling, monkeypatch):
         )  # fmt: skip
 
     monkeypatch.setattr(certification, "find_optimum", found)
-    entries = list(certification.entries("stabilize", range(2), "rolling", 5))
+    entries = list(certification.entries("stabilize", range(2), "rolling"))
     assert [entry.get("draw") for entry in entries] == [None, 2]
     states = certification.arrays(entries, task, rolling)["states"]
     np.testing.assert_array_equal(states[1], certification.episode(task, rolling, 1, 2)[0])
     refused.append(certification.episode(Stabilize(), default_params(), 0)[0])
-    assert "error" in next(certification.entries("stabilize", [0], "paper", 5))
+    assert "error" in next(certification.entries("stabilize", [0], "paper"))
 
 
 def test_a_certified_set_is_of_one_robot(tmp_path):

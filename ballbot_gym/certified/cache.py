@@ -80,7 +80,7 @@ def write(
     path = _path(task, params, index, randomization)
     known = read(task, params, [index], randomization).get(index)
     if known is not None and float(known["cost"]) <= optimum["cost"]:
-        optimum = {**known, "found": {**known["found"], "guesses": optimum["found"]["guesses"]}}
+        return
     draw = int(optimum.get("draw", 0))
     state, constants = episode(task, params, index, draw)
     arrays = {"state": state, "constants": constants, "draw": np.array(draw)}

@@ -6,7 +6,7 @@ The search is that of `search.py`, for all episodes together:
   then LQR is simulated to the end. Where that costs something else than LQR's cost-to-go, the whole episode is optimized.
 - Tasks that end at rest without obstacles start from the cheapest simulated recovery (`righting.steering`).
 - Slaloms are first solved without their obstacles. That predicts what every choice of sides costs (`sides.py`), and the
-  likely ones are compared with forces held longer. The best is tried again with all obstacles passed a step later and earlier.
+  likely ones are compared with forces held longer. The best is tried again, passing all obstacles a step later and earlier.
 - First-exit tasks are first solved along each guessed path with a free length of the steps, then for whole numbers of control
   steps near the best arrivals.
 - All others are solved along their guessed paths.

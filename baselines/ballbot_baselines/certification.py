@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import ALL_GUESSES, Optimum, find_optimum
+from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_baselines.search import COARSE
 from ballbot_gym import dynamics
 from ballbot_gym.certified import cache
@@ -26,7 +26,7 @@ from ballbot_gym.trajectory import Trajectory
 Entry = dict[str, Any]
 """The optimum of one episode as JSON holds it: "episode" (its index), "cost", "violation", "solver", "status", and the
 optimal trajectory's "t", "x" and "u" as lists; "draw", which draw of the episode it is, where it is not the first; and
-"found", how it was found: "guesses" allowed and "tried", and "next_basin", by which share the next best local optimum
+"found", how it was found: guesses "tried", and "next_basin", by which share the next best local optimum
 costs more. JSON keeps every bit of a float. Where no optimum was found: "episode" and "error", the message."""
 
 _MOST_DRAWS = 20
@@ -36,7 +36,6 @@ def entries(
     task: str | Task,
     indices: Iterable[int],
     robot: str | BallbotParams = PAPER,
-    guesses: int = ALL_GUESSES,
     randomization: Randomization = Randomization(),
 ) -> Iterator[Entry]:
     """Solves episodes of a task for a robot, and yields one entry for each, in order.
@@ -48,7 +47,6 @@ def entries(
         task: the problem, or its name in `TASKS`.
         indices: of the episodes.
         robot: whose optima, or its name in `ROBOTS`.
-        guesses: see `find_optimum`.
         randomization: what the robot and the actuator of each episode are drawn from.
 
     Raises:
@@ -57,23 +55,21 @@ def entries(
     task, params = make_task(task, robot), checked_robot(robot)
     for index in indices:
         for draw in range(_MOST_DRAWS if params.grips or randomization.moves_optima else 1):
-            entry = _solved(task, params, index, draw, guesses, randomization)
+            entry = _solved(task, params, index, draw, randomization)
             if "error" not in entry:
                 break
         yield entry
 
 
-def _solved(
-    task: Task, params: BallbotParams, index: int, draw: int, guesses: int, randomization: Randomization
-) -> Entry:
+def _solved(task: Task, params: BallbotParams, index: int, draw: int, randomization: Randomization) -> Entry:
     x0, c = episode(task, params, index, draw)
     drawn = cache.drawn(task, randomization, index, draw)
     delay = randomization.moves_optima and drawn[5] > 0
     try:
-        optimum = optimum_of(task, params, x0, c, randomization, drawn, guesses)
+        optimum = optimum_of(task, params, x0, c, randomization, drawn)
         ideal = optimum
         if delay:
-            ideal = find_optimum(task, randomization.robot(params, drawn), x0, c, guesses=guesses, twice=True)
+            ideal = find_optimum(task, randomization.robot(params, drawn), x0, c, twice=True)
     except PlanError as error:
         return {"episode": index, "error": str(error)}
     for found in (optimum, ideal):
@@ -89,7 +85,6 @@ def _solved(
             "solver": optimum.solver,
             "status": optimum.solver_status,
             "found": {
-                "guesses": guesses,
                 "tried": optimum.tried,
                 "next_basin": None if math.isnan(optimum.next_basin) else optimum.next_basin,
             },
@@ -109,7 +104,6 @@ def optimum_of(
     c: np.ndarray,
     randomization: Randomization,
     drawn: tuple[float, ...],
-    guesses: int = 5,
 ) -> Optimum:
     """The optimum of an episode for which a randomization drew this: of its own robot, and no force comes while it is late.
 
@@ -120,7 +114,6 @@ def optimum_of(
         c: (nc,) constants.
         randomization: without an actuator that lags; noise and pushes move no optimum.
         drawn: what its `draw` drew.
-        guesses: as of `find_optimum`.
 
     Raises:
         PlanError: the robot violates a limit before it can be moved, or no try came to a feasible episode.
@@ -129,7 +122,7 @@ def optimum_of(
         params = randomization.robot(params, drawn)
     delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
-        return find_optimum(task, params, x0, c, guesses=guesses, twice=True)
+        return find_optimum(task, params, x0, c, twice=True)
     dt, none, states, cost = task.control_dt, np.zeros(2), [np.asarray(x0, np.float64)], 0.0
     for k in range(delay):
         began = task.at(c, k * dt)
@@ -143,8 +136,8 @@ def optimum_of(
     if rest.steps % COARSE and task.passed_obstacles(c) is not None:
         # only over an even number of steps are choices of sides compared
         longer = replace(task, duration=rest.duration + dt)
-        paths = [find_optimum(longer, params, states[-1], c, guesses=guesses, start=start).trajectory.x[:-1, :2]]
-    found = find_optimum(rest, params, states[-1], c, guesses=guesses, paths=paths, start=start, twice=True)
+        paths = [find_optimum(longer, params, states[-1], c, start=start).trajectory.x[:-1, :2]]
+    found = find_optimum(rest, params, states[-1], c, paths=paths, start=start, twice=True)
     x = np.concatenate([states[:-1], found.trajectory.x])
     u = np.concatenate([np.zeros((delay, 2)), found.trajectory.u])
     return replace(found, cost=cost + found.cost, trajectory=Trajectory(dt * np.arange(len(x)), x, u))

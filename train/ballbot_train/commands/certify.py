@@ -4,7 +4,6 @@ from functools import partial
 from pathlib import Path
 
 from ballbot_baselines import certification
-from ballbot_baselines.optimum import ALL_GUESSES
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.randomization import checked_randomization
@@ -30,7 +29,6 @@ def certify(
     out: Path = Path("runs/certify"),
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
-    guesses: int = ALL_GUESSES,
     randomization: str | None = None,
 ) -> None:
     """Computes the certified evaluation sets: the optimum of every episode.
@@ -47,11 +45,10 @@ def certify(
         out: folder of the .npz files.
         workers: who does the work.
         robot: whose sets.
-        guesses: most guessed paths per episode; default all. With fewer, those of a slalom that are predicted to be the best.
         randomization: name of the track from which each episode's robot and delay are drawn; default, none.
     """
     check_some("task", tasks, TASKS)
-    check_least(1, episodes=episodes, guesses=guesses)
+    check_least(1, episodes=episodes)
     Workers.of(workers)
     most = _MOST_EPISODES if shards is None else _MOST_IN_SHARDS
     if episodes > most:
@@ -66,14 +63,14 @@ def certify(
     if shards is not None:
         if install:
             raise ValueError("the package holds no shards; give --install without --shards")
-        _certify_shards(tasks, episodes, shards, out, workers, robot, guesses)
+        _certify_shards(tasks, episodes, shards, out, workers, robot)
         return
     jobs.make_folder(out)
     params, failures, sets = named_robot(robot), [], {}
     for name in tasks:
         task = make_task(name, robot)
         try:
-            optima.compute(task, params, range(episodes), workers, guesses, guesses, varied)
+            optima.compute(task, params, range(episodes), workers, varied)
         except PlanError as error:
             failures.append(str(error))
             continue
@@ -99,12 +96,10 @@ def certify(
             console.print(f"installed: {kept.save(task, path, robot, varied)}")
 
 
-def _certify_shards(
-    tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers, robot: str, guesses: int
-) -> None:
+def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers, robot: str) -> None:
     from ballbot_train.shards import make
 
-    settings = robot_setting(robot) | ({} if guesses == ALL_GUESSES else {"guesses": guesses})
+    settings = robot_setting(robot)
     with progress_bars(dict.fromkeys(tasks, episodes)) as bars:
         for name in tasks:
             task, params = make_task(name, robot), named_robot(robot)
@@ -112,7 +107,7 @@ def _certify_shards(
                 f"{url.rstrip('/')}/{name}",
                 {"certified": task.problem(), "version": provenance()["version"], **settings},
                 episodes,
-                partial(certification.entries, robot=robot, guesses=guesses),
+                partial(certification.entries, robot=robot),
                 (name,),
                 partial(certification.arrays, task=task, params=params),
                 out / name,

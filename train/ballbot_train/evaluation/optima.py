@@ -72,8 +72,6 @@ def compute(
     params: BallbotParams,
     episodes: Iterable[int],
     workers: int | Workers | None = None,
-    guesses: int | None = None,
-    enough: int = 1,
     randomization: Randomization = Randomization(),
 ) -> None:
     """Computes the optima of episodes that the user's cache lacks. Each is kept as soon as it is found.
@@ -84,8 +82,6 @@ def compute(
         task: and params: the problem.
         episodes: their indices.
         workers: processes that compute, or `Workers`; default, this process alone.
-        guesses: most guessed paths per episode; default, all.
-        enough: an optimum that is there is not computed again if it was the best of so many guesses.
         randomization: as of `known`.
 
     Raises:
@@ -105,14 +101,13 @@ def compute(
         lock.acquire()
     failures = []
     try:
-        missing = _missing(task, params, needed, enough, randomization)
+        missing = _missing(task, params, needed, randomization)
         if not missing:
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as bars:
-            solve = _solver(params, guesses, randomization)
-            label = f"{guesses or 'all'}"
-            some = solve if workers is None else partial(_elsewhere, label, folder, workers, solve)
+            solve = _solver(params, randomization)
+            some = solve if workers is None else partial(_elsewhere, folder, workers, solve)
             for entry in some(task, missing):
                 bars.advance(name, 1)
                 if "error" in entry:
@@ -151,29 +146,27 @@ def _check_start(task: Task, params: BallbotParams, index: int) -> None:
             )
 
 
-def _missing(
-    task: Task, params: BallbotParams, episodes: list[int], enough: int, randomization: Randomization
-) -> list[int]:
+def _missing(task: Task, params: BallbotParams, episodes: list[int], randomization: Randomization) -> list[int]:
     found = cache.read(task, params, episodes, randomization)
     for index in list(found):
         if certified.from_cache(task, params, [index], randomization) is None:  # it does not move or cost so any more
             cache.forget(task, params, index, randomization)
             del found[index]
-    return [index for index in episodes if index not in found or found[index]["found"]["guesses"] < enough]
+    return [index for index in episodes if index not in found]
 
 
 def _elsewhere(
-    label: str, folder: Path, workers: int | Workers, solve: _Solver, task: Task, missing: list[int]
+    folder: Path, workers: int | Workers, solve: _Solver, task: Task, missing: list[int]
 ) -> Iterator[jobs.Entry]:
     """In other processes, in the order in which they finish. A job an episode, because any may be missing."""
-    work = [jobs.Job(f"{index:06d}-{label}", solve, (task,), (index,)) for index in missing]
+    work = [jobs.Job(f"{index:06d}", solve, (task,), (index,)) for index in missing]
     for number, (entry,) in jobs.stream(work, folder, workers, lambda *_: None):
         yield entry
         jobs.forget(folder, work[number].name)
     jobs.release(folder)
 
 
-def _solver(params: BallbotParams, guesses: int | None, randomization: Randomization) -> _Solver:
-    from ballbot_baselines.certification import ALL_GUESSES, entries
+def _solver(params: BallbotParams, randomization: Randomization) -> _Solver:
+    from ballbot_baselines.certification import entries
 
-    return partial(entries, robot=params, guesses=guesses or ALL_GUESSES, randomization=randomization)
+    return partial(entries, robot=params, randomization=randomization)
