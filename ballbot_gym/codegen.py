@@ -118,12 +118,14 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
     return "\n".join([*defined, text("real.h"), text("native.c"), *blocks])
 
 
-def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
+def in_lanes(functions: Sequence[casadi.Function], lanes: int, code: str = "") -> str:
     """The C code of functions that CasADi loads as external ones: each computes `lanes` stages, a column each, at once.
 
     Args:
         functions: with dense columns as arguments and results, and distinct names.
         lanes: stages per call, a number that SIMD instructions suit.
+        code: C code that computes a function NAME as NAME_lanes, with the arguments of a `block`; default, what CasADi's
+            functions compute is written out.
 
     Raises:
         NotImplementedError: a function has an operation that is not known here.
@@ -133,8 +135,11 @@ def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
         name = function.name()
         symbols = [casadi.SX.sym(f"in{i}", function.size1_in(i)) for i in range(function.n_in())]
         inputs = [(f"in{i}", casadi.vertsplit(part)) for i, part in enumerate(symbols)]
-        outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
-        parts.append(block(f"{name}_lanes", inputs, outputs))
+        if code:
+            outputs = [(f"out{i}", [0] * function.size1_out(i)) for i in range(function.n_out())]
+        else:
+            outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
+            parts.append(block(f"{name}_lanes", inputs, outputs))
         body = []
         for i, (pointer, rows) in enumerate(inputs):
             body.append(f"real {pointer}[{max(len(rows), 1)} * LANES]; gather({len(rows)}, arg[{i}], {pointer});")
@@ -153,7 +158,7 @@ def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
             f"int {name}(const double **arg, double **res, casadi_int *iw, double *w, int mem) {{\n    {lines}\n"
             "    return 0;\n}"
         )
-    parts.insert(3, _TRANSPOSE)
+    parts[3:3] = [_TRANSPOSE, code]
     return "\n".join(parts)
 
 

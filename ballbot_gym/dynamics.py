@@ -138,12 +138,15 @@ def held_contact(
 ) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
     """The floor's force, as `contact`, when force u begins in state x and after it was held for so many seconds.
 
-    The leans at the end are extrapolated with their accelerations, so that nothing is integrated for them. In between, a
+    The leans at the end are extrapolated with their accelerations, so that nothing is integrated for them; with wheels at
+    their rates alone, because derivatives of accelerations at extrapolated states are too long to compile. In between, a
     force that is held while the robot falls or rises needs up to twice the friction that it needs at first.
     """
     _, _, gamma, theta, vx, vy, gamma_dot, theta_dot, *turning = parts = ops.components(x)
     acceleration = accelerations(params, x, u)
     _, _, gamma_ddot, theta_ddot, *_ = acceleration
+    if params.wheels is not None:
+        gamma_ddot = theta_ddot = 0.0
     end = ops.stack(
         (
             *parts[:2],

@@ -1,9 +1,9 @@
 """A robot that three omni-wheels drive: its body yaws, its ball spins, and its motors weaken with speed.
 
 The wheels touch the ball at 45° of zenith angle and at azimuths α of 0, 120 and 240° about the body's axis. In the body's
-frame wheel i has the contact normal n_i = (s cos α, s sin α, c) and drives the ball along t_i = (−sin α, cos α, 0), with
-s = sin 45° and c = cos 45°; its rollers let the ball pass across. The state has three components more than that
-of `dynamics`: ψ, by which the body is turned about its own axis after γ and θ, ψ̇, and ω_z, the ball's spin about the vertical.
+frame wheel i has the contact normal n_i = (s cos α, s sin α, c), and drives the ball along t_i = (−sin α, cos α, 0), with
+s = sin 45° and c = cos 45°; its rollers let the ball pass across. The state has three components more than that of
+`dynamics`: ψ, by which the body is turned about its own axis after γ and θ, ψ̇, and the ball's spin ω_z about the vertical.
 
 The ball turns at ω = (−ẏ/r, ẋ/r, ω_z). Seen from the frame B of the leans, in which the body turns by ψ alone, it turns
 relative to the body at
@@ -26,15 +26,17 @@ the body sees it,
 
     Σ a_i f_i = Σ a_i u_i − d r² D w − m r² D ẇ,    ẇ = J v̇ + (J̇ v − ψ̇ e₃ × w).
 
-The other terms are those of `dynamics`, with the body's spin γ̇ sin θ + ψ̇ about its axis in place of γ̇ sin θ, the ball's energy
-½ I_b ω_z², and a torque of the floor against the ball's spin, which is smooth where dry friction jumps. All that makes six
-linear equations M v̇ = q. The body and D are the same about all axes across the body's, so that ψ matters to u alone.
+The other terms are those of `dynamics`, with the body's spin γ̇ sin θ + ψ̇ about its axis in place of γ̇ sin θ, the ball's
+energy ½ I_b ω_z², and a torque of the floor against the ball's spin, which is smooth where dry friction jumps. All that makes
+six linear equations M v̇ = q. The body and D are the same about all axes across the body's, so that ψ matters to u alone.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
+
+import numpy as np
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector, is_number
@@ -73,8 +75,10 @@ class Wheels:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not is_number(value):
+            if isinstance(value, str | bool | None):
                 raise ValueError(f"Wheels: {field.name} must be a number, not {value!r}")
+            if not is_number(value):
+                continue  # a symbol
             positive = field.name in ("radius", "no_load_speed")
             if not (0 < value < math.inf if positive else 0 <= value < math.inf):
                 raise ValueError(
@@ -128,6 +132,17 @@ def wheel_forces(params: Any, x: Vector, force: Vector, yaw_torque: Any = 0.0) -
     t1, t2, t3 = cos * t1 + sin * t2, cos * t2 - sin * t1, t3 - yaw_torque / params.ball_radius
     parts = [t3 / (3 * _SIN) - 2 / (3 * _COS) * (math.cos(a) * t1 + math.sin(a) * t2) for a in _AZIMUTHS]
     return ops.stack(tuple(parts), like=force)
+
+
+def with_wheels(params: Any, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 8) and forces (m, 2), m ≤ n, N, of the robot without wheels, as (n, 11) and (m, 3) of one with wheels.
+
+    It does not turn, and the wheels' forces are clipped. Without wheels both stay as they are.
+    """
+    if params.wheels is None:
+        return x, u
+    x = np.column_stack([x, np.zeros((len(x), 3))])
+    return x, wheel_forces(params, x[: len(u)], u).clip(-params.force_limit, params.force_limit)
 
 
 def relative_turning(params: Any, x: Vector) -> tuple[tuple[Any, Any, Any], tuple[tuple[Any, ...], ...]]:

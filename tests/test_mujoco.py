@@ -13,19 +13,20 @@ from ballbot_gym.tasks import Stabilize
 
 pytest.importorskip("mujoco")
 
-SPREAD = np.array([0.5, 0.5, 0.2, 0.2, 1.0, 1.0, 0.5, 0.5])
-"""Of drawn starts, as `dynamics.STATE`."""
+SPREAD = np.array([0.5, 0.5, 0.2, 0.2, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
+"""Of drawn starts, as `dynamics.OMNI_STATE`."""
 
 
 def drawn(robot, rng, steps=25):
     """Forces of half a second in grip from a drawn start, and the exact states under them, the start first."""
-    gain = discrete_lqr(Stabilize(), robot, np.zeros(8), np.zeros(2), np.zeros(0))[0]
+    rest = np.zeros(robot.state_size), np.zeros(robot.action_size)
+    gain = discrete_lqr(Stabilize(), robot, *rest, np.zeros(0))[0]
     exact = make_simulator("rk4", robot, 0.02, 0.0005)
     while True:
-        states, forces = [SPREAD * rng.uniform(-1, 1, 8)], []
+        states, forces = [SPREAD[: robot.state_size] * rng.uniform(-1, 1, robot.state_size)], []
         exact.reset(tuple(states[0]))
         for _ in range(steps):
-            u = np.clip(-gain @ states[-1] + rng.normal(0, 5, 2), -robot.force_limit, robot.force_limit)
+            u = np.clip(-gain @ states[-1] + rng.normal(0, 5, robot.action_size), -robot.force_limit, robot.force_limit)
             if robot.grips and not dynamics.keeps_grip(robot, dynamics.held_contact(robot, states[-1], u, 0.02)):
                 break
             forces.append(tuple(u.tolist()))

@@ -198,7 +198,10 @@ def _from_cache(
         return None
     rows = max(EPISODES, max(found) + 1)
     arrays: dict[str, Any] = {name: np.full(rows, np.nan) for name in ("costs", "durations", "violations", "ideal")}
-    arrays |= {"states": np.full((rows, 8), np.nan), "constants": np.full((rows, len(task.constant_names)), np.nan)}
+    arrays |= {
+        "states": np.full((rows, params.state_size), np.nan),
+        "constants": np.full((rows, len(task.constant_names)), np.nan),
+    }
     arrays["drawn"] = np.full((rows, len(cache.drawn(task, randomization, 0))), np.nan)
     statuses = [""] * rows
     moves = {}
@@ -246,7 +249,7 @@ def _read(
         for made, wanted in zip(made_for, (task.problem(), repr(params), repr(randomization)), strict=True):
             if made != wanted:
                 raise CertificateError(f"{path} was computed for {made}, not for {wanted}")
-        arrays |= _checked(task, arrays)
+        arrays |= _checked(task, params, arrays)
         lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
         forces = np.split(u, np.cumsum(lengths)[:-1])
         states = np.split(x, np.cumsum(lengths + 1)[:-1])
@@ -309,10 +312,13 @@ def _holds(
         return bool(moved.all() and (np.abs(found - known) <= _SAME * known).all() and kept)
 
 
-def _checked(task: Task, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _checked(task: Task, params: BallbotParams, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of numbers; raises a ValueError that names the one whose shape or values make no sense."""
     n = arrays["costs"].size
-    shapes = dict.fromkeys(_PER_EPISODE, (n,)) | {"states": (n, 8), "constants": (n, len(task.constant_names))}
+    shapes = dict.fromkeys(_PER_EPISODE, (n,)) | {
+        "states": (n, params.state_size),
+        "constants": (n, len(task.constant_names)),
+    }
     shapes["drawn"] = (n, arrays["drawn"].shape[-1])
     for name, shape in shapes.items():
         if n == 0 or arrays[name].shape != shape:
@@ -328,6 +334,6 @@ def _checked(task: Task, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarr
     if (lengths < 0).any() or (lengths > task.steps).any():
         raise ValueError(f"lengths must be 0 to {task.steps} control steps")
     steps = int(lengths.sum())
-    for name, shape in (("x", (steps + lengths.size, 8)), ("u", (steps, 2))):
+    for name, shape in (("x", (steps + lengths.size, params.state_size)), ("u", (steps, params.action_size))):
         found[name] = files.numbers(arrays[name], name, shape)
     return found

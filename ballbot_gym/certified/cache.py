@@ -110,7 +110,7 @@ def read(
             own = episode(task, params, index, arrays["draw"])
             n = len(arrays["u"])
             shapes = (arrays["x"].shape, arrays["u"].shape, arrays["cost"].shape)
-            if shapes == ((n + 1, 8), (n, 2), ()) and np.array_equal(
+            if shapes == ((n + 1, params.state_size), (n, params.action_size), ()) and np.array_equal(
                 np.concatenate(own), np.concatenate([arrays["state"], arrays["constants"]])
             ):
                 found[index] = arrays

@@ -123,7 +123,7 @@ def optimum_of(
     delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
         return find_optimum(task, params, x0, c, twice=True)
-    dt, none, states, cost = task.control_dt, np.zeros(2), [np.asarray(x0, np.float64)], 0.0
+    dt, none, states, cost = task.control_dt, np.zeros(params.action_size), [np.asarray(x0, np.float64)], 0.0
     for k in range(delay):
         began = task.at(c, k * dt)
         cost += dt * float(task.cost(states[-1], none, began))
@@ -139,7 +139,7 @@ def optimum_of(
         paths = [find_optimum(longer, params, states[-1], c, start=start).trajectory.x[:-1, :2]]
     found = find_optimum(rest, params, states[-1], c, paths=paths, start=start, twice=True)
     x = np.concatenate([states[:-1], found.trajectory.x])
-    u = np.concatenate([np.zeros((delay, 2)), found.trajectory.u])
+    u = np.concatenate([np.zeros((delay, params.action_size)), found.trajectory.u])
     return replace(found, cost=cost + found.cost, trajectory=Trajectory(dt * np.arange(len(x)), x, u))
 
 
@@ -169,14 +169,14 @@ def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[
 
     return {
         "episodes": np.array([entry["episode"] for entry in found], np.int64),
-        "states": np.array([x for x, _ in starts], float).reshape(-1, 8),
+        "states": np.array([x for x, _ in starts], float).reshape(-1, params.state_size),
         "constants": np.array([c for _, c in starts], float).reshape(len(found), len(task.constant_names)),
         "costs": np.array([entry["cost"] for entry in found], float),
         "violations": np.array([entry["violation"] for entry in found], float),
         "statuses": np.array([f"{entry['solver']}: {entry['status']}" for entry in found], str),
         "lengths": np.array([len(entry["u"]) for entry in found], np.int64),
-        "x": joined("x", 8),
-        "u": joined("u", 2),
+        "x": joined("x", params.state_size),
+        "u": joined("u", params.action_size),
         "failed": np.array([entry["episode"] for entry in failed], np.int64),
         "errors": np.array([entry["error"] for entry in failed], str),
     }

@@ -22,6 +22,9 @@ SIMD = (
 )
 """Flags of the compiler for functions of `LANES` stages."""
 
+LONG = (*SIMD, "-O1")
+"""The same for tens of thousands of operations, on which the compiler would spend twice the time."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -41,16 +44,19 @@ def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
     return loaded(name, generator.dump(), functions, ("-O2",)) or functions
 
 
-def in_lanes(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.Function, ...]:
+def in_lanes(
+    name: str, functions: tuple[casadi.Function, ...], code: str = "", flags: tuple[str, ...] = SIMD
+) -> tuple[casadi.Function, ...]:
     """The same functions of `LANES` stages at once, which SIMD instructions compute: a column for each stage.
 
-    Args: as of `compiled`; arguments and results are dense columns.
+    Args: as of `compiled`; arguments and results are dense columns. `code` is that of `codegen.in_lanes`, `flags` of the
+        compiler.
 
     Raises:
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
     try:
-        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, SIMD)
+        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES, code), functions, flags)
     except NotImplementedError:  # an operation that only CasADi knows as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)

@@ -27,7 +27,8 @@ def check_formulas(task: Task, params: BallbotParams) -> None:
     rng = np.random.default_rng(0)
     starts = [task.sample(rng, params) for _ in range(_SEGMENTS)]
     x = np.stack([x for x, _ in starts])
-    towards, u = rng.uniform(-1, 1, x.shape) * _REACH, rng.uniform(-1, 1, (_SEGMENTS, 2)) * params.force_limit
+    towards = rng.uniform(-1, 1, x.shape) * np.concatenate([_REACH, np.ones(x.shape[1] - 8)])
+    u = rng.uniform(-1, 1, (_SEGMENTS, params.action_size)) * params.force_limit
     at_times = rng.uniform(0, task.duration, _SEGMENTS)
     c = np.stack([task.at(c, np.float64(t)) for (_, c), t in zip(starts, at_times, strict=True)])
     share = np.linspace(0, 1, _POINTS)
@@ -37,7 +38,7 @@ def check_formulas(task: Task, params: BallbotParams) -> None:
         "goal": lambda x, u, c: task.goal(x, c),
     }
     for name, method in methods.items():
-        along = _along(task, name, method, c.shape[1])
+        along = _along(task, name, method, x.shape[1], u.shape[1], c.shape[1])
         for k in range(_SEGMENTS):
             values, slopes, bends = np.array(along(x[k], towards[k], u[k], c[k], share[None])).reshape(3, -1, _POINTS)
             start = f"x = {np.round(x[k], 3).tolist()}, c = {np.round(c[k], 3).tolist()}"
@@ -56,9 +57,11 @@ def check_formulas(task: Task, params: BallbotParams) -> None:
                     )
 
 
-def _along(task: Task, name: str, method: Callable[..., tuple[Any, ...]], constants: int) -> casadi.Function:
+def _along(
+    task: Task, name: str, method: Callable[..., tuple[Any, ...]], states: int, forces: int, constants: int
+) -> casadi.Function:
     """From a state, a direction, forces and constants to a method's values, slopes and bends at shares of the line."""
-    x, towards, u = (casadi.SX.sym(name, count) for name, count in (("x", 8), ("towards", 8), ("u", 2)))
+    x, towards, u = (casadi.SX.sym(name, count) for name, count in (("x", states), ("towards", states), ("u", forces)))
     c, s = casadi.SX.sym("c", constants), casadi.SX.sym("s")
     try:
         values = casadi.vertcat(*method(x + s * towards, s * u, c))

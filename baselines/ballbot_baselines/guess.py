@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ballbot_gym import omni
 from ballbot_gym.params import BallbotParams
 
 _SMOOTHING = 0.15  # s: shorter turns of a guessed path are rounded off, because the body cannot follow them
@@ -29,9 +30,10 @@ def along_path(
     theta = np.arctan2(acceleration[:, 1], np.hypot(params.gravity, acceleration[:, 0]))
     lean = np.clip(np.column_stack([gamma, theta]), -1.0, 1.0)
     x = np.column_stack([path, lean, velocity, np.gradient(lean, dt, axis=0)])
+    u = np.clip(params.moving_mass * acceleration[:-1], -params.force_limit, params.force_limit)
+    x, u = omni.with_wheels(params, x, u)
     if start is not None:
         x[0] = start
-    u = np.clip(params.moving_mass * acceleration[:-1], -params.force_limit, params.force_limit)
     return x, u
 
 

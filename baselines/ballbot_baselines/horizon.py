@@ -6,6 +6,7 @@ Where there are more control steps than nodes, the later intervals hold theirs l
 
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import casadi
 import numpy as np
@@ -25,15 +26,32 @@ _LEAST_CURVATURE = 1e-6  # of the cost in every input, because an interval of le
 _RESIDUAL = 1e-4  # of the quadratic program, in states' SI units and fractions of the force
 _QP_ITERATIONS = 30
 
-# Variables of an inner stage: changes of the state and of the input, and the slack of margins and grip.
-_X, _A, _SLACK, _VARIABLES = slice(0, 8), slice(8, 10), 10, 11
-# Its Hessian, one dense block after the other: of the state (8, 8), of the input (2, 2), of the slack.
-_Q, _R, _OF_SLACK, _HESSIAN = slice(0, 64), slice(64, 68), 68, 69
-# Its constraints: the gap to the next state, then the margins, then the limits of the robot's grip.
-_GAP, _LIMITS = slice(0, 8), slice(8, None)
-# Column of a state in the constraints' matrix: −1 in the gap of the stage before, the slopes of the next state, and the
-# slopes of the margins and of the grip.
-_BEFORE, _NEXT, _SLOPES = 0, slice(1, 9), slice(9, None)
+
+class _Places(NamedTuple):
+    """Where things stand in the arrays of an inner stage, for states of n components and inputs of m."""
+
+    # Variables: changes of the state and of the input, and the slack of margins and grip.
+    x: slice
+    a: slice
+    slack: int
+    # Its Hessian, one dense block after the other: of the state (n, n), of the input (m, m), of the slack.
+    q: slice
+    r: slice
+    of_slack: int
+    # Its constraints: the gap to the next state, then the margins, then the limits of the robot's grip.
+    gap: slice
+    limits: slice
+    # Column of a state in the constraints' matrix: −1 in the gap of the stage before, the slopes of the next state, and the
+    # slopes of the margins and of the grip.
+    next: slice
+    slopes: slice
+
+    @classmethod
+    def of(cls, n: int, m: int) -> "_Places":
+        squares, rest = (slice(0, n * n), slice(n * n, n * n + m * m), n * n + m * m), slice(n, None)
+        return cls(
+            slice(0, n), slice(n, n + m), n + m, *squares, slice(0, n), rest, slice(1, n + 1), slice(n + 1, None)
+        )
 
 
 @dataclass(frozen=True)
@@ -95,29 +113,34 @@ class HorizonQp:
     | `curvature` | (N,) | of the friction cone in the inputs, by the multipliers of the last program; 0 before the first |
     """
 
-    def __init__(self, task: Task, rolls: bool, grips: bool, nodes: int):
+    def __init__(self, task: Task, rolls: bool, grips: bool, wheels: bool, nodes: int):
         """Differentiates the stage and builds the solver; compiles on first use on a machine. `set_robot` must follow."""
-        count = len(task.margins((0.0,) * 8, (1.0,) * (len(task.constant_names) + task.clock)))
+        self._states, self._inputs = (11, 3) if wheels else (8, 2)
+        self._at = _Places.of(self._states, self._inputs)
+        count = len(task.margins((0.0,) * self._states, (1.0,) * (len(task.constant_names) + task.clock)))
         self.distinct = np.arange(count)
         self.disturbance: DisturbanceEstimator | None = None
         self.curvature = np.zeros(nodes)
         self._margins = min(count, _MARGINS)
-        self._make_stage(task, rolls, 2 * grips, nodes, count)
+        self._make_stage(task, rolls, 2 * grips, wheels, nodes, count)
         self._make_program(nodes, self._margins, 2 * grips)
 
-    def _make_stage(self, task: Task, rolls: bool, grips: int, n: int, m: int) -> None:
+    def _make_stage(self, task: Task, rolls: bool, grips: int, wheels: bool, n: int, m: int) -> None:
+        states, forces = self._states, self._inputs
+        variables = states + forces
         blocks = -(-n // LANES)  # of intervals; the last one is filled up with zeros
         computed = slice(0, blocks * LANES)
 
         def rows(*shape: int) -> np.ndarray:
             return np.zeros((max(n + 1, computed.stop), *shape))
 
-        numbers = rows(1 + len(robot_names(rolls, grips > 0)))  # an interval's length, and the robot
-        inputs = [rows(8), rows(2), numbers, rows(len(task.constant_names) + task.clock), *([rows()] if grips else [])]
-        outputs = [rows(8), rows(10, 8), rows(10), rows(m), rows(8, m)]
-        outputs += [rows(grips), rows(10, grips)] if grips else []
+        numbers = rows(1 + len(robot_names(rolls, grips > 0, wheels)))  # an interval's length, and the robot
+        c = rows(len(task.constant_names) + task.clock)
+        inputs = [rows(states), rows(forces), numbers, c, *([rows()] if grips else [])]
+        outputs = [rows(states), rows(variables, states), rows(variables), rows(m), rows(states, m)]
+        outputs += [rows(grips), rows(variables, grips)] if grips else []
         self._stage = InPlace(
-            _stage_function(task, rolls, grips > 0).map(blocks),
+            _stage_function(task, rolls, grips > 0, wheels).map(blocks),
             [array[computed] for array in inputs],
             [array[computed] for array in outputs],
         )
@@ -127,21 +150,28 @@ class HorizonQp:
         self._next, self._jacobian, self._gradient, self._margin, self._margin_jacobian, *grip = (
             array[: n + 1] for array in outputs
         )
-        self._grip, self._grip_jacobian = grip if grips else (np.zeros((n + 1, 0)), np.zeros((n + 1, 10, 0)))
+        none = np.zeros((n + 1, 0)), np.zeros((n + 1, variables, 0))
+        self._grip, self._grip_jacobian = grip if grips else none
 
     def _make_program(self, n: int, m: int, grips: int) -> None:
         rows, slack = m + grips, int(grips > 0)  # of the first stage, if there is a grip
-        variables = partial(_Stages, 2 + slack, n - 1, _VARIABLES, 8)
-        constraints = partial(_Stages, 8 + grips, n - 1, 8 + rows, 0)
-        of_states, of_inputs = 8 * (9 + rows), 2 * (8 + grips)  # entries of the constraints' matrix
-        a = _Stages(of_inputs + grips, n - 1, of_states + of_inputs + rows, 8)
-        self._h, self._g, self._z = _Stages(4 + slack, n - 1, _HESSIAN, 64), variables(), variables()
+        at, states, inputs = self._at, self._states, self._inputs
+        variables = partial(_Stages, inputs + slack, n - 1, at.slack + 1, states)
+        constraints = partial(_Stages, states + grips, n - 1, states + rows, 0)
+        # entries of the constraints' matrix
+        of_states, of_inputs = states * (states + 1 + rows), inputs * (states + grips)
+        a = _Stages(of_inputs + grips, n - 1, of_states + of_inputs + rows, states)
+        self._h = _Stages(inputs**2 + slack, n - 1, at.of_slack + 1, states**2)
+        self._g, self._z = variables(), variables()
         self._low, self._high = constraints(), constraints()
         self._lower, self._upper = variables(-np.inf), variables(np.inf)
         self._cost, multipliers = np.zeros(1), constraints()
-        self._grip_multipliers = multipliers.first[8:], multipliers.inner[:, 8 + m :]  # of the last program, ≤ 0
+        self._grip_multipliers = (
+            multipliers.first[states:],
+            multipliers.inner[:, states + m :],
+        )  # of the last program, ≤ 0
         self._program = InPlace(
-            _solver(n, m, grips),
+            _solver(n, m, grips, states, inputs),
             # HPIPM's interface reads every input and writes every output, so all have an array.
             [
                 *(array.all for array in (self._h, self._g, a, self._low, self._high, self._lower, self._upper)),
@@ -149,16 +179,16 @@ class HorizonQp:
             ],
             [self._z.all, self._cost, multipliers.all, variables().all],
         )
-        self._a0 = a.first[:of_inputs].reshape(2, 8 + grips)
-        self._a_x = a.inner[:, :of_states].reshape(n - 1, 8, 9 + rows)
-        self._a_u = a.inner[:, of_states : of_states + of_inputs].reshape(n - 1, 2, 8 + grips)
+        self._a0 = a.first[:of_inputs].reshape(inputs, states + grips)
+        self._a_x = a.inner[:, :of_states].reshape(n - 1, states, states + 1 + rows)
+        self._a_u = a.inner[:, of_states : of_states + of_inputs].reshape(n - 1, inputs, states + grips)
         # what never changes: slacks are ≥ 0 and have a price, margins have no upper limit
-        self._a_x[:, :, _BEFORE], a.last[:] = -1.0, -1.0
+        self._a_x[:, :, 0], a.last[:] = -1.0, -1.0
         a.first[of_inputs:], a.inner[:, of_states + of_inputs :] = 1.0, 1.0
-        self._lower.first[2:], self._lower.inner[:, _SLACK] = 0.0, 0.0
-        self._h.first[4:], self._h.inner[:, _OF_SLACK] = _SLACK_CURVATURE, _SLACK_CURVATURE
-        self._g.first[2:], self._g.inner[:, _SLACK] = _SLACK_PRICE, _SLACK_PRICE
-        self._high.first[_LIMITS], self._high.inner[:, _LIMITS] = np.inf, np.inf
+        self._lower.first[inputs:], self._lower.inner[:, at.slack] = 0.0, 0.0
+        self._h.first[inputs**2 :], self._h.inner[:, at.of_slack] = _SLACK_CURVATURE, _SLACK_CURVATURE
+        self._g.first[inputs:], self._g.inner[:, at.slack] = _SLACK_PRICE, _SLACK_PRICE
+        self._high.first[at.limits], self._high.inner[:, at.limits] = np.inf, np.inf
 
     def set_robot(self, params: BallbotParams) -> None:
         """Sets the robot of the model: one of the kind that the program was made for, which rolls and grips or does not."""
@@ -176,8 +206,8 @@ class HorizonQp:
             slope: (8,) of V at the target.
             target: (8,) state.
         """
-        self._r = r + _LEAST_CURVATURE * np.eye(2)
-        self._h.inner[:, _Q] = q[1:].reshape(-1, 64)
+        self._r = r + _LEAST_CURVATURE * np.eye(self._inputs)
+        self._h.inner[:, self._at.q] = q[1:].reshape(len(q) - 1, -1)
         self._h.last[:] = 2 * p.ravel()
         self._beyond = p, slope, target
 
@@ -187,7 +217,7 @@ class HorizonQp:
         Args:
             margin: least value of the task's margins, in their own units.
         """
-        x, a = self.x, self.a
+        x, a, at, inputs = self.x, self.a, self._at, self._inputs
         self._stage()
         if self.disturbance is not None:
             rates, slopes = self.disturbance.rates(self.x, self.a)
@@ -196,18 +226,18 @@ class HorizonQp:
         if not np.isfinite(self._next).all():
             return False
         self._set_constraints(margin)
-        r = self._r if not self.curvature.any() else self._r + self.curvature[:, None, None] * np.eye(2)
-        self._h.first[:4], self._h.inner[:, _R] = r[0].ravel(), r[1:].reshape(-1, 4)
+        r = self._r if not self.curvature.any() else self._r + self.curvature[:, None, None] * np.eye(inputs)
+        self._h.first[: inputs**2], self._h.inner[:, at.r] = r[0].ravel(), r[1:].reshape(len(r) - 1, -1)
         p, slope, target = self._beyond
-        self._g.first[:2], self._g.inner[:, :_SLACK] = self._gradient[0, _A], self._gradient[1:-1]
+        self._g.first[:inputs], self._g.inner[:, : at.slack] = self._gradient[0, at.a], self._gradient[1:-1]
         self._g.last[:] = slope + 2 * p @ (x[-1] - target)
-        self._lower.first[:2], self._upper.first[:2] = -1 - a[0], 1 - a[0]
-        self._lower.inner[:, _A], self._upper.inner[:, _A] = -1 - a[1:-1], 1 - a[1:-1]
+        self._lower.first[:inputs], self._upper.first[:inputs] = -1 - a[0], 1 - a[0]
+        self._lower.inner[:, at.a], self._upper.inner[:, at.a] = -1 - a[1:-1], 1 - a[1:-1]
         if not (self._program() and self._program.solved and np.isfinite(self._cost[0])):
             return False
-        a[0] += self._z.first[:2]
-        a[1:-1] += self._z.inner[:, _A]
-        x[1:-1] += self._z.inner[:, _X]
+        a[0] += self._z.first[:inputs]
+        a[1:-1] += self._z.inner[:, at.a]
+        x[1:-1] += self._z.inner[:, at.x]
         x[-1] += self._z.last
         if self._grip.shape[1]:
             first, inner = self._grip_multipliers
@@ -216,20 +246,20 @@ class HorizonQp:
         return True
 
     def _set_constraints(self, margin: float) -> None:
-        jacobian, low, high = self._jacobian, self._low, self._high
+        jacobian, low, high, at = self._jacobian, self._low, self._high, self._at
         gaps = self.x[1:] - self._next[:-1]
-        self._a0[:, _GAP] = jacobian[0, _A]
-        self._a_x[:, :, _NEXT], self._a_u[:, :, _GAP] = jacobian[1:-1, _X], jacobian[1:-1, _A]
-        low.first[_GAP] = high.first[_GAP] = gaps[0]
-        low.inner[:, _GAP] = high.inner[:, _GAP] = gaps[1:]
+        self._a0[:, at.gap] = jacobian[0, at.a]
+        self._a_x[:, :, at.next], self._a_u[:, :, at.gap] = jacobian[1:-1, at.x], jacobian[1:-1, at.a]
+        low.first[at.gap] = high.first[at.gap] = gaps[0]
+        low.inner[:, at.gap] = high.inner[:, at.gap] = gaps[1:]
         margins, slopes = self._nearest_margins()
-        limits, of_states = low.inner[:, _LIMITS], self._a_x[:, :, _SLOPES]
+        limits, of_states = low.inner[:, at.limits], self._a_x[:, :, at.slopes]
         limits[:, : self._margins], of_states[:, :, : self._margins] = margin - margins, slopes
         if self._grip.shape[1]:
             grip = self._grip_jacobian
-            self._a0[:, _LIMITS], self._a_u[:, :, _LIMITS] = grip[0, _A], grip[1:-1, _A]
-            low.first[_LIMITS] = -self._grip[0]
-            limits[:, self._margins :], of_states[:, :, self._margins :] = -self._grip[1:-1], grip[1:-1, _X]
+            self._a0[:, at.limits], self._a_u[:, :, at.limits] = grip[0, at.a], grip[1:-1, at.a]
+            low.first[at.limits] = -self._grip[0]
+            limits[:, self._margins :], of_states[:, :, self._margins :] = -self._grip[1:-1], grip[1:-1, at.x]
 
     def _nearest_margins(self) -> tuple[np.ndarray, np.ndarray]:
         """(N−1, m) the least of the inner nodes' distinct margins, and their slopes (N−1, 8, m)."""
@@ -241,22 +271,23 @@ class HorizonQp:
 
 
 @lru_cache(maxsize=16)
-def horizon_qp(task: Task, rolls: bool, grips: bool, nodes: int) -> HorizonQp:
+def horizon_qp(task: Task, rolls: bool, grips: bool, wheels: bool, nodes: int) -> HorizonQp:
     """The program of a task, kind of robot and number of intervals, made once and shared by all controllers."""
-    return HorizonQp(task, rolls, grips, nodes)
+    return HorizonQp(task, rolls, grips, wheels, nodes)
 
 
 @lru_cache(maxsize=16)
-def _stage_function(task: Task, rolls: bool, grips: bool) -> casadi.Function:
+def _stage_function(task: Task, rolls: bool, grips: bool, wheels: bool) -> casadi.Function:
     """(x, a, p, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
 
     It computes `LANES` intervals at once, and matrices are columns. p is the interval's length and the robot's numbers.
 
     Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
     """
-    x, a, p = casadi.SX.sym("x", 8), casadi.SX.sym("a", 2), casadi.SX.sym("p", 1 + len(robot_names(rolls, grips)))
+    x, a = (casadi.SX.sym(name, size) for name, size in zip("xa", (11, 3) if wheels else (8, 2), strict=True))
+    p = casadi.SX.sym("p", 1 + len(robot_names(rolls, grips, wheels)))
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
-    robot, limit = symbolic_robot(rolls, grips, p)
+    robot, limit = symbolic_robot(rolls, grips, p, wheels)
     z, u, h = casadi.vertcat(x, a), limit * a, p[0]
     after = dynamics.step(robot, x, u, h, 2)  # two RK4 steps, as the env takes per control step
     margins = casadi.vertcat(*task.margins(x, c))
@@ -282,16 +313,16 @@ def _stage_function(task: Task, rolls: bool, grips: bool) -> casadi.Function:
     return in_lanes(f"{task.id}-nmpc", (function,))[0]
 
 
-def _solver(n: int, m: int, grips: int) -> casadi.Function:
+def _solver(n: int, m: int, grips: int, states: int, inputs: int) -> casadi.Function:
     """HPIPM for n intervals with m margins and limits of grip at each node."""
-    state, inputs, slack = casadi.Sparsity.dense(8, 8), casadi.Sparsity.dense(2, 2), casadi.Sparsity.dense(1, 1)
+    state, action, slack = (casadi.Sparsity.dense(size, size) for size in (states, inputs, 1))
     first_slack = [slack] if grips else []
     options = {
         "print_time": False,
         "error_on_fail": False,
         "N": n,
-        "nx": [0] + [8] * n,
-        "nu": [2 + len(first_slack)] + [3] * (n - 1) + [0],
+        "nx": [0] + [states] * n,
+        "nu": [inputs + len(first_slack)] + [inputs + 1] * (n - 1) + [0],
         "ng": [grips] + [m + grips] * (n - 1) + [0],
         "hpipm": {
             "mode": "speed_abs",  # a fourth faster, as it computes no residuals; costs agree to 0.03 %
@@ -300,20 +331,21 @@ def _solver(n: int, m: int, grips: int) -> casadi.Function:
             **dict.fromkeys(("res_g_max", "res_b_max", "res_d_max", "res_m_max"), _RESIDUAL),
         },
     }
-    hessian = casadi.diagcat(inputs, *first_slack, *[state, inputs, slack] * (n - 1), state)
-    return casadi.conic("qp", "hpipm", {"h": hessian, "a": _constraint_pattern(n, m, grips)}, options)
+    hessian = casadi.diagcat(action, *first_slack, *[state, action, slack] * (n - 1), state)
+    return casadi.conic("qp", "hpipm", {"h": hessian, "a": _constraint_pattern(n, m, grips, states, inputs)}, options)
 
 
-def _constraint_pattern(n: int, m: int, grips: int) -> casadi.Sparsity:
+def _constraint_pattern(n: int, m: int, grips: int, states: int, inputs: int) -> casadi.Sparsity:
     """Where the constraints' matrix has entries; the constants at the top of this file say their order."""
-    first_rows, first_columns, height = 8 + grips, 2 + (grips > 0), 8 + m + grips
-    present = np.zeros((first_rows + (n - 1) * height, first_columns + (n - 1) * _VARIABLES + 8), bool)
-    present[:first_rows, :2] = present[8:first_rows, 2:first_columns] = True
+    at = _Places.of(states, inputs)
+    first_rows, first_columns, height, width = states + grips, inputs + (grips > 0), states + m + grips, at.slack + 1
+    present = np.zeros((first_rows + (n - 1) * height, first_columns + (n - 1) * width + states), bool)
+    present[:first_rows, :inputs] = present[states:first_rows, inputs:first_columns] = True
     for k in range(n):
-        row, column = first_rows + k * height, first_columns + k * _VARIABLES
+        row, column = first_rows + k * height, first_columns + k * width
         before = row - height if k else 0
-        present[range(before, before + 8), range(column, column + 8)] = True
-        own = present[row : row + height, column : column + _VARIABLES]  # without rows in the last stage
-        own[:, _X] = own[_GAP, _A] = own[8 + m :, _A] = own[8:, _SLACK:] = True
+        present[range(before, before + states), range(column, column + states)] = True
+        own = present[row : row + height, column : column + width]  # without rows in the last stage
+        own[:, at.x] = own[at.gap, at.a] = own[states + m :, at.a] = own[states:, at.slack :] = True
     rows, columns = np.nonzero(present)
     return casadi.Sparsity.triplet(*present.shape, rows.tolist(), columns.tolist())

@@ -9,13 +9,15 @@ from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
+_YAW_WEIGHT = 0.1  # of ψ², ψ̇² and ω_z², SI units, 1/s
+
 
 def linearize(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Linearizes the dynamics about one point.
 
     Args:
         params: the robot.
-        x: (8,) state; order and units in `dynamics.STATE`.
+        x: (8,) state; order and units in `dynamics.STATE`. With wheels it has 11 components, and u has 3.
         u: (2,) ball force, N.
 
     Returns:
@@ -49,24 +51,31 @@ def quadratic_cost(
     to tasks with a clock.
 
     Returns:
-        Q: (n, 8, 8) and R: (n, 2, 2). Mixed terms of x and u are left out; no task has any.
+        Q: (n, 8, 8) and R: (n, 2, 2). Mixed terms of x and u are left out; no task has any. With wheels Q also has a small
+        weight on the heading, which tasks leave free, because LQR has no gain for what it may leave to itself for ever.
     """
-    n = len(x)
-    q, r = _cost_derivatives(task, 2)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, n))
-    return _semidefinite(0.5 * _blocks(q, n)), 0.5 * _blocks(r, n)
+    n, states = np.shape(x)
+    q, r = _cost_derivatives(task, 2, states, np.shape(u)[1])(
+        np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, n)
+    )
+    weights = _semidefinite(0.5 * _blocks(q, n))
+    weights[:, range(8, states), range(8, states)] += _YAW_WEIGHT
+    return weights, 0.5 * _blocks(r, n)
 
 
 def cost_slopes(
     task: Task, x: np.ndarray, u: np.ndarray, c: np.ndarray, t: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The gradient of the task's cost rate with respect to x (n, 8) and to u (n, 2); arguments as of `quadratic_cost`."""
-    along_x, along_u = _cost_derivatives(task, 1)(np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, len(x)))
+    along_x, along_u = _cost_derivatives(task, 1, np.shape(x)[1], np.shape(u)[1])(
+        np.asarray(x).T, np.asarray(u).T, _constants(task, c, t, len(x))
+    )
     return np.array(along_x).T, np.array(along_u).T
 
 
 def goal_weight(task: Task, x: np.ndarray, c: np.ndarray, t: float = 0.0) -> np.ndarray:
     """(8, 8) half the Hessian of the sum of the task's goal functions at x: about 1 per squared tolerance."""
-    return _semidefinite(0.5 * np.array(_goal_hessian(task)(x, _constants(task, c, t, 1)))[None])[0]
+    return _semidefinite(0.5 * np.array(_goal_hessian(task, len(x))(x, _constants(task, c, t, 1)))[None])[0]
 
 
 def _constants(task: Task, c: np.ndarray, t: np.ndarray | float, n: int) -> np.ndarray:
@@ -77,7 +86,7 @@ def _constants(task: Task, c: np.ndarray, t: np.ndarray | float, n: int) -> np.n
 @lru_cache(maxsize=64)  # controllers that estimate their robot come with many
 def _jacobians(params: BallbotParams, dt: float | None) -> casadi.Function:
     """Of the state after a control step of dt, s; of the state's derivative for None."""
-    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
+    x, u = casadi.SX.sym("x", params.state_size), casadi.SX.sym("u", params.action_size)
     held = dt is not None
     out = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt)) if held else dynamics.derivative(params, x, u)
     outputs = [casadi.densify(casadi.jacobian(out, x)), casadi.densify(casadi.jacobian(out, u))]
@@ -85,9 +94,9 @@ def _jacobians(params: BallbotParams, dt: float | None) -> casadi.Function:
 
 
 @cache
-def _cost_derivatives(task: Task, order: int) -> casadi.Function:
+def _cost_derivatives(task: Task, order: int, states: int, forces: int) -> casadi.Function:
     """Gradients (order 1) or Hessians (order 2) of the cost rate with respect to x and to u."""
-    x, u = casadi.SX.sym("x", 8), casadi.SX.sym("u", 2)
+    x, u = casadi.SX.sym("x", states), casadi.SX.sym("u", forces)
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
     cost = task.cost(x, u, c)
     parts = [casadi.gradient(cost, z) if order == 1 else casadi.hessian(cost, z)[0] for z in (x, u)]
@@ -95,8 +104,8 @@ def _cost_derivatives(task: Task, order: int) -> casadi.Function:
 
 
 @cache
-def _goal_hessian(task: Task) -> casadi.Function:
-    x, c = casadi.SX.sym("x", 8), casadi.SX.sym("c", len(task.constant_names) + task.clock)
+def _goal_hessian(task: Task, states: int) -> casadi.Function:
+    x, c = casadi.SX.sym("x", states), casadi.SX.sym("c", len(task.constant_names) + task.clock)
     return casadi.Function("hessian", [x, c], [casadi.densify(casadi.hessian(sum(task.goal(x, c)), x)[0])])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from ballbot_baselines.linearize import cost_slopes, discretize, goal_weight, quadratic_cost
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, omni
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Reference, Task
 
@@ -44,7 +44,7 @@ def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.
         The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first eight observations
         of such a task are the scaled errors of the state. None for every other task.
     """
-    if task.clock:
+    if task.clock or params.wheels is not None:
         return None
     x, c = task.sample(np.random.default_rng(0), params)
     reference = task.reference(x, c, params)
@@ -62,8 +62,9 @@ def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:
 
 def final_weight(task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, t: float = 0.0) -> np.ndarray:
     """(8, 8) cost-to-go at a trajectory's end: LQR's at an equilibrium, else `_GOAL_PRICE` per squared goal tolerance."""
-    if is_equilibrium(params, x, np.zeros(2)):
-        return discrete_lqr(task, params, x, np.zeros(2), c, t)[1]
+    none = np.zeros(params.action_size)
+    if is_equilibrium(params, x, none):
+        return discrete_lqr(task, params, x, none, c, t)[1]
     return _GOAL_PRICE * goal_weight(task, x, c, t)
 
 
@@ -77,7 +78,7 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, p_final:
         r: (n, 2, 2) cost of each step, input part.
         p_final: (8, 8) cost-to-go at the end.
     """
-    k, p = np.zeros((len(a), 2, 8)), np.zeros((len(a), 8, 8))
+    k, p = np.zeros((*b.shape[::2], b.shape[1])), np.zeros(a.shape)
     after = p_final
     for i in reversed(range(len(a))):
         weighted = b[i].T @ after
@@ -128,7 +129,10 @@ def feedforward(
     missed = np.zeros_like(x)
     missed[:-1] = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))[:-1] - x[1:]
     after = [*gains.p[1:], p_final]
-    forces, slope = np.zeros_like(u), np.zeros(8)  # half the slope of the cost-to-go, which is xᵀPx + 2 slopeᵀx
+    forces, slope = (
+        np.zeros_like(u),
+        np.zeros(x.shape[1]),
+    )  # half the slope of the cost-to-go, which is xᵀPx + 2 slopeᵀx
     for i in reversed(range(len(x))):
         slope = slope + after[i] @ missed[i]
         along = dt * of_u[i] / 2 + b[i].T @ slope
@@ -139,9 +143,12 @@ def feedforward(
 
 def closed_gains(task: Task, params: BallbotParams, reference: Reference, c: np.ndarray) -> Gains:
     """LQR around a closed motion: the Riccati recursion goes backwards, round after round, until it is periodic."""
-    gains = Gains(np.zeros((0, 2, 8)), np.eye(8)[None])
+    x, u, dt = reference.x, reference.u, task.control_dt
+    a, b = discretize(params, x, u, dt)
+    q, r = quadratic_cost(task, x, u, c, dt * np.arange(len(x)))
+    gains = Gains(np.zeros((0, u.shape[1], x.shape[1])), np.eye(x.shape[1])[None])
     for _ in range(_MAX_ROUNDS):
-        before, gains = gains, tracking_gains(task, params, reference.x, reference.u, c, gains.p[0])
+        before, gains = gains, riccati(a, b, q * dt, r * dt, gains.p[0])
         if np.allclose(before.p[0], gains.p[0], rtol=1e-6):
             return gains
     raise RuntimeError(f"LQR around the closed motion of {task.id} found no periodic gain in {_MAX_ROUNDS} rounds")
@@ -163,7 +170,9 @@ class LqrController:
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         task, params = self._task, self._params
         self._start = t
-        self.reference = reference = task.reference(x, c, params)
+        found = task.reference(x[:8], c, params)
+        states, forces = omni.with_wheels(params, found.x, found.u)
+        self.reference = reference = replace(found, x=states, u=forces)
         if reference.closed:
             self.gains = closed_gains(task, params, reference, c)
         else:

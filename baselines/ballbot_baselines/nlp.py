@@ -23,10 +23,13 @@ Constraints g, in the order that fatrop needs:
 | at the end | final_path(s_N, p) |
 """
 
+from pathlib import Path
+
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LANES, in_lanes
+from ballbot_baselines.compiled import LANES, SIMD, in_lanes
+from ballbot_gym import codegen
 
 
 class Stage:
@@ -44,7 +47,9 @@ class Stage:
     | `size`, `width`, `params` | lengths of out, of z, and of the p that is taken |
     """
 
-    def __init__(self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, of_stages: bool):
+    def __init__(
+        self, name: str, z: casadi.SX, p: casadi.SX, out: casadi.SX, of_stages: bool, flags: tuple[str, ...] = SIMD
+    ):
         used = max(np.flatnonzero(casadi.which_depends(out, p, 1)) + 1, default=0)
         p = p[:used] if used else casadi.SX.sym("p", 0)
         multipliers = casadi.SX.sym("l", out.shape[0])
@@ -56,10 +61,56 @@ class Stage:
             casadi.Function("jacobian", [z, p], [out, _nonzeros(jacobian)], options),
             casadi.Function("hessian", [z, p, multipliers], [casadi.densify(gradient), _nonzeros(hessian)], options),
         )
-        self.value, self.jacobian, self.hessian = in_lanes(name, functions) if of_stages else functions
+        self.value, self.jacobian, self.hessian = in_lanes(name, functions, flags=flags) if of_stages else functions
         self.size, self.width, self.params = out.shape[0], z.shape[0], p.shape[0]
         self.jacobian_at = _triplets(jacobian)
         self.hessian_at = _triplets(hessian)
+
+
+class RatesStage(Stage):
+    """A stage whose result is the state after RK4 steps of given rates, for rates of so many operations that the steps and
+    their derivatives, written out, would take minutes to compile.
+
+    The chain rule is applied by loops (rk4.c). Without a compiler CasADi applies it.
+    """
+
+    def __init__(self, z: casadi.SX, p: casadi.SX, rates: casadi.SX, steps: int):
+        n, width = rates.shape[0], z.shape[0]
+        used = max(np.flatnonzero(casadi.which_depends(rates, p, 1)) + 1, default=0)
+        p, multipliers = p[:used], casadi.SX.sym("l", n)
+        of_rates = casadi.Function("rates", [z, p], [rates], {"cse": True})
+        z_calls, p_calls, l_calls = (
+            casadi.MX.sym("zpl"[i], part.shape[0]) for i, part in enumerate((z, p, multipliers))
+        )
+        x, w, h = z_calls[:n], z_calls[n:], 1 / steps
+        for _ in range(steps):
+            k1 = of_rates(casadi.vertcat(x, w), p_calls)
+            k2 = of_rates(casadi.vertcat(x + h / 2 * k1, w), p_calls)
+            k3 = of_rates(casadi.vertcat(x + h / 2 * k2, w), p_calls)
+            k4 = of_rates(casadi.vertcat(x + h * k3, w), p_calls)
+            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+        jacobian = casadi.densify(casadi.jacobian(x, z_calls))
+        hessian, gradient = casadi.hessian(casadi.dot(l_calls, x), z_calls)
+        full = casadi.vec(casadi.densify(hessian))
+        functions = (
+            casadi.Function("value", [z_calls, p_calls], [x]),
+            casadi.Function("jacobian", [z_calls, p_calls], [x, casadi.vec(jacobian)]),
+            casadi.Function("hessian", [z_calls, p_calls, l_calls], [casadi.densify(gradient), full]),
+        )
+        inputs = [("z", casadi.vertsplit(z)), ("p", casadi.vertsplit(p))]
+        slopes = casadi.vertsplit(casadi.vec(casadi.densify(casadi.jacobian(rates, z)).T))  # row by row
+        curve = casadi.vertsplit(casadi.vec(casadi.densify(casadi.hessian(casadi.dot(multipliers, rates), z)[0])))
+        of_rates_in_lanes = [
+            codegen.block("rates_jacobian", inputs, [("rate", casadi.vertsplit(rates)), ("slopes", slopes)]),
+            codegen.block("rates_hessian", [*inputs, ("l", casadi.vertsplit(multipliers))], [("curve", curve)]),
+        ]
+        loops = Path(__file__).with_name("rk4.c").read_text(encoding="utf-8")
+        defined = f"#include <string.h>\nenum {{ N = {n}, M = {width - n}, STEPS = {steps} }};"
+        self.value, self.jacobian, self.hessian = in_lanes(
+            "dynamics", functions, "\n".join([defined, *of_rates_in_lanes, loops])
+        )
+        self.size, self.width, self.params = n, width, used
+        self.jacobian_at, self.hessian_at = (_triplets(casadi.SX.ones(rows, width)) for rows in (n, width))
 
 
 class StagedNlp:

@@ -104,8 +104,8 @@ def prepared_plan(
         q=2 * q,
         r=2 * r * params.force_limit**2,
         p=np.concatenate([tracker.gains.p, final_weight(task, params, trajectory.x[-1], c, trajectory.t[-1])[None]]),
-        slopes=np.concatenate([np.zeros((1, 8)), plan.costates]),
-        sums=np.concatenate([np.zeros((1, 2)), np.cumsum(trajectory.u, axis=0)]) / params.force_limit,
+        slopes=np.concatenate([np.zeros((1, params.state_size)), plan.costates]),
+        sums=np.concatenate([np.zeros((1, params.action_size)), np.cumsum(trajectory.u, axis=0)]) / params.force_limit,
         distinct=np.unique(margins, axis=1, return_index=True)[1],  # unused obstacles repeat others
     )
 
@@ -160,7 +160,7 @@ class NmpcController:
                 )
         self._grid = Grid.make(steps, min(nodes or (steps if params.grips else _NODES), steps))
         self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
-        self._qp = horizon_qp(task, params.rolls, params.grips, len(self._grid.lengths))
+        self._qp = horizon_qp(task, params.rolls, params.grips, params.wheels is not None, len(self._grid.lengths))
         self.plan: Optimum | None = None
         self.predicted: np.ndarray | None = None
         self.disturbance: DisturbanceEstimator | None = None
@@ -169,7 +169,7 @@ class NmpcController:
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         c, self.disturbance = np.asarray(c, np.float64), None
         for _ in range(self._delay):  # before the first force acts there is none
-            x = self._moved(x, np.zeros(2))
+            x = self._moved(x, np.zeros(self._params.action_size))
         begins = t + self._delay * self._task.control_dt
         self.start(t, c, prepared_plan(self._task, self._params, x, c, self.backoff, begins))
 
@@ -178,7 +178,7 @@ class NmpcController:
         self._c, self._lost = np.asarray(c, np.float64), False
         self.disturbance = DisturbanceEstimator(self._params.force_limit) if self._offset_free else None
         self._before: tuple[np.ndarray, np.ndarray] | None = None
-        self._commanded = [np.zeros(2)] * self._delay
+        self._commanded = [np.zeros(self._params.action_size)] * self._delay
         self._follow(t, prepared)
 
     def adapt(self, params: BallbotParams) -> None:
@@ -192,7 +192,8 @@ class NmpcController:
         prepared.tracker.reset(t, self._trajectory.x[0], self._c)
         self._length, self._step = len(self._trajectory.u), 0
         nodes = len(self._grid.lengths)
-        self._dx, self._da = np.zeros((nodes + 1, 8)), np.zeros((nodes, 2))
+        robot = self._params
+        self._dx, self._da = np.zeros((nodes + 1, robot.state_size)), np.zeros((nodes, robot.action_size))
         self._curvature = np.zeros(nodes)
         self._reserve = self._reserve_of_grip()
 

@@ -20,7 +20,8 @@ import casadi
 import numpy as np
 import scipy.linalg
 
-from ballbot_baselines.nlp import Stage, StagedNlp
+from ballbot_baselines.compiled import LONG, SIMD
+from ballbot_baselines.nlp import RatesStage, Stage, StagedNlp
 
 StageFunction = Callable[[casadi.SX, casadi.SX, casadi.SX], casadi.SX]
 FinalFunction = Callable[[casadi.SX, casadi.SX], casadi.SX]
@@ -68,6 +69,9 @@ class Ocp:
     """(s, p) -> (mi,), each ≥ 0."""
     counts_stages: bool = False
     """Whether p of every function has one entry more, at its end: the stage's number k, and N at the end."""
+    rates: StageFunction | None = None
+    """(s, w, p) -> (states,) where `next` is `rk4_steps` RK4 steps of these over a time of 1; see `nlp.RatesStage`."""
+    rk4_steps: int = 1
     initial_matrix: np.ndarray | None = None
     """(mo, states): linear equalities between the components of s_0, as periodic problems have."""
 
@@ -80,9 +84,13 @@ class Ocp:
         z, path = casadi.vertcat(s, w), casadi.vertcat(equal, self.inequalities(s, w, p))
         final_path = casadi.vertcat(final_equal, self.final_inequalities(s, p))
         costs, final_costs = casadi.vertcat(self.cost(s, w, p), path), casadi.vertcat(self.final_cost(s, p), final_path)
+        if self.rates is None:
+            dynamics = Stage("dynamics", z, p, casadi.densify(casadi.SX(self.next(s, w, p))), of_stages=True)
+        else:
+            dynamics = RatesStage(z, p, casadi.densify(self.rates(s, w, p)), self.rk4_steps)
         return Stages(
-            dynamics=Stage("dynamics", z, p, casadi.densify(casadi.SX(self.next(s, w, p))), of_stages=True),
-            running=Stage(self.name, z, p, casadi.densify(costs), of_stages=True),
+            dynamics=dynamics,
+            running=Stage(self.name, z, p, casadi.densify(costs), of_stages=True, flags=LONG if self.rates else SIMD),
             final=Stage(f"{self.name}-final", s, p, casadi.densify(final_costs), of_stages=False),
             equalities=equal.shape[0],
             final_equalities=final_equal.shape[0],

@@ -96,7 +96,7 @@ def find_optimum(
     Args:
         task: the problem, or its name in `TASKS`.
         params: the robot, or its name in `ROBOTS`.
-        x0: (8,) initial state, m, rad, m/s, rad/s; order in `dynamics.STATE`.
+        x0: (8,) initial state, m, rad, m/s, rad/s; order in `dynamics.STATE`; (11,) with wheels.
         c: (nc,) constants of the episode, named in the task's `constant_names`; (0,) where it has none.
         backoff: distance kept from limits; none for the true optimum.
         guesses: how many of the task's guessed paths to solve at most. For a slalom all choices of sides are considered, and
@@ -114,7 +114,7 @@ def find_optimum(
         ValueError: no task or robot of that name, or x0 or c has another shape or is not finite.
     """
     task, params = make_task(task, params), checked_robot(params)
-    x0, c = finite_array(x0, (8,), "x0"), finite_array(c, (len(task.constant_names),), "c")
+    x0, c = finite_array(x0, (params.state_size,), "x0"), finite_array(c, (len(task.constant_names),), "c")
     episode = Shooting(task, params, x0, c, backoff, start)
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     tried = search(episode, guesses, paths)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_baselines import guess
-from ballbot_gym import dynamics, ops
+from ballbot_gym import dynamics, omni, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -56,6 +56,8 @@ def righted(
     gains = np.array([(*loops, *a) for *loops, a in itertools.product(_LEAN_BANDWIDTHS, _TIME_CONSTANTS, aside)]).T
     target = task.reference(x0, c, params).x[-1, :2] if _has_point(task, x0, c, params) else np.array(x0[:2])
     with np.errstate(all="ignore"):  # members that fall may overflow, and are left out
+        if params.wheels is not None:
+            force = omni.LEAST_FORCE * force
         if params.grips:
             force = min(force, _GRIPPING * params.friction * params.weight)
         x, u = simulate(params, x0, gains, target, task.steps, task.control_dt, force)
@@ -116,11 +118,13 @@ def simulate(
     """
     bandwidth, seconds, lean, fade = gains
     aside = leaning_aside(x0, lean)
-    x = np.array(np.broadcast_to(np.asarray(x0, np.float64), (gains.shape[1], 8)))
+    x = np.array(np.broadcast_to(np.asarray(x0, np.float64), (gains.shape[1], params.state_size)))
     states, forces = [x], []
     for k in range(steps):
         leaning = aside * np.exp(-k * dt / fade)
         u = np.stack(steering(params, tuple(x.T), leaning, bandwidth, seconds, target, force), -1)
+        if params.wheels is not None:
+            u = omni.wheel_forces(params, x, u).clip(-params.force_limit, params.force_limit)
         forces.append(u)
         x = dynamics.step(params, x, u, dt, dynamics.substeps_for(dt))
         states.append(x)

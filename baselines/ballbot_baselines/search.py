@@ -187,7 +187,7 @@ def _simulated(episode: Shooting, member: righting.Member) -> OcpSolution:
         iterations=0,
         seconds=0.0,
         solver="simulation",
-        costates=np.zeros((len(member.u), 8)),
+        costates=np.zeros((len(member.u), params.state_size)),
     )
 
 

@@ -8,7 +8,7 @@ Solvers see actions, which are forces divided by their limit.
 """
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -19,6 +19,7 @@ from ballbot_baselines import guess
 from ballbot_baselines.formulas import check_formulas
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
+from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number
 from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.tasks import Task
@@ -32,7 +33,7 @@ FREE_TIME_INTERVALS = 60
 """Of a first-exit task whose time is free."""
 
 _MOST_ITERATIONS = 200
-_checked: set[tuple[Task, bool, bool]] = set()
+_checked: set[tuple[Task, bool, bool, bool]] = set()
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,9 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
     return _ocp(*kind_of(task, params))
 
 
-def kind_of(task: Task, params: BallbotParams) -> tuple[Task, bool, bool]:
-    """What solvers are made for: a task whose formulas they can use, and whether the ball rolls and the robot has to grip."""
-    kind = task, params.rolls, params.grips
+def kind_of(task: Task, params: BallbotParams) -> tuple[Task, bool, bool, bool]:
+    """What solvers are made for: a task whose formulas they can use, whether the ball rolls, has to grip, and has wheels."""
+    kind = task, params.rolls, params.grips, params.wheels is not None
     if kind not in _checked:
         check_formulas(task, params)
         _checked.add(kind)
@@ -91,10 +92,10 @@ def kind_of(task: Task, params: BallbotParams) -> tuple[Task, bool, bool]:
 
 
 @lru_cache(maxsize=64)
-def _ocp(task: Task, rolls: bool, grips: bool) -> Ocp:
-    nr = len(robot_names(rolls, grips))
+def _ocp(task: Task, rolls: bool, grips: bool, wheels: bool) -> Ocp:
+    nr = len(robot_names(rolls, grips, wheels))
     nc = len(task.constant_names)
-    robot = partial(symbolic_robot, rolls, grips)
+    robot = partial(symbolic_robot, rolls, grips, wheels=wheels)
 
     def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
         return casadi.vertcat(*task.margins(x, _constants(task, nr, p, p[0]))) - p[1 + nr + nc]
@@ -110,16 +111,19 @@ def _ocp(task: Task, rolls: bool, grips: bool) -> Ocp:
         room = (1 - p[2 + nr + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, _constants(task, nr, p, p[0])))
         return casadi.vertcat(margins(x, p), room)
 
+    substeps = dynamics.substeps_for(task.control_dt)
     return Ocp(
         name=task.id,
-        states=8,
-        inputs=2,
+        states=11 if wheels else 8,
+        inputs=3 if wheels else 2,
         params=1 + nr + nc + 2 + grips + task.clock,
         counts_stages=task.clock,
-        next=lambda x, a, p: _after(robot(p), x, a, p[0], dynamics.substeps_for(task.control_dt)),
+        next=lambda x, a, p: _after(robot(p), x, a, p[0], substeps),
         cost=lambda x, a, p: task.cost(x, robot(p)[1] * a, _constants(task, nr, p, p[0])) * p[0],
         inequalities=path if grips else lambda x, a, p: margins(x, p),
         final_inequalities=final,
+        rates=(lambda x, a, p: _rates(robot(p), x, a, p[0])) if wheels else None,
+        rk4_steps=substeps,
     )
 
 
@@ -135,28 +139,38 @@ def shooting_parameters(
 
 
 def robot_numbers(params: BallbotParams) -> list[float]:
-    """What problems need to know of a robot, besides whether its ball rolls and whether it has to grip."""
-    return [getattr(params, name) for name in robot_names(params.rolls, params.grips)]
+    """What problems need to know of a robot, besides whether its ball rolls, whether it has to grip, and has wheels."""
+    wheels = params.wheels
+    names = robot_names(params.rolls, params.grips)
+    return [getattr(params, name) for name in names] + (
+        [] if wheels is None else [params.ball_inertia, *astuple(wheels)]
+    )
 
 
-def robot_names(rolls: bool, grips: bool) -> list[str]:
-    """Fields of a robot of this kind that `robot_numbers` gives."""
+def robot_names(rolls: bool, grips: bool, wheels: bool = False) -> list[str]:
+    """Fields of a robot of this kind, and of its wheels, that `robot_numbers` gives."""
     names = ["total_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "force_limit"]
-    return names + ["moving_mass", "ball_radius"] * rolls + ["friction"] * grips
+    names += ["moving_mass", "ball_radius"] * rolls + ["friction"] * grips
+    return names + ["ball_inertia", *(field.name for field in fields(Wheels))] * wheels
 
 
-def symbolic_robot(rolls: bool, grips: bool, p: casadi.SX) -> tuple[Any, casadi.SX]:
+def symbolic_robot(rolls: bool, grips: bool, p: casadi.SX, wheels: bool = False) -> tuple[Any, casadi.SX]:
     """A robot of this kind, whose numbers stand in p after the length of a step, and its force limit."""
-    found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(robot_names(rolls, grips))}
-    limit = found.pop("force_limit")
+    found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(robot_names(rolls, grips, wheels))}
+    own = Wheels(*(found.pop(field.name) for field in fields(Wheels))) if wheels else None
     weight = found["total_mass"] * found["gravity"]
     numbers = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight} | found
-    return ModelNumbers(**numbers, rolls=rolls, grips=grips), limit
+    return ModelNumbers(**numbers, rolls=rolls, grips=grips, wheels=own), found["force_limit"]
 
 
 def _after(robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX, substeps: int) -> casadi.SX:
     numbers, limit = robot
     return dynamics.step(numbers, x, limit * a, length, substeps)
+
+
+def _rates(robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX) -> casadi.SX:
+    numbers, limit = robot
+    return length * dynamics.derivative(numbers, x, limit * a)
 
 
 def _constants(task: Task, nr: int, p: casadi.SX, h: casadi.SX) -> casadi.SX:
@@ -188,12 +202,12 @@ def shooting_solver(
 
 
 @lru_cache(maxsize=256)
-def _solver(task: Task, rolls: bool, grips: bool, steps: int, *options: Any) -> OcpSolver:
-    return OcpSolver(_ocp(task, rolls, grips), steps, *options)
+def _solver(task: Task, rolls: bool, grips: bool, wheels: bool, steps: int, *options: Any) -> OcpSolver:
+    return OcpSolver(_ocp(task, rolls, grips, wheels), steps, *options)
 
 
 def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolver:
-    """A solver of a first-exit task over intervals of one free length h, the ninth state. It tells roughly when to arrive.
+    """A solver of a first-exit task over intervals of one free length h, the last state. It tells roughly when to arrive.
 
     Made once for all robots of a kind.
     """
@@ -201,21 +215,23 @@ def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolve
 
 
 @lru_cache(maxsize=8)
-def _free_time_solver(task: Task, rolls: bool, grips: bool, solver: str) -> OcpSolver:
-    fixed, nr = _ocp(task, rolls, grips), len(robot_names(rolls, grips))
-    robot = partial(symbolic_robot, rolls, grips)
+def _free_time_solver(task: Task, rolls: bool, grips: bool, wheels: bool, solver: str) -> OcpSolver:
+    fixed, nr = _ocp(task, rolls, grips, wheels), len(robot_names(rolls, grips, wheels))
+    robot, n = partial(symbolic_robot, rolls, grips, wheels=wheels), fixed.states
 
     def with_length(s: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(s[8], p[1:]) if task.clock else p  # the length is also what the stage's time is found by
+        return casadi.vertcat(s[n], p[1:]) if task.clock else p  # the length is also what the stage's time is found by
 
     ocp = replace(
         fixed,
         name=f"{task.id}-free-time",
-        states=9,
-        next=lambda s, a, p: casadi.vertcat(_after(robot(p), s[:8], a, s[8], 2), s[8]),
-        cost=lambda s, a, p: task.cost(s[:8], robot(p)[1] * a, _constants(task, nr, p, s[8])) * s[8],
-        inequalities=lambda s, a, p: fixed.inequalities(s[:8], a, with_length(s, p)),
-        final_inequalities=lambda s, p: fixed.final_inequalities(s[:8], with_length(s, p)),
+        states=n + 1,
+        next=lambda s, a, p: casadi.vertcat(_after(robot(p), s[:n], a, s[n], 2), s[n]),
+        cost=lambda s, a, p: task.cost(s[:n], robot(p)[1] * a, _constants(task, nr, p, s[n])) * s[n],
+        inequalities=lambda s, a, p: fixed.inequalities(s[:n], a, with_length(s, p)),
+        final_inequalities=lambda s, p: fixed.final_inequalities(s[:n], with_length(s, p)),
+        rates=(lambda s, a, p: casadi.vertcat(_rates(robot(p), s[:n], a, s[n]), 0)) if wheels else None,
+        rk4_steps=2,
     )
     return OcpSolver(ocp, FREE_TIME_INTERVALS, solver, _tolerance(grips))
 
@@ -283,11 +299,11 @@ class Shooting:
         The search begins at the arrival of a solution with a free interval length, and goes both ways while the cost falls.
         """
         most = self.task.steps
-        arrival = relaxed.states[0, 8] * FREE_TIME_INTERVALS / self.task.control_dt
+        arrival = relaxed.states[0, -1] * FREE_TIME_INTERVALS / self.task.control_dt
         steps = min(max(1, math.ceil(arrival)), most)
 
         def arriving(steps: int) -> list[OcpSolution]:
-            return self.solve_to_the_end(*_resampled(relaxed.states[:, :8], relaxed.inputs, steps), near=True)
+            return self.solve_to_the_end(*_resampled(relaxed.states[:, :-1], relaxed.inputs, steps), near=True)
 
         groups = {steps: arriving(steps)}
         for direction in (-1, 1):
@@ -306,7 +322,7 @@ class Shooting:
             solver = free_time_solver(self.task, self.params, name)
             bounds = self._bounds(solver, x[0], n)
             longest = self.task.duration / n
-            bounds.state_lower[:, 8], bounds.state_upper[:, 8] = min(self.task.control_dt / 4, longest), longest
+            bounds.state_lower[:, -1], bounds.state_upper[:, -1] = min(self.task.control_dt / 4, longest), longest
             solution = solver.solve(np.column_stack([x, np.full(n + 1, h)]), a, bounds, self._parameters())
             if solution.is_optimal:
                 break
@@ -314,7 +330,7 @@ class Shooting:
 
     def _bounds(self, solver: OcpSolver, x0: np.ndarray, n: int) -> Bounds:
         bounds, force = Bounds.free(solver.ocp, n), self.backoff.force
-        bounds.state_lower[0, :8] = bounds.state_upper[0, :8] = x0
+        bounds.state_lower[0, : len(x0)] = bounds.state_upper[0, : len(x0)] = x0
         bounds.input_lower[:], bounds.input_upper[:] = force - 1, 1 - force
         return bounds
 

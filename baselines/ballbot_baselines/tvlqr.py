@@ -40,7 +40,8 @@ class TvlqrController:
         self.x, self.u = _sampled(trajectory, dt)
         a, b = discretize(params, self.x, self.u, dt)
         n = len(self.x)
-        self.gains = riccati(a, b, np.broadcast_to(q, (n, 8, 8)), np.broadcast_to(r, (n, 2, 2)), p_final)
+        q, r = (np.broadcast_to(weight, (n, *np.shape(weight)[-2:])) for weight in (q, r))
+        self.gains = riccati(a, b, q, r, p_final)
         self._end, self._end_gain = trajectory.x[-1], self.gains.k[-1] if end_gain is None else end_gain
         self._dt, self._start = dt, 0.0
 
@@ -55,8 +56,9 @@ class TvlqrController:
         c, dt, end = np.asarray(c, np.float64), task.control_dt, trajectory.x[-1]
         x, u = _sampled(trajectory, dt)
         q, r = quadratic_cost(task, x, u, c, trajectory.t[0] + dt * np.arange(len(x)))
-        rest = is_equilibrium(params, end, np.zeros(2))
-        end_gain = discrete_lqr(task, params, end, np.zeros(2), c, trajectory.t[-1])[0] if rest else None
+        none = np.zeros(params.action_size)
+        rest = is_equilibrium(params, end, none)
+        end_gain = discrete_lqr(task, params, end, none, c, trajectory.t[-1])[0] if rest else None
         return cls(
             params, trajectory, dt, q * dt, r * dt, final_weight(task, params, end, c, trajectory.t[-1]), end_gain
         )
@@ -69,7 +71,8 @@ class TvlqrController:
 
         Uniform motion upright linearizes like standing, so both end with LQR's cost-to-go.
         """
-        a, b = (matrix[0] for matrix in discretize(params, np.zeros((1, 8)), np.zeros((1, 2)), dt))
+        upright = np.zeros((1, params.state_size)), np.zeros((1, params.action_size))
+        a, b = (matrix[0] for matrix in discretize(params, *upright, dt))
         p = scipy.linalg.solve_discrete_are(a, b, q * dt, r * dt)
         gain = np.linalg.solve(r * dt + b.T @ p @ b, b.T @ p @ a)
         return cls(params, trajectory, dt, q * dt, r * dt, p, gain)
@@ -95,10 +98,12 @@ def tube_gains(task: Task, params: BallbotParams, trajectory: Trajectory, c: np.
     q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
     end, h = trajectory.x[-1], 1e-5
     goal = np.array(task.goal(end, c), np.float64)
-    slopes = np.array([np.subtract(task.goal(end + d, c), task.goal(end - d, c)) / (2 * h) for d in h * np.eye(8)])
+    slopes = np.array(
+        [np.subtract(task.goal(end + d, c), task.goal(end - d, c)) / (2 * h) for d in h * np.eye(len(end))]
+    )
     active = slopes[:, goal > goal.max() - _ACTIVE]
     dt = task.control_dt
-    return TvlqrController(params, trajectory, dt, q * dt, r * dt, active @ active.T + 1e-3 * np.eye(8)).gains.k
+    return TvlqrController(params, trajectory, dt, q * dt, r * dt, active @ active.T + 1e-3 * np.eye(len(end))).gains.k
 
 
 def _sampled(trajectory: Trajectory, dt: float) -> tuple[np.ndarray, np.ndarray]:
