@@ -138,15 +138,16 @@ def held_contact(
 ) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
     """The floor's force, as `contact`, when force u begins in state x and after it was held for so many seconds.
 
-    The leans at the end are extrapolated with their accelerations, so that nothing is integrated for them; with wheels at
-    their rates alone, because derivatives of accelerations at extrapolated states are too long to compile. In between, a
-    force that is held while the robot falls or rises needs up to twice the friction that it needs at first.
+    The leans at the end are extrapolated with their accelerations, so that nothing is integrated for them. In between, a
+    force that is held while the robot falls or rises needs up to twice the friction that it needs at first. With wheels the
+    end counts as the beginning does, because the derivatives of both together take minutes to compile.
     """
-    _, _, gamma, theta, vx, vy, gamma_dot, theta_dot, *turning = parts = ops.components(x)
-    acceleration = accelerations(params, x, u)
-    _, _, gamma_ddot, theta_ddot, *_ = acceleration
     if params.wheels is not None:
-        gamma_ddot = theta_ddot = 0.0
+        begin = contact(params, x, u)
+        return begin, begin
+    _, _, gamma, theta, vx, vy, gamma_dot, theta_dot = parts = ops.components(x)
+    acceleration = accelerations(params, x, u)
+    *_, gamma_ddot, theta_ddot = acceleration
     end = ops.stack(
         (
             *parts[:2],
@@ -156,7 +157,6 @@ def held_contact(
             vy,
             gamma_dot + hold * gamma_ddot,
             theta_dot + hold * theta_ddot,
-            *turning,
         ),
         like=x,
     )
@@ -176,7 +176,8 @@ def limits(params: BallbotParams, x: Vector, u: Vector, backoff: Any = 0.0, hold
     """
     if not params.grips:
         return ()
-    forces = (contact(params, x, u),) if hold is None else held_contact(params, x, u, hold)
+    both = hold is not None and params.wheels is None
+    forces = held_contact(params, x, u, hold) if both else (contact(params, x, u),)
     return tuple([limit for force in forces for limit in grip_limits(params, force, backoff)])
 
 

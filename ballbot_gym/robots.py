@@ -193,14 +193,15 @@ register_robot(
     },
     about="Kugle V1 of Aalborg University, by its published numbers",
 )
+_HEADING = {"heading_weight": 1.0}  # 1/s: with a free heading it pays to spin, which is far from linear
 register_robot(
     "omni",
     OMNI_URDF_PATH,
     {
-        "stabilize": {"start_position": 1.0, "start_speed": 1.0, "start_lean": 0.1, "start_lean_rate": 0.2},
-        "turn": {"min_speed": 0.5, "max_speed": 1.5},
-        "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15},
-        "weave": {"ball_radius": 0.129},
+        "stabilize": {"start_position": 1.0, "start_speed": 1.0, "start_lean": 0.1, "start_lean_rate": 0.2} | _HEADING,
+        "turn": {"min_speed": 0.5, "max_speed": 1.5} | _HEADING,
+        "orbit": {"min_steady_tilt": 0.05, "max_steady_tilt": 0.15} | _HEADING,
+        "weave": {"ball_radius": 0.129} | _HEADING,
     },
     about="Kugle V1 with its three omni-wheels and motors: it yaws, and its torque falls with speed",
 )
@@ -208,10 +209,10 @@ register_robot(
     "omni_strong",
     URDF_FOLDER / "omni_strong.urdf",
     {
-        "stabilize": {"start_position": 1.0, "start_speed": 2.0, "start_lean": 0.3, "start_lean_rate": 0.5},
-        "turn": {"min_speed": 1.0, "max_speed": 4.0},
-        "orbit": {"max_steady_tilt": 0.52},
-        "weave": {"ball_radius": 0.129},
+        "stabilize": {"start_position": 1.0, "start_speed": 2.0, "start_lean": 0.3, "start_lean_rate": 0.5} | _HEADING,
+        "turn": {"min_speed": 1.0, "max_speed": 4.0} | _HEADING,
+        "orbit": {"max_steady_tilt": 0.52} | _HEADING,
+        "weave": {"ball_radius": 0.129} | _HEADING,
     },
     about="the same with motors for leans of 30°",
 )

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -60,6 +60,9 @@ class Task(ABC):
     survival_reward: float = 100.0
     """Paid for every second lived, 1/s: more than nearly every motion in the arena costs."""
 
+    heading_weight: float = field(default=0.0, repr=False)
+    """Of 2 (1 − cos ψ), which is ψ² near 0, of robots with wheels, which yaw, 1/s."""
+
     id: ClassVar[str]
     """Gymnasium id."""
     observation_scale: ClassVar[tuple[float, ...]]
@@ -93,15 +96,15 @@ class Task(ABC):
     """Bounds of observations hold while no constant of the episode exceeds this, m or m/s."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not isinstance(field.default, float):
+        for each in fields(self):
+            if not isinstance(each.default, float):
                 continue
-            value = getattr(self, field.name)
+            value = getattr(self, each.name)
             if not is_number(value):
-                raise ValueError(f"{type(self).__name__}: {field.name} must be a number, not {value!r}")
-            if not is_positive(value):
-                raise ValueError(f"{type(self).__name__}: {field.name} must be positive and finite, not {value}")
-            object.__setattr__(self, field.name, float(value))  # so that 8 and 8.0 are the same task
+                raise ValueError(f"{type(self).__name__}: {each.name} must be a number, not {value!r}")
+            if not is_positive(value) and not (each.name == "heading_weight" and value == 0):
+                raise ValueError(f"{type(self).__name__}: {each.name} must be positive and finite, not {value}")
+            object.__setattr__(self, each.name, float(value))  # so that 8 and 8.0 are the same task
         if not 0.5 <= self.duration / self.control_dt <= MAX_STEPS:
             raise ValueError(
                 f"duration {self.duration} s must be 1 to {MAX_STEPS:,} control steps of {self.control_dt} s"
@@ -131,6 +134,7 @@ class Task(ABC):
     def problem(self) -> str:
         """The task's name and the fields that define its optima: tells whether an optimum or a policy belongs to a task."""
         named = (f.name for f in fields(self) if f.name not in self.NOT_THE_PROBLEM)
+        named = (name for name in named if name != "heading_weight" or self.heading_weight)  # as before there was one
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in named)})"
 
     def at(self, c: Vector, time: Any) -> Vector:
@@ -231,6 +235,11 @@ class Task(ABC):
     def observation_size(self, params: BallbotParams) -> int:
         """Numbers that a robot observes."""
         return len(self.observation_scale) + (0 if params.wheels is None else 4)
+
+    def heading_cost(self, x: Vector) -> Any:
+        """Part of the cost rate, 1/s, by which tasks hold the heading of a robot that yaws."""
+        yaw = ops.components(x)[8:9] if self.heading_weight else ()
+        return self.heading_weight * 2 * (1 - ops.cos(yaw[0])) if yaw else 0.0
 
     def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         """What optimizers keep ≥ 0. Every task has the tilt limit; obstacles add theirs."""

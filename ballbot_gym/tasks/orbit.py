@@ -149,6 +149,7 @@ class Orbit(Task):
             + self.velocity_weight * squared(vx_error, vy_error)
             + self.lean_rate_weight * squared(gamma_dot, theta_dot)
             + self.effort_weight * squared(*ops.components(u))
+            + self.heading_cost(x)
         )
 
     def arena(self, c: Vector) -> tuple[Any, Any, Any]:

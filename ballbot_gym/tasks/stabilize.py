@@ -107,6 +107,7 @@ class Stabilize(Task):
             self.position_weight * squared(px, py)
             + self.rest_weight * squared(*rest)
             + self.effort_weight * squared(*ops.components(u))
+            + self.heading_cost(x)
         )
 
     def arena(self, c: Vector) -> tuple[Any, Any, Any]:

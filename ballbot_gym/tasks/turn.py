@@ -124,6 +124,7 @@ class Turn(Task):
             self.time_weight
             + self.lean_weight * squared(gamma, theta, gamma_dot, theta_dot)
             + self.effort_weight * squared(*ops.components(u))
+            + self.heading_cost(x)
         )
 
     def arena(self, c: Vector) -> tuple[Any, Any, Any]:

@@ -150,6 +150,7 @@ class Weave(Task):
             self.position_weight * squared(px - x_goal, py - y_goal)
             + self.rest_weight * squared(*rest)
             + self.effort_weight * squared(*ops.components(u))
+            + self.heading_cost(x)
         )
 
     def margins(self, x: Vector, c: Vector) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LANES, InPlace, in_lanes
+from ballbot_baselines.compiled import LANES, LONG, SIMD, InPlace, in_lanes
 from ballbot_baselines.disturbance import DisturbanceEstimator
 from ballbot_baselines.shooting import robot_names, robot_numbers, symbolic_robot
 from ballbot_gym import dynamics
@@ -310,7 +310,7 @@ def _stage_function(task: Task, rolls: bool, grips: bool, wheels: bool) -> casad
         grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT
         outputs += [grip, casadi.vec(casadi.densify(casadi.jacobian(grip, z)))]
     function = casadi.Function("stage", inputs, outputs, {"cse": True})
-    return in_lanes(f"{task.id}-nmpc", (function,))[0]
+    return in_lanes(f"{task.id}-nmpc", (function,), flags=LONG if wheels else SIMD)[0]
 
 
 def _solver(n: int, m: int, grips: int, states: int, inputs: int) -> casadi.Function:
