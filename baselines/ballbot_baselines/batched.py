@@ -84,8 +84,8 @@ class BatchOptima:
 
 
 def solves(task: Task, params: BallbotParams) -> bool:
-    """Whether `find_optima` can solve this task here: C code can be compiled, it has all operations of the task, and the task
-    has no clock.
+    """Whether `find_optima` can solve this task here: C code can be compiled, it has all operations of the task, the task has
+    no clock, and the robot no wheels.
     """
     try:
         ilqr(task, params)

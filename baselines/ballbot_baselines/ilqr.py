@@ -295,6 +295,8 @@ def ilqr(task: Task, params: BallbotParams, free_time: bool = False) -> Ilqr:
     """The solver, made once."""
     if task.clock:
         raise NotImplementedError(f"{task.id} has a clock, which batches of optima do not know; use find_optimum")
+    if params.wheels is not None:
+        raise NotImplementedError("many optima at once know no robot with wheels; find_optimum solves them one by one")
     return Ilqr(task, params, free_time)
 
 
