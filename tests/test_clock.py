@@ -76,7 +76,7 @@ def test_a_step_costs_what_it_costs_at_its_beginning_and_is_judged_at_its_end(ta
 
 def test_machine_code_of_a_single_env_computes_the_bits_of_python(task, params):
     deadline = time.monotonic() + 30
-    while (code := Judge.made(task, start=True)) is None and time.monotonic() < deadline:
+    while (code := Judge.made(task, params, start=True)) is None and time.monotonic() < deadline:
         time.sleep(0.01)
     assert code is not None
     x, c = task.sample(np.random.default_rng(1), params)
