@@ -20,6 +20,7 @@ from ballbot_train.console import (
     check_least,
     console,
     physics_or_default,
+    print_rows,
     print_table,
     progress_bars,
 )
@@ -186,19 +187,18 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
         key=lambda entry: entry.success,
     )
     if weakest:
-        header = ["range with the least success", "", "episodes", "success", "failures", "mean cost"]
         rows = [
-            [
-                entry.measure,
-                f"{entry.low:.4g}" if entry.low == entry.high else f"{entry.low:.4g} to {entry.high:.4g}",
-                f"{entry.episodes}",
-                f"{entry.success:.1%}",
-                f"{entry.failures}",
-                f"{entry.cost_mean:.1f}",
-            ]
+            {
+                "range with the least success": entry.measure,
+                "": f"{entry.low:.4g}" if entry.low == entry.high else f"{entry.low:.4g} to {entry.high:.4g}",
+                "episodes": f"{entry.episodes}",
+                "success": f"{entry.success:.1%}",
+                "failures": f"{entry.failures}",
+                "mean cost": f"{entry.cost_mean:.1f}",
+            }
             for entry in weakest[:_SHOWN_BINS]
         ]
-        print_table("", header, rows)
+        print_rows("", rows)
     rows = [[str(entry["episode"]), entry["replay"], entry["failed"] or "–", f"{entry['cost']:.1f}"] for entry in worst]
     print_table("", ["worst", "look at it with", "failed", "cost"], rows)
 

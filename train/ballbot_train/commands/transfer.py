@@ -8,7 +8,7 @@ from ballbot_gym import files
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default, print_table
+from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default, print_rows
 from ballbot_train.evaluation import agreement
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish, run_groups
@@ -86,31 +86,23 @@ def _compare(
     far = [d for task, names in own.items() for d in agreement.drifts(task, robot, names[0], engines, episodes)]
     for name, entries in [("engines", found)] + [("drift", far)] * bool(far):
         files.write_csv(out / f"{name}.csv", [asdict(entry) for entry in entries])
-    print_table(
+    print_rows(
         "where engines disagree",
-        ["task", "made for", "controller", "friction", "engines", "ends otherwise", "regret apart"],
         [
-            [d.task, d.made_for, d.controller, f"{d.friction:g}", f"{d.first}, {d.second}", f"{len(d.episodes)}/{d.of}",
-             f"{d.regret:+.2%}" if d.both else "–"]
+            {
+                "task": d.task,
+                "made for": d.made_for,
+                "controller": d.controller,
+                "friction": f"{d.friction:g}",
+                "engines": f"{d.first}, {d.second}",
+                "ends otherwise": f"{len(d.episodes)}/{d.of}",
+                "regret apart": f"{d.regret:+.2%}" if d.both else "–",
+            }
             for d in found
         ],
-    )  # fmt: skip
+    )
     if far:
-        print_table(
-            "distance of the same forces, which nothing corrects",
-            ["task", "engines", "after", "episodes", "median", "worst"],
-            [
-                [
-                    d.task,
-                    f"{d.first}, {d.second}",
-                    f"{d.seconds:g} s",
-                    str(d.episodes),
-                    f"{d.median:.2g} m",
-                    f"{d.worst:.2g} m",
-                ]
-                for d in far
-            ],
-        )
+        console.print(f"distance of the same forces, which nothing corrects: {out / 'drift.csv'}")
     usual = named_robot(robot).friction
     for one in found:
         if one.episodes and one.made_for == robot and one.friction == usual:

@@ -1,6 +1,7 @@
 """Figures of trajectories and of comparisons, in matplotlib."""
 
 import io
+import itertools
 import math
 import textwrap
 from collections.abc import Sequence
@@ -67,40 +68,29 @@ def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Cir
         [["position", "velocity", "path"], ["lean", "force", "path"]], width_ratios=[1, 1, 1.25]
     )
     panels = {
-        "position": ("ball position, m", 0, ("x", "y"), 1.0),
-        "velocity": ("ball velocity, m/s", 4, ("ẋ", "ẏ"), 1.0),
-        "lean": ("lean, deg", 2, ("γ", "θ"), 180 / math.pi),
+        "position": ("ball position, m", 0, "x solid, y dotted", 1.0),
+        "velocity": ("ball velocity, m/s", 4, "ẋ solid, ẏ dotted", 1.0),
+        "lean": ("lean, deg", 2, "γ solid, θ dotted", 180 / math.pi),
+        "force": ("force, N", None, "Fx solid, Fy dotted", 1.0),
     }
+    for key, (y_label, first, names, factor) in panels.items():
+        axis = axes[key]
+        for curve, i in itertools.product(curves, range(2)):
+            t, values = (
+                curve.trajectory.t,
+                curve.trajectory.u[:, i] if first is None else curve.trajectory.x[:, first + i],
+            )
+            held = "steps-post" if first is None and curve.trajectory.held else "default"
+            look = {"color": curve.color, "lw": 1.5, "alpha": 0.8 if i else 1.0, "drawstyle": held}
+            axis.plot(t[: len(values)], factor * values, ":" if i else curve.style, **look)
+        axis.set_ylabel(y_label)
+        axis.set_title(names, fontsize=9, color="0.35")
+        axis.grid(alpha=0.3)
+        axis.axhline(0, color="0.6", lw=0.6)
     for curve in curves:
-        t, x = curve.trajectory.t, curve.trajectory.x
-        for key, (_, first, names, factor) in panels.items():
-            for i, name in enumerate(names):
-                axes[key].plot(
-                    t,
-                    factor * x[:, first + i],
-                    _component_style(curve, i),
-                    color=curve.color,
-                    lw=1.5,
-                    alpha=_alpha(i),
-                    label=f"{name}" if curve is curves[0] else None,
-                )
-        _plot_forces(axes["force"], curve)
-        axes["path"].plot(x[:, 0], x[:, 1], curve.style, color=curve.color, lw=2, label=curve.label)
-    for key, (y_label, *_rest) in panels.items():
-        axes[key].set_ylabel(y_label)
-    axes["force"].set_ylabel("force, N")
+        axes["path"].plot(*curve.trajectory.x[:, :2].T, curve.style, color=curve.color, lw=2, label=curve.label)
     for key in ("lean", "force"):
         axes[key].set_xlabel("time, s")
-    for key in ("position", "velocity", "lean", "force"):
-        axes[key].grid(alpha=0.3)
-        axes[key].axhline(0, color="0.6", lw=0.6)
-    for key, names in (
-        ("position", "x solid, y dotted"),
-        ("velocity", "ẋ solid, ẏ dotted"),
-        ("lean", "γ solid, θ dotted"),
-        ("force", "Fx solid, Fy dotted"),
-    ):
-        axes[key].set_title(names, fontsize=9, color="0.35")
     _finish_path(axes["path"], curves, circles)
     return figure
 
@@ -283,24 +273,6 @@ def plain(figure: Figure) -> None:
 
 def _folded(text: str) -> str:
     return "\n".join(textwrap.wrap(text, 28))
-
-
-def _component_style(curve: Curve, i: int) -> str:
-    return curve.style if i == 0 else ":"
-
-
-def _alpha(i: int) -> float:
-    return 1.0 if i == 0 else 0.8
-
-
-def _plot_forces(axis: Axes, curve: Curve) -> None:
-    trajectory = curve.trajectory
-    for i in range(2):
-        style, common = _component_style(curve, i), {"color": curve.color, "lw": 1.2, "alpha": _alpha(i)}
-        if trajectory.held:
-            axis.step(trajectory.t[:-1], trajectory.u[:, i], style, where="post", **common)
-        else:
-            axis.plot(trajectory.t, trajectory.u[:, i], style, **common)
 
 
 def _finish_path(axis: Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
