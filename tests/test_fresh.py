@@ -152,7 +152,6 @@ def test_the_command_writes_summary_bins_worst_episodes_and_their_films(tmp_path
     for name, lines in (("bins", 4), ("worst", 10), ("fresh", 60)):
         with (out / f"{name}.csv").open() as opened:
             assert len(list(csv.DictReader(opened))) == lines
-    assert (out / "fresh.png").exists()
     assert (out / "certified" / "leaderboard.csv").exists()
     assert worst["replay"] in capsys.readouterr().out
 

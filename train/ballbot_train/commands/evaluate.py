@@ -111,7 +111,6 @@ def _fresh(
     varied: Randomization,
 ) -> None:
     from ballbot_train.evaluation import fresh  # it imports torch
-    from ballbot_train.report import figures
 
     fresh.check_fresh(episodes, seed)
     jobs.make_folder(out)
@@ -136,9 +135,8 @@ def _fresh(
     binned = result.bins()
     worst = _worst(result, policy, task, out / "worst", robot, varied)
     fresh.write(result, binned, worst, facts, out)
-    picture = figures.save(figures.fresh_figure(result, binned), out / "fresh.png")
     _print(result, binned, worst)
-    console.print(f"figure: {picture}\nall episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
+    console.print(f"all episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
 
 
 def _worst(

@@ -15,7 +15,6 @@ from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish
 from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
-from ballbot_train.report import figures
 from ballbot_train.report.film import write_film
 from ballbot_train.report.replay import engines_replay
 
@@ -64,12 +63,11 @@ def transfer(
     results = run_groups(groups, episodes, out, workers, matrix.TransferResult, seed)
     rows = rows_of(results, matrix.TransferRow, "made_for", "robot", "friction", "physics", seed=seed)
     write_results("transfer", rows, results, facts, out, matrix.COLUMNS, regret=matrix.REGRET)
-    figures.save(figures.transfer_figure(rows), out / "transfer.png")
     if len(engines) > 1:
         _compare(results, chosen, robot, episodes, engines, out)
     title, table = f"{episodes} certified episodes of {robot} per task", [matrix.cells(row) for row in rows]
     publish(out, "transfer", title, matrix.HEADER, table)
-    console.print(f"matrix: {out / 'transfer.png'}, {out / 'transfer.csv'}")
+    console.print(f"matrix: {out / 'transfer.csv'}")
 
 
 def _compare(
