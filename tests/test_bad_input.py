@@ -574,7 +574,6 @@ TYPED = [
     ("benchmark --episodes 0", "episodes must be 1 to 200, not 0"),
     ("certify --install --shards set", "give --install without --shards"),
     ("certify --episodes 1 --shards nowhere://set", "nowhere://set/stabilize cannot be read"),
-    ("train ppo --seeds 0:2 --workers 0", "workers must be 1 to 1024, not 0"),
     ("train dagger --demos nowhere://set", "nowhere://set cannot be read"),
     ("demos --backoff.margin nan", "margin must be at least 0 and below inf, not nan"),
     ("demos --pushes 1e9", "pushes must be at most 50 per second, one in every control step"),

@@ -6,7 +6,7 @@ import math
 import shlex
 import shutil
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args, get_type_hints
@@ -16,7 +16,7 @@ from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import meanings_of
-from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
+from ballbot_train.console import RobotName, check_names, console, physics_or_default
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.learners import LEARNERS, check_settings
@@ -24,7 +24,7 @@ from ballbot_train.learning.learners import LEARNERS, check_settings
 _MOST_THREADS = 1024
 _MOST_VALIDATION_EPISODES = 100_000
 
-_FIRST = ("task", "out", "seed", "iterations", "seeds", "workers", "resume")  # what newcomers need
+_FIRST = ("task", "out", "seed", "iterations", "resume")  # what newcomers need
 _LAST = (
     "robot",
     "threads",
@@ -63,10 +63,6 @@ class Run:
     """Earlier observations and actions that are seen."""
     seed: int = 0
     """Seed of all that is drawn."""
-    seeds: str | None = None
-    """Several, as 0:5 or 0,3,7: a queue of one-core runs."""
-    workers: int = 1
-    """How many runs of --seeds go on at once."""
     threads: int = 1
     """Threads of torch."""
     out: Path | None = None
@@ -82,7 +78,6 @@ class Run:
         """Raises a ValueError that names the first number out of its range."""
         for name, least, most in (
             ("threads", 1, _MOST_THREADS),
-            ("workers", 1, _MOST_THREADS),
             ("seed", 0, 2**32 - 1),
             ("test_episodes", 1, certified.EPISODES),
             ("validation_episodes", 1, _MOST_VALIDATION_EPISODES),
@@ -113,14 +108,11 @@ def train(learner: str, run: Run = Run(), settings: Any = None, command: str | N
         run = replace(run, out=Path("runs") / "train" / f"{file_name(run.task, run.robot)}-{learner}")
     settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
     check_settings(settings)
-    if run.seeds is not None:
-        _train_seeds(learner, run, settings, run.seeds)
-    else:
-        _train_one(learner, run, settings, command or command_with(learner, run, settings))
+    _train(learner, run, settings, command or command_with(learner, run, settings))
 
 
-def _train_one(learner: str, run: Run, settings: Any, command: str) -> None:
-    """Trains on one seed, and prints what the policy reached."""
+def _train(learner: str, run: Run, settings: Any, command: str) -> None:
+    """Trains, and prints what the policy reached."""
     import torch
 
     from ballbot_gym.engines import PHYSICS_NAMES
@@ -174,33 +166,6 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
         **({"history": run.history} if run.history else {}),
         **({} if more == VALIDATION_EPISODES else {"validation_episodes": more}),
     }
-
-
-def _train_seeds(learner: str, run: Run, settings: Any, named: str) -> None:
-    """Trains on several seeds, and prints what each reached."""
-    from ballbot_train.learning import seeds as queue
-
-    seeds, out = queue.parse_seeds(named), cast(Path, run.out)
-
-    def command_of(seed: int) -> str:
-        return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
-
-    expected = {"learner": learner, "task": run.task, "settings": asdict(settings), **robot_setting(run.robot)}
-    with progress_bar() as progress:
-        bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
-        trained = queue.run(command_of, expected, seeds, out, run.workers, lambda seed: progress.advance(bar))
-    header = ["seed", "", "success", "failures", "mean regret", "minutes"]
-    rows = [_row(str(seed), each) for seed, each in zip(seeds, trained, strict=True)]
-    middle, worst = queue.middle_and_worst(trained)
-    print_table(
-        f"{learner} on {run.task}, certified episodes", header, [*rows, _row("median", middle), _row("worst", worst)]
-    )
-    console.print(f"learning curves: ballbot curves {shlex.quote(str(out))}")
-
-
-def _row(name: str, values: Mapping[str, Any]) -> list[str]:
-    shares = f"{values['success']:.1%}", f"{values['failures']:g}", _share(values["regret_mean"])
-    return [name, "", *shares, f"{values['minutes']:.1f}"]
 
 
 def _share(value: float) -> str:
@@ -292,15 +257,8 @@ def _described(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
 def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
-    defaults = {  # settings of which older records know nothing
-        "robot": PAPER,
-        "history": 0,
-        "threads": 1,
-        "test_episodes": certified.EPISODES,
-        "validation_episodes": VALIDATION_EPISODES,
-    }
     for name, value in _shallow(run).items():
-        if value is not None and name not in ("resume", "seeds", "workers") and value != defaults.get(name):
+        if name in ("task", "seed") or (value != getattr(Run, name) and name != "resume"):
             words += [f"--{name.replace('_', '-')}", str(value)]
     for name, value in asdict(settings).items():
         words += _option(name.replace("_", "-"), value)
