@@ -587,7 +587,7 @@ TYPED = [
     ("train shac --demos x", "shac uses no demonstrations"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),
     ("train dagger --gathering-iterations 0", "gathering_iterations 0 needs demonstrations: give --demos"),
-    ("evaluate shac --fresh 0", "nothing to run: give --fresh or --episodes"),
+    ("evaluate shac --fresh 0", "the number of fresh episodes must be 1 to 1,000,000, not 0"),
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),
