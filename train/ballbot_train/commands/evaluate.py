@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ballbot_gym.env import BallbotEnv
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization, checked_randomization, track_of
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
@@ -64,6 +64,7 @@ def evaluate(
     from ballbot_train.evaluation import fresh as episodes  # it imports torch
 
     episodes.check_fresh(fresh, seed)
+    episodes.as_batch_policy(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
     jobs.make_folder(out)
     facts = provenance() | {
         "task": task,

@@ -298,7 +298,7 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         if is_expert(str(policy)):
             raise ValueError(
                 f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
-                "policy, or run the expert on certified episodes with evaluate"
+                "policy, or run the expert on certified episodes with evaluate or ballbot benchmark"
             )
         network = cast(PolicyController, make_controller(str(policy), task, named_robot(robot))).network
 
