@@ -1,21 +1,17 @@
 """`ballbot train LEARNER`: trains a policy. Every setting of the learner is an option; see `ballbot train LEARNER --help`."""
 
 import argparse
-import itertools
 import math
 import shlex
-import shutil
-import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args, get_type_hints
+from typing import Annotated, Any, cast
 
 from ballbot_gym import certified
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import meanings_of
 from ballbot_train.console import RobotName, check_names, console, physics_or_default
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
@@ -24,26 +20,6 @@ from ballbot_train.learning.learners import LEARNERS, check_settings
 _MOST_THREADS = 1024
 _MOST_VALIDATION_EPISODES = 100_000
 
-_FIRST = ("task", "out", "seed", "iterations", "resume")  # what newcomers need
-_LAST = (
-    "robot",
-    "threads",
-    "evaluations",
-    "validation_episodes",
-    "test_episodes",
-)  # all that is in neither is the recipe
-_OPTION_WIDTH = 28
-_WORDS = {
-    int: "N",
-    float: "X",
-    tuple[float, float]: "X X",
-    tuple[int, ...]: "N ...",
-    int | None: "N",
-    str | None: "TEXT",
-    Path | None: "PATH",
-}
-"""What stands for a value in the help, by its type."""
-
 
 @dataclass(frozen=True)
 class Run:
@@ -51,6 +27,12 @@ class Run:
 
     task: str = "stabilize"
     """Name of a task."""
+    out: Path | None = None
+    """Folder; default runs/train/TASK-LEARNER."""
+    seed: int = 0
+    """Seed of all that is drawn."""
+    resume: bool = False
+    """Continue the run in this folder."""
     robot: RobotName = PAPER
     """Name of a robot."""
     demos: str | None = None
@@ -61,18 +43,12 @@ class Run:
     """Track: unknown, late, noisy or real; not sac."""
     history: int = 0
     """Earlier observations and actions that are seen."""
-    seed: int = 0
-    """Seed of all that is drawn."""
     threads: int = 1
     """Threads of torch."""
-    out: Path | None = None
-    """Folder; default runs/train/TASK-LEARNER."""
     test_episodes: int = certified.EPISODES
     """Certified episodes that measure the kept policy."""
     validation_episodes: int = VALIDATION_EPISODES
     """Fresh episodes that choose the policy to keep."""
-    resume: bool = False
-    """Continue the run in this folder."""
 
     def check(self) -> None:
         """Raises a ValueError that names the first number out of its range."""
@@ -203,10 +179,8 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     if named is not None:
         check_names("learner", [named], LEARNERS)
         check_names("task", [task], TASKS)
-        if {"-h", "--help"} & set(arguments):
-            _print_help(named, LEARNERS[named].settings(task, warm))
-            raise SystemExit(0)
-        tyro.cli(_command(named, task, warm, call), prog=f"ballbot train {named}", args=list(arguments[1:]))
+        command = _command(named, task, warm, call)
+        tyro.cli(command, prog=f"ballbot train {named}", args=list(arguments[1:]), compact_help=True)
         return
     tyro.extras.subcommand_cli_from_dict(
         {name: _command(name) for name in LEARNERS},
@@ -215,43 +189,6 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
         "`ballbot train LEARNER --help` lists the settings of a learner, with the defaults tuned for --task.",
         args=list(arguments),
     )
-
-
-def _print_help(learner: str, settings: Any) -> None:
-    """Prints the options in groups, with their defaults; tyro has no groups whose options keep their names."""
-    options = _described(Run()) | _described(settings)
-    groups = {
-        "first": [options[name] for name in _FIRST],
-        "recipe, tuned for --task": [text for name, text in options.items() if name not in (*_FIRST, *_LAST)],
-        "more": [options[name] for name in _LAST],
-    }
-    console.print(f"usage: ballbot train {learner} [OPTIONS]\n\nTrains by {LEARNERS[learner].description}.")
-    for title, texts in groups.items():
-        console.print(f"\n{title}:")
-        for option, meaning in texts:
-            lines = textwrap.wrap(meaning, max(shutil.get_terminal_size().columns, 60) - _OPTION_WIDTH)
-            if len(option) > _OPTION_WIDTH - 2:
-                lines = ["", *lines]
-            for head, line in itertools.zip_longest([option], lines, fillvalue=""):
-                console.print(f"{head:{_OPTION_WIDTH}}{line}".rstrip())
-
-
-def _described(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
-    """How to type each field of a dataclass, and what it means, by name."""
-    found: dict[str, tuple[str, str]] = {}
-    meanings, types = meanings_of(type(values)), get_type_hints(type(values))
-    for name, value in _shallow(values).items():
-        typed, word = (prefix + name).replace("_", "-"), _WORDS.get(types[name], "NAME")
-        default = " ".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
-        meaning = meanings[name] if value is None or value is False else f"{meanings[name]} [{default}]"
-        if is_dataclass(value):
-            found |= _described(value, f"{name}.")
-        elif isinstance(value, bool):
-            found[name] = f"  --{typed}, --no-{typed}", meaning
-        else:
-            choices = ", ".join(map(str, get_args(types[name]))) if word == "NAME" else ""
-            found[prefix + name] = f"  --{typed} {word}", f"{meaning} ({choices})" if choices else meaning
-    return found
 
 
 def command_with(learner: str, run: Run, settings: Any) -> str:
