@@ -171,11 +171,16 @@ def score_and_validate(
     cost, success, failure = run.cost.double().numpy(), run.success.numpy(), run.failure.numpy()
     priced = fresh.priced(cost, success, task)
     standing = (cost[:count] / known.costs - 1)[~failure[:count]]
-    spread = (float(of(standing)) if standing.size else math.nan for of in (np.mean, np.median, np.max))
+    mean, median, worst = (float(of(standing)) if standing.size else math.nan for of in (np.mean, np.median, np.max))
     ratio = float((priced[:count] / known.costs).mean())
-    score = Score(ratio, *spread, float(success[:count].mean()), int(failure[:count].sum()))
-    rest = float(success[count:].mean()), int(failure[count:].sum()), float(cost[count:].mean())
-    return score, Validation(float(priced[count:].mean()), *rest)
+    score = Score(ratio, mean, median, worst, float(success[:count].mean()), int(failure[:count].sum()))
+    validation = Validation(
+        cost=float(priced[count:].mean()),
+        success=float(success[count:].mean()),
+        failures=int(failure[count:].sum()),
+        mean_cost=float(cost[count:].mean()),
+    )
+    return score, validation
 
 
 @own_defaults()

@@ -227,8 +227,8 @@ class OwnPolicy(SACPolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         critic = super().make_critic(features_extractor)
-        inputs, hidden, activation = critic.features_extractor.features_dim + 2, self.net_arch, self.activation_fn
-        critic.q_networks = [self._network(inputs, hidden, activation) for _ in critic.q_networks]
+        inputs, hidden = critic.features_extractor.features_dim + 2, cast(list[int], self.net_arch)
+        critic.q_networks = [self._network(inputs, hidden, self.activation_fn) for _ in critic.q_networks]
         for index, network in enumerate(critic.q_networks):
             critic.add_module(f"qf{index}", network)
         return critic.to(self.device)
