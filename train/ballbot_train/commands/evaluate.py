@@ -84,10 +84,9 @@ def evaluate(
             folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
             found = episodes.find_optima(task, optima, seed, folder, workers, bars.advance, robot, varied)
         result = replace(result, optima=found)
-    binned = result.bins()
     worst = _worst(result, policy, task, out / "worst", robot, varied)
-    episodes.write(result, binned, worst, facts, out)
-    _print(result, binned, worst)
+    episodes.write(result, worst, facts, out)
+    _print(result, worst)
     console.print(f"all episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
 
 
@@ -112,7 +111,7 @@ def _worst(
     return worst
 
 
-def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) -> None:
+def _print(result: Any, worst: Sequence[dict[str, Any]]) -> None:
     row = result.summary()
     failed_by = ", ".join(f"{count} {name}" for name, count in row.failed_by.items())
     facts = [
@@ -132,22 +131,19 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
         facts.append([f"regret on {row.optima} optima, the same", ", ".join(f"{share:.2%}" for share in shares)])
     title = f"{result.policy}: {row.episodes} fresh episodes of {result.task.id}, seed {result.seed}"
     print_table(title, ["", ""], facts)
-    weakest = sorted(
-        (entry for entry in binned if entry.episodes >= _FULL_BIN and entry.success < 1),
-        key=lambda entry: entry.success,
-    )
-    if weakest:
-        rows = [
-            {
-                "range with the least success": entry.measure,
-                "": f"{entry.low:.4g}" if entry.low == entry.high else f"{entry.low:.4g} to {entry.high:.4g}",
-                "episodes": f"{entry.episodes}",
-                "success": f"{entry.success:.1%}",
-                "failures": f"{entry.failures}",
-                "mean cost": f"{entry.cost_mean:.1f}",
-            }
-            for entry in weakest[:_SHOWN_BINS]
-        ]
+    weak = [entry for entry in result.bins() if entry["episodes"] >= _FULL_BIN and entry["success"] < 1]
+    rows = [
+        {
+            "range with the least success": entry["measure"],
+            "": f"{entry['low']:.4g} to {entry['high']:.4g}",
+            "episodes": f"{entry['episodes']}",
+            "success": f"{entry['success']:.1%}",
+            "failures": f"{entry['failures']}",
+            "mean cost": f"{entry['cost_mean']:.1f}",
+        }
+        for entry in sorted(weak, key=lambda entry: entry["success"])[:_SHOWN_BINS]
+    ]
+    if rows:
         print_rows("", rows)
     rows = [[str(entry["episode"]), entry["replay"], entry["failed"] or "–", f"{entry['cost']:.1f}"] for entry in worst]
     print_table("", ["worst", "look at it with", "failed", "cost"], rows)
