@@ -79,7 +79,7 @@ def _dataset(out: Path) -> Made:
 
 
 def _fresh(out: Path) -> Made:
-    return {"fresh.csv": (out / "fresh.csv").read_text()} | _episodes(out / "certified")
+    return {"fresh.csv": (out / "fresh.csv").read_text()}
 
 
 def _search(out: Path) -> Made:
@@ -113,7 +113,7 @@ COMMANDS = {
     ),
     "basins": _command("basins --controllers lqr --points 5 --physics rk4", _basins),
     "certify": _command("certify --tasks turn --episodes 6", _sets),
-    "evaluate": _command("evaluate shac --fresh 20 --optima 4 --bins 2 --episodes 4 --physics rk4", _fresh),
+    "evaluate": _command("evaluate shac --fresh 20 --optima 4", _fresh),
     "transfer": _command(
         "transfer --tasks turn --controllers lqr --made-for paper rolling --episodes 8 --physics rk4", _episodes
     ),

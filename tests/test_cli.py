@@ -81,7 +81,7 @@ def test_the_commands_that_continue_are_those_that_do_much_work():
 @pytest.mark.parametrize(
     ("arguments", "how"),
     [
-        (("evaluate", "lqr", "--task", "turn", "--episodes", 2, "--workers", 1, "--out", "a folder"), "continues"),
+        (("basins", "--controllers", "lqr", "--points", 3, "--workers", 1, "--out", "a folder"), "continues"),
         (("optimize", "stabilize", "--duration", 1), "starts again"),
     ],
 )

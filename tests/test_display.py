@@ -102,14 +102,6 @@ def test_in_a_notebook_a_replay_is_a_frame_below_the_cell(monkeypatch):
     assert re.search(r'<iframe srcdoc="&lt;!doctype html.*style="width:100%;height:\d+px', shown[0], flags=re.DOTALL)
 
 
-def test_a_row_replays_a_certified_episode_of_a_controller_that_it_finds(monkeypatch):
-    monkeypatch.setattr(webbrowser, "open", lambda page: True)
-    row = summarize([result()])
-    assert "certified episode 1" in row.show(1, physics="rk4").read_text()
-    with pytest.raises(ValueError, match="unknown controller 'mine'"):
-        replace(row, controller="mine").show(physics="rk4")
-
-
 @pytest.mark.parametrize(
     ("show", "message"),
     [

@@ -352,7 +352,6 @@ def test_transfer_tells_who_was_made_for_what(tmp_path):
     assert {"regret_mean_on_own_floor", "regret_median_on_own_floor"} <= set(rows[0])
     assert not {"regret_mean", "optimum"} & set(rows[0])
     assert "| regret over the optimum on the robot's own floor |" in (tmp_path / "transfer.md").read_text()
-    assert (tmp_path / "transfer.png").stat().st_size > 1000
     with pytest.raises(ValueError, match="does not roll"):
         transfer(frictions=(0.8,), out=tmp_path, **arguments)
 

@@ -230,18 +230,21 @@ def test_a_command_with_all_settings_gives_them_again(learner, task):
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_help_lists_every_setting_with_the_defaults_of_the_task_and_what_newcomers_need_first(
+def test_help_lists_every_setting_with_the_defaults_of_the_task_and_on_demand_what_it_means(
     learner, capsys, monkeypatch
 ):
     monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit):
-        parse([learner, "--task", "weave", "--help"], lambda *call: None)
-    printed = capsys.readouterr().out
-    first, recipe = printed.split("recipe, tuned for --task:")
-    for field in fields(LEARNERS[learner].settings("weave")):
-        assert f"--{field.name.replace('_', '-')}" in (first if field.name == "iterations" else recipe)
-    assert "256 256" in printed or learner != "shac"
-    assert len(printed.splitlines()) <= 60
+    printed = {}
+    for option in ("--help", "-H"):
+        with pytest.raises(SystemExit):
+            parse([learner, "--task", "weave", option], lambda *call: None)
+        printed[option] = capsys.readouterr().out
+    settings = LEARNERS[learner].settings("weave")
+    for field in fields(settings):
+        assert f"--{field.name.replace('_', '-')}" in printed["--help"]
+    assert "256 256" in printed["--help"] or learner != "shac"
+    assert len(printed["--help"].splitlines()) <= 60
+    assert "Evaluations, at equal distances." in printed["-H"]
 
 
 def test_every_setting_says_what_it_is():

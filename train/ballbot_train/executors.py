@@ -1,8 +1,8 @@
 """Where work is done: in this process, in processes of this machine, or on the nodes of a Ray cluster.
 
 Each of the three is a `Pool`. It runs tasks, which are generator functions, and gives back what they yield as soon as they
-yield it. Items of `jobs`, trials of `learning.tuning` and trainings of `learning.seeds` are tasks. A task gets its arguments
-and nothing else, so a worker needs no file of this machine.
+yield it. Items of `jobs` and trials of `learning.tuning` are tasks. A task gets its arguments and
+nothing else, so a worker needs no file of this machine.
 """
 
 import math

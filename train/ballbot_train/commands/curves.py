@@ -9,7 +9,7 @@ def curves(runs: tuple[Path, ...], /, metric: str = "regret", out: Path = Path("
     """Draws learning curves: interquartile mean over seeds with bootstrap bands, one line per learner.
 
     Args:
-        runs: folders of `ballbot train`, or folders of such folders, as `ballbot train --seeds` makes them.
+        runs: folders of `ballbot train`, or folders of such folders, as of several seeds.
         metric: regret, in which an episode without success counts as failing at once; regret_mean, regret_median or
             regret_worst of what did not fail; success; failures; validation_cost; or validation_mean_cost.
         out: folder of curves.png, of curves.csv with every point, and of curves.md with where each curve ends.

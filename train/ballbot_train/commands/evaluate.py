@@ -1,4 +1,4 @@
-"""`ballbot evaluate POLICY`: one policy on thousands of fresh episodes, or anything that acts on the certified ones."""
+"""`ballbot evaluate POLICY`: one policy on thousands of fresh episodes."""
 
 import shlex
 from collections.abc import Sequence
@@ -7,29 +7,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ballbot_gym import certified
-from ballbot_gym.env import BallbotEnv
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization, checked_randomization, track_of
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.rollout import rollout
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import (
-    Physics,
-    RobotName,
-    check_least,
-    console,
-    physics_or_default,
-    print_table,
-    progress_bars,
-)
-from ballbot_train.evaluation.benchmark import benchmark, controllers_of, open_run, policy_digests
-from ballbot_train.evaluation.controllers import is_expert, make_controller, task_name
-from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard
+from ballbot_train.console import RobotName, check_least, console, print_rows, print_table, progress_bars
+from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
+from ballbot_train.evaluation.controllers import make_controller, task_name
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
 
-_FRESH = 10_000
 _WORST = 10
 _SHOWN_BINS = 6
 _FULL_BIN = 20  # episodes from which a bin is called weak
@@ -39,11 +28,9 @@ def evaluate(
     policy: str,
     /,
     task: str | None = None,
-    fresh: int | None = None,
+    fresh: int = 10_000,
     seed: int = 0,
     optima: int = 0,
-    episodes: int = 0,
-    physics: Physics | None = None,
     out: Path | None = None,
     workers: WorkersOption = Workers(),
     robot: RobotName = PAPER,
@@ -53,66 +40,31 @@ def evaluate(
 
     Args:
         policy: a policy file, a model saved by Stable-Baselines3 (.zip), or the name of a policy that comes
-            with the package; with --episodes also an expert. Statistics of VecNormalize are read from
+            with the package. Statistics of VecNormalize are read from
             MODEL.vecnormalize.npz beside the model, which `ballbot_train.save_vecnormalize` writes.
         task: name of its task; default the one that its file names or whose observations fit, or else stabilize.
-        fresh: how many fresh episodes, in the batched closed-form model; default 10000, or none where --episodes is given.
-            They are never the certified ones.
+        fresh: how many fresh episodes, in the batched closed-form model. They are never the certified ones.
         seed: of the fresh episodes.
         optima: of how many fresh episodes, from the first, the optimum is found too, for their regret. Optima stay in the
             folder `optima` beside --out, for later calls and other policies.
-        episodes: how many of the certified episodes to run in PyBullet.
-        physics: of the certified episodes, "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper. An
-            interrupted run continues here.
-        workers: who does the work, for optima and certified episodes.
+        out: folder of the results; default runs/evaluate/TASK-POLICY, with the robot's name if that is not paper.
+        workers: who finds optima.
         robot: whose episodes.
-        randomization: name of the track on which the fresh episodes are, of robots and delays that the policy is not told;
-            certified episodes of tracks are run by `ballbot benchmark --randomization`.
+        randomization: name of the track on which the episodes are, of robots and delays that the policy is not told.
     """
     varied = checked_randomization(randomization)
-    if episodes and randomization:
-        raise ValueError("--episodes knows no tracks; give ballbot benchmark --randomization")
     task = task_name(policy, task, robot)
-    chosen = controllers_of([task], [policy], robot)
-    check_least(0, seed=seed, optima=optima, episodes=episodes)
+    controllers_of([task], [policy], robot)
+    check_least(0, optima=optima)
     Workers.of(workers)
-    if episodes > certified.EPISODES:
-        raise ValueError(f"episodes must be at most {certified.EPISODES}, the certified ones, not {episodes}")
-    fresh = (0 if episodes else _FRESH) if fresh is None else fresh
-    check_least(0, fresh=fresh)
     if optima > fresh:
         raise ValueError(f"optima must be at most the {fresh} fresh episodes, not {optima}")
-    if not fresh and not episodes:
-        raise ValueError("nothing to run: give --fresh or --episodes")
-    if fresh and is_expert(policy):
-        raise ValueError(
-            f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a policy, "
-            "or run the expert on certified episodes with --episodes"
-        )
     named = f"{task}-{Path(policy).stem}" + (f"-on-{randomization}" if randomization else "")
     out = Path("runs") / "evaluate" / file_name(named, robot) if out is None else out
-    if fresh:
-        _fresh(policy, task, fresh, seed, optima, out, workers, robot, varied)
-    if episodes:
-        _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers, robot)
+    from ballbot_train.evaluation import fresh as episodes  # it imports torch
 
-
-def _fresh(
-    policy: str,
-    task: str,
-    episodes: int,
-    seed: int,
-    optima: int,
-    out: Path,
-    workers: Workers,
-    robot: str,
-    varied: Randomization,
-) -> None:
-    from ballbot_train.evaluation import fresh  # it imports torch
-    from ballbot_train.report import figures
-
-    fresh.check_fresh(episodes, seed)
+    episodes.check_fresh(fresh, seed)
+    episodes.as_batch_policy(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
     jobs.make_folder(out)
     facts = provenance() | {
         "task": task,
@@ -120,24 +72,22 @@ def _fresh(
         "robot": robot,
         "policies": policy_digests({task: [policy]}, robot),
         "seed": seed,
-        "episodes": episodes,
+        "episodes": fresh,
         "physics": "closed form, batched, float64",
     }
-    with progress_bars({"episodes": episodes}) as bars:
+    with progress_bars({"episodes": fresh}) as bars:
         progress = partial(bars.advance, "episodes")
-        result = fresh.evaluate_fresh(policy, task, episodes, seed, None, progress, robot, varied)
+        result = episodes.evaluate_fresh(policy, task, fresh, seed, None, progress, robot, varied)
     if optima:
         with progress_bars({task: optima}) as bars:
             track = f"-{track_of(varied)}" if varied.moves_optima else ""
             folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
-            found = fresh.find_optima(task, optima, seed, folder, workers, bars.advance, robot, varied)
+            found = episodes.find_optima(task, optima, seed, folder, workers, bars.advance, robot, varied)
         result = replace(result, optima=found)
-    binned = result.bins()
     worst = _worst(result, policy, task, out / "worst", robot, varied)
-    fresh.write(result, binned, worst, facts, out)
-    picture = figures.save(figures.fresh_figure(result, binned), out / "fresh.png")
-    _print(result, binned, worst)
-    console.print(f"figure: {picture}\nall episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
+    episodes.write(result, worst, facts, out)
+    _print(result, worst)
+    console.print(f"all episodes: {out / 'fresh.csv'}\nthe worst: {out / 'worst.csv'}")
 
 
 def _worst(
@@ -161,7 +111,7 @@ def _worst(
     return worst
 
 
-def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) -> None:
+def _print(result: Any, worst: Sequence[dict[str, Any]]) -> None:
     row = result.summary()
     failed_by = ", ".join(f"{count} {name}" for name, count in row.failed_by.items())
     facts = [
@@ -181,37 +131,19 @@ def _print(result: Any, binned: Sequence[Any], worst: Sequence[dict[str, Any]]) 
         facts.append([f"regret on {row.optima} optima, the same", ", ".join(f"{share:.2%}" for share in shares)])
     title = f"{result.policy}: {row.episodes} fresh episodes of {result.task.id}, seed {result.seed}"
     print_table(title, ["", ""], facts)
-    weakest = sorted(
-        (entry for entry in binned if entry.episodes >= _FULL_BIN and entry.success < 1),
-        key=lambda entry: entry.success,
-    )
-    if weakest:
-        header = ["range with the least success", "", "episodes", "success", "failures", "mean cost"]
-        rows = [
-            [
-                entry.measure,
-                f"{entry.low:.4g}" if entry.low == entry.high else f"{entry.low:.4g} to {entry.high:.4g}",
-                f"{entry.episodes}",
-                f"{entry.success:.1%}",
-                f"{entry.failures}",
-                f"{entry.cost_mean:.1f}",
-            ]
-            for entry in weakest[:_SHOWN_BINS]
-        ]
-        print_table("", header, rows)
+    weak = [entry for entry in result.bins() if entry["episodes"] >= _FULL_BIN and entry["success"] < 1]
+    rows = [
+        {
+            "range with the least success": entry["measure"],
+            "": f"{entry['low']:.4g} to {entry['high']:.4g}",
+            "episodes": f"{entry['episodes']}",
+            "success": f"{entry['success']:.1%}",
+            "failures": f"{entry['failures']}",
+            "mean cost": f"{entry['cost_mean']:.1f}",
+        }
+        for entry in sorted(weak, key=lambda entry: entry["success"])[:_SHOWN_BINS]
+    ]
+    if rows:
+        print_rows("", rows)
     rows = [[str(entry["episode"]), entry["replay"], entry["failed"] or "–", f"{entry['cost']:.1f}"] for entry in worst]
     print_table("", ["worst", "look at it with", "failed", "cost"], rows)
-
-
-def _certified(
-    chosen: dict[str, list[str]], episodes: int, physics: str, out: Path, workers: Workers, robot: str
-) -> None:
-    settings = {"physics": physics, "episodes": episodes}
-    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), 0, robot, **settings)
-    results = benchmark(chosen, episodes, physics, out, workers, robot=robot)
-    rows = leaderboard(results)
-    write_leaderboard(rows, results, facts, out)
-    jobs.release(out)
-    table = [cells(row) for row in rows]
-    print_table(f"{episodes} certified episodes, physics={physics}", HEADER, table)
-    console.print(f"all episodes: {out / 'episodes.csv'}")

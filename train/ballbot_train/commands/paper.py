@@ -10,7 +10,7 @@ from ballbot_baselines.paper_experiments import TRACKING_DT, compare_stabilizati
 from ballbot_baselines.paper_problems import PAPER_PROBLEMS, PaperProblem
 from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.params import default_params
-from ballbot_train.console import check_names, console, physics_or_default, print_table
+from ballbot_train.console import check_names, console, physics_or_default, print_rows
 from ballbot_train.report import figures
 
 
@@ -37,30 +37,19 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}.png")
         tilt = math.degrees(np.abs(plan.trajectory.x[:, 2:4]).max())
         rows.append(
-            [
-                entry.figure,
-                name,
-                f"{plan.cost:.4f}",
-                f"{plan.trajectory.duration:.3f}",
-                f"{tilt:.2f}",
-                f"{np.abs(plan.trajectory.u).max():.0f}",
-                f"{plan.collocation_error:.1e}",
-                f"{100 * tracked.error:.1f}",
-                plan.status,
-            ]
+            {
+                "figure": entry.figure,
+                "problem": name,
+                "J*": f"{plan.cost:.4f}",
+                "final time, s": f"{plan.trajectory.duration:.3f}",
+                "peak lean, deg": f"{tilt:.2f}",
+                "peak force, N": f"{np.abs(plan.trajectory.u).max():.0f}",
+                "collocation error": f"{plan.collocation_error:.1e}",
+                "tracked within, cm": f"{100 * tracked.error:.1f}",
+                "status": plan.status,
+            }
         )
-    header = [
-        "figure",
-        "problem",
-        "J*",
-        "final time, s",
-        "peak lean, deg",
-        "peak force, N",
-        "collocation error",
-        "tracked within, cm",
-        "status",
-    ]
-    print_table("The paper's problems: 40 intervals, Hermite–Simpson", header, rows)
+    print_rows("The paper's problems: 40 intervals, Hermite–Simpson", rows)
     stabilizations = [name for name in only or PAPER_PROBLEMS if name.startswith("stabilize")]
     if stabilizations:
         _compare_stabilizations(stabilizations, out, simulator)
@@ -78,16 +67,22 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
             label = f"{figures.LABELS[run.controller]}, {rate}"
             curves.append(figures.Curve(label, episode.trajectory, figures.COLORS[run.controller]))
             peak = math.degrees(np.abs(episode.trajectory.x[:, 2:4]).max())
-            settle = f"{episode.settle_time:.2f}"
             rows.append(
-                [entry.figure, run.controller, rate, f"{episode.cost:.2f}", f"{peak:.1f}", settle, str(episode.failure)]
+                {
+                    "figure": entry.figure,
+                    "controller": run.controller,
+                    "feedback": rate,
+                    "cost": f"{episode.cost:.2f}",
+                    "peak lean, deg": f"{peak:.1f}",
+                    "settle time, s": f"{episode.settle_time:.2f}",
+                    "fell": str(episode.failure),
+                }
             )
         figure = figures.trajectory_figure(
             f"{entry.figure}: {entry.title}, LQR against trajectory optimization", curves
         )
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}-lqr-and-trajopt.png")
-    header = ["figure", "controller", "feedback", "cost", "peak lean, deg", "settle time, s", "fell"]
-    print_table(f"Stabilization in {simulator}, both with Stabilize's weights", header, rows)
+    print_rows(f"Stabilization in {simulator}, both with Stabilize's weights", rows)
 
 
 def _paper_circles(entry: PaperProblem, plan: Plan) -> list[figures.Circle]:

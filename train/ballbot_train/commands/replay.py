@@ -36,7 +36,7 @@ def replay(
         controllers: names of controllers or policy files; several are shown side by side.
         episode: index of the certified episode.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        format: png, a strip of pictures; mp4, gif or webp, a film with tilts, forces and paths.
+        format: png, a strip of pictures; mp4, gif or webp, a film.
         seconds: time of the last picture, s; default the end of the episode.
         frames: number of pictures in a strip, at equal times.
         fps: frames per second of a film.

@@ -13,7 +13,7 @@ def submit(
     """Makes the submissions of a results folder, one small file per task, and verifies them.
 
     Args:
-        results: folder that evaluate(out=...), `ballbot evaluate --episodes 200` or `ballbot benchmark` wrote.
+        results: folder that evaluate(out=...) or `ballbot benchmark` wrote.
         name: of the leaderboard's row.
         link: where one reads about the controller; an address that begins with https://.
         controller: which one, where the folder has several.

@@ -1,48 +1,24 @@
 """`ballbot train LEARNER`: trains a policy. Every setting of the learner is an option; see `ballbot train LEARNER --help`."""
 
 import argparse
-import itertools
 import math
 import shlex
-import shutil
-import textwrap
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args, get_type_hints
+from typing import Annotated, Any, cast
 
 from ballbot_gym import certified
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import meanings_of
-from ballbot_train.console import RobotName, check_names, console, physics_or_default, print_table, progress_bar
+from ballbot_train.console import RobotName, check_names, console, physics_or_default
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.learners import LEARNERS, check_settings
 
 _MOST_THREADS = 1024
 _MOST_VALIDATION_EPISODES = 100_000
-
-_FIRST = ("task", "out", "seed", "iterations", "seeds", "workers", "resume")  # what newcomers need
-_LAST = (
-    "robot",
-    "threads",
-    "evaluations",
-    "validation_episodes",
-    "test_episodes",
-)  # all that is in neither is the recipe
-_OPTION_WIDTH = 28
-_WORDS = {
-    int: "N",
-    float: "X",
-    tuple[float, float]: "X X",
-    tuple[int, ...]: "N ...",
-    int | None: "N",
-    str | None: "TEXT",
-    Path | None: "PATH",
-}
-"""What stands for a value in the help, by its type."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +27,12 @@ class Run:
 
     task: str = "stabilize"
     """Name of a task."""
+    out: Path | None = None
+    """Folder; default runs/train/TASK-LEARNER."""
+    seed: int = 0
+    """Seed of all that is drawn."""
+    resume: bool = False
+    """Continue the run in this folder."""
     robot: RobotName = PAPER
     """Name of a robot."""
     demos: str | None = None
@@ -61,28 +43,17 @@ class Run:
     """Track: unknown, late, noisy or real; not sac."""
     history: int = 0
     """Earlier observations and actions that are seen."""
-    seed: int = 0
-    """Seed of all that is drawn."""
-    seeds: str | None = None
-    """Several, as 0:5 or 0,3,7: a queue of one-core runs."""
-    workers: int = 1
-    """How many runs of --seeds go on at once."""
     threads: int = 1
     """Threads of torch."""
-    out: Path | None = None
-    """Folder; default runs/train/TASK-LEARNER."""
     test_episodes: int = certified.EPISODES
     """Certified episodes that measure the kept policy."""
     validation_episodes: int = VALIDATION_EPISODES
     """Fresh episodes that choose the policy to keep."""
-    resume: bool = False
-    """Continue the run in this folder."""
 
     def check(self) -> None:
         """Raises a ValueError that names the first number out of its range."""
         for name, least, most in (
             ("threads", 1, _MOST_THREADS),
-            ("workers", 1, _MOST_THREADS),
             ("seed", 0, 2**32 - 1),
             ("test_episodes", 1, certified.EPISODES),
             ("validation_episodes", 1, _MOST_VALIDATION_EPISODES),
@@ -113,14 +84,11 @@ def train(learner: str, run: Run = Run(), settings: Any = None, command: str | N
         run = replace(run, out=Path("runs") / "train" / f"{file_name(run.task, run.robot)}-{learner}")
     settings = LEARNERS[learner].settings(run.task, run.warm) if settings is None else settings
     check_settings(settings)
-    if run.seeds is not None:
-        _train_seeds(learner, run, settings, run.seeds)
-    else:
-        _train_one(learner, run, settings, command or command_with(learner, run, settings))
+    _train(learner, run, settings, command or command_with(learner, run, settings))
 
 
-def _train_one(learner: str, run: Run, settings: Any, command: str) -> None:
-    """Trains on one seed, and prints what the policy reached."""
+def _train(learner: str, run: Run, settings: Any, command: str) -> None:
+    """Trains, and prints what the policy reached."""
     import torch
 
     from ballbot_gym.engines import PHYSICS_NAMES
@@ -176,33 +144,6 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
     }
 
 
-def _train_seeds(learner: str, run: Run, settings: Any, named: str) -> None:
-    """Trains on several seeds, and prints what each reached."""
-    from ballbot_train.learning import seeds as queue
-
-    seeds, out = queue.parse_seeds(named), cast(Path, run.out)
-
-    def command_of(seed: int) -> str:
-        return command_with(learner, replace(run, seed=seed, out=queue.folder_of(out, seed)), settings) + " --resume"
-
-    expected = {"learner": learner, "task": run.task, "settings": asdict(settings), **robot_setting(run.robot)}
-    with progress_bar() as progress:
-        bar = progress.add_task(f"{learner} {run.task}", total=len(seeds))
-        trained = queue.run(command_of, expected, seeds, out, run.workers, lambda seed: progress.advance(bar))
-    header = ["seed", "", "success", "failures", "mean regret", "minutes"]
-    rows = [_row(str(seed), each) for seed, each in zip(seeds, trained, strict=True)]
-    middle, worst = queue.middle_and_worst(trained)
-    print_table(
-        f"{learner} on {run.task}, certified episodes", header, [*rows, _row("median", middle), _row("worst", worst)]
-    )
-    console.print(f"learning curves: ballbot curves {shlex.quote(str(out))}")
-
-
-def _row(name: str, values: Mapping[str, Any]) -> list[str]:
-    shares = f"{values['success']:.1%}", f"{values['failures']:g}", _share(values["regret_mean"])
-    return [name, "", *shares, f"{values['minutes']:.1f}"]
-
-
 def _share(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:.2%}"
 
@@ -238,10 +179,8 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     if named is not None:
         check_names("learner", [named], LEARNERS)
         check_names("task", [task], TASKS)
-        if {"-h", "--help"} & set(arguments):
-            _print_help(named, LEARNERS[named].settings(task, warm))
-            raise SystemExit(0)
-        tyro.cli(_command(named, task, warm, call), prog=f"ballbot train {named}", args=list(arguments[1:]))
+        command = _command(named, task, warm, call)
+        tyro.cli(command, prog=f"ballbot train {named}", args=list(arguments[1:]), compact_help=True)
         return
     tyro.extras.subcommand_cli_from_dict(
         {name: _command(name) for name in LEARNERS},
@@ -252,55 +191,11 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     )
 
 
-def _print_help(learner: str, settings: Any) -> None:
-    """Prints the options in groups, with their defaults; tyro has no groups whose options keep their names."""
-    options = _described(Run()) | _described(settings)
-    groups = {
-        "first": [options[name] for name in _FIRST],
-        "recipe, tuned for --task": [text for name, text in options.items() if name not in (*_FIRST, *_LAST)],
-        "more": [options[name] for name in _LAST],
-    }
-    console.print(f"usage: ballbot train {learner} [OPTIONS]\n\nTrains by {LEARNERS[learner].description}.")
-    for title, texts in groups.items():
-        console.print(f"\n{title}:")
-        for option, meaning in texts:
-            lines = textwrap.wrap(meaning, max(shutil.get_terminal_size().columns, 60) - _OPTION_WIDTH)
-            if len(option) > _OPTION_WIDTH - 2:
-                lines = ["", *lines]
-            for head, line in itertools.zip_longest([option], lines, fillvalue=""):
-                console.print(f"{head:{_OPTION_WIDTH}}{line}".rstrip())
-
-
-def _described(values: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
-    """How to type each field of a dataclass, and what it means, by name."""
-    found: dict[str, tuple[str, str]] = {}
-    meanings, types = meanings_of(type(values)), get_type_hints(type(values))
-    for name, value in _shallow(values).items():
-        typed, word = (prefix + name).replace("_", "-"), _WORDS.get(types[name], "NAME")
-        default = " ".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
-        meaning = meanings[name] if value is None or value is False else f"{meanings[name]} [{default}]"
-        if is_dataclass(value):
-            found |= _described(value, f"{name}.")
-        elif isinstance(value, bool):
-            found[name] = f"  --{typed}, --no-{typed}", meaning
-        else:
-            choices = ", ".join(map(str, get_args(types[name]))) if word == "NAME" else ""
-            found[prefix + name] = f"  --{typed} {word}", f"{meaning} ({choices})" if choices else meaning
-    return found
-
-
 def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
-    defaults = {  # settings of which older records know nothing
-        "robot": PAPER,
-        "history": 0,
-        "threads": 1,
-        "test_episodes": certified.EPISODES,
-        "validation_episodes": VALIDATION_EPISODES,
-    }
     for name, value in _shallow(run).items():
-        if value is not None and name not in ("resume", "seeds", "workers") and value != defaults.get(name):
+        if name in ("task", "seed") or (value != getattr(Run, name) and name != "resume"):
             words += [f"--{name.replace('_', '-')}", str(value)]
     for name, value in asdict(settings).items():
         words += _option(name.replace("_", "-"), value)

@@ -8,14 +8,13 @@ from ballbot_gym import files
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default, print_table
+from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default, print_rows
 from ballbot_train.evaluation import agreement
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish, run_groups
 from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import rows_of, write_results
 from ballbot_train.executors import Workers
-from ballbot_train.report import figures
 from ballbot_train.report.film import write_film
 from ballbot_train.report.replay import engines_replay
 
@@ -64,12 +63,11 @@ def transfer(
     results = run_groups(groups, episodes, out, workers, matrix.TransferResult, seed)
     rows = rows_of(results, matrix.TransferRow, "made_for", "robot", "friction", "physics", seed=seed)
     write_results("transfer", rows, results, facts, out, matrix.COLUMNS, regret=matrix.REGRET)
-    figures.save(figures.transfer_figure(rows), out / "transfer.png")
     if len(engines) > 1:
         _compare(results, chosen, robot, episodes, engines, out)
     title, table = f"{episodes} certified episodes of {robot} per task", [matrix.cells(row) for row in rows]
     publish(out, "transfer", title, matrix.HEADER, table)
-    console.print(f"matrix: {out / 'transfer.png'}, {out / 'transfer.csv'}")
+    console.print(f"matrix: {out / 'transfer.csv'}")
 
 
 def _compare(
@@ -86,31 +84,23 @@ def _compare(
     far = [d for task, names in own.items() for d in agreement.drifts(task, robot, names[0], engines, episodes)]
     for name, entries in [("engines", found)] + [("drift", far)] * bool(far):
         files.write_csv(out / f"{name}.csv", [asdict(entry) for entry in entries])
-    print_table(
+    print_rows(
         "where engines disagree",
-        ["task", "made for", "controller", "friction", "engines", "ends otherwise", "regret apart"],
         [
-            [d.task, d.made_for, d.controller, f"{d.friction:g}", f"{d.first}, {d.second}", f"{len(d.episodes)}/{d.of}",
-             f"{d.regret:+.2%}" if d.both else "–"]
+            {
+                "task": d.task,
+                "made for": d.made_for,
+                "controller": d.controller,
+                "friction": f"{d.friction:g}",
+                "engines": f"{d.first}, {d.second}",
+                "ends otherwise": f"{len(d.episodes)}/{d.of}",
+                "regret apart": f"{d.regret:+.2%}" if d.both else "–",
+            }
             for d in found
         ],
-    )  # fmt: skip
+    )
     if far:
-        print_table(
-            "distance of the same forces, which nothing corrects",
-            ["task", "engines", "after", "episodes", "median", "worst"],
-            [
-                [
-                    d.task,
-                    f"{d.first}, {d.second}",
-                    f"{d.seconds:g} s",
-                    str(d.episodes),
-                    f"{d.median:.2g} m",
-                    f"{d.worst:.2g} m",
-                ]
-                for d in far
-            ],
-        )
+        console.print(f"distance of the same forces, which nothing corrects: {out / 'drift.csv'}")
     usual = named_robot(robot).friction
     for one in found:
         if one.episodes and one.made_for == robot and one.friction == usual:

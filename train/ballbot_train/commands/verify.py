@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from ballbot_train.console import console, print_table
+from ballbot_train.console import console, print_rows
 from ballbot_train.evaluation import submissions
 
 
@@ -32,21 +32,22 @@ def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:
 
 def print_entries(entries: Sequence[submissions.Entry]) -> None:
     """Prints rows of the leaderboard as a table."""
-    header = ["task", "name", "robot", "physics", "success", "falls", "regret mean"]
-    rows = [
-        [
-            entry.task,
-            entry.name,
-            entry.robot,
-            entry.physics,
-            f"{entry.success:.1%}",
-            f"{entry.falls}/{len(entry.costs)}",
-            regret(entry),
-        ]
-        for entry in entries
-    ]
-    if rows:
-        print_table("verified", header, rows)
+    if entries:
+        print_rows(
+            "verified",
+            [
+                {
+                    "task": entry.task,
+                    "name": entry.name,
+                    "robot": entry.robot,
+                    "physics": entry.physics,
+                    "success": f"{entry.success:.1%}",
+                    "falls": f"{entry.falls}/{len(entry.costs)}",
+                    "regret mean": regret(entry),
+                }
+                for entry in entries
+            ],
+        )
 
 
 def regret(entry: submissions.Entry) -> str:

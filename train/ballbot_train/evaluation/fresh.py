@@ -12,7 +12,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -49,26 +49,8 @@ _BATCH = 2500  # episodes that run at once
 _CHUNK = 5  # episodes of a job that finds optima
 _PURPOSES = {"evaluation": 0, "validation": 1, "training": 2}
 _DISCRETE = 12  # a quantity with at most so many values gets a bin for each of them
-_PER_BIN = 125  # episodes of a bin on average, by default
+_PER_BIN = 125  # episodes of a bin on average
 _MOST_BINS = 80
-
-
-@dataclass(frozen=True)
-class Bin:
-    """The episodes in which one quantity is between two values; equal ends are a single value."""
-
-    measure: str
-    low: float
-    high: float
-    episodes: int
-    success: float
-    """Share; NaN where there is no episode, as of all others."""
-    success_low: float
-    """Of its 95 % Wilson interval."""
-    success_high: float
-    failures: int
-    cost_mean: float
-    """A failure's price included."""
 
 
 @dataclass(frozen=True)
@@ -162,32 +144,24 @@ class FreshResult:
             **{f"regret_{name}": value for name, value in regrets.items()},
         )
 
-    def bins(self) -> list[Bin]:
-        """Success and cost by ranges of every measure, equally wide from its smallest to its largest value.
+    def bins(self) -> list[dict[str, Any]]:
+        """Success, failures and mean cost, a failure's price included, by equally wide ranges of every measure.
 
-        A measure has a bin per 125 episodes, 4 to 80; one with few values has a bin for each.
+        A measure has a range per 125 episodes, 4 to 80; one with few values has one for each. Empty ranges are left out.
         """
-        count = min(max(len(self) // _PER_BIN, 4), _MOST_BINS)
-        return [
-            self._bin(name, low, high, chosen)
-            for name, values in self.measures.items()
-            for low, high, chosen in intervals(values, count)
-        ]
-
-    def _bin(self, measure: str, low: float, high: float, chosen: np.ndarray) -> Bin:
-        n, success = int(chosen.sum()), int(self.success[chosen].sum())
-        success_low, success_high = share_interval(success, n) if n else (math.nan, math.nan)
-        return Bin(
-            measure=measure,
-            low=low,
-            high=high,
-            episodes=n,
-            success=success / n if n else math.nan,
-            success_low=success_low,
-            success_high=success_high,
-            failures=int(self.failure[chosen].sum()),
-            cost_mean=float(self.costs[chosen].mean()) if n else math.nan,
-        )
+        rows, count = [], min(max(len(self) // _PER_BIN, 4), _MOST_BINS)
+        for name, values in self.measures.items():
+            distinct = np.unique(values)
+            few = len(distinct) <= _DISCRETE
+            lows = distinct if few else np.linspace(distinct[0], distinct[-1], count, endpoint=False)
+            highs = distinct if few else np.append(lows[1:], distinct[-1])
+            number = np.searchsorted(lows, values, side="right") - 1
+            for i in np.unique(number):
+                chosen = number == i
+                row = {"measure": name, "low": float(lows[i]), "high": float(highs[i]), "episodes": int(chosen.sum())}
+                row |= {"success": float(self.success[chosen].mean()), "failures": int(self.failure[chosen].sum())}
+                rows.append(row | {"cost_mean": float(self.costs[chosen].mean())})
+        return rows
 
     def worst(self, count: int = 10) -> list[int]:
         """The indices of the worst episodes: those without success first, and then the dearest."""
@@ -212,19 +186,6 @@ def _spread(values: np.ndarray) -> tuple[float, float, float, float]:
     if not len(values):
         return math.nan, math.nan, math.nan, math.nan
     return float(values.mean()), float(np.median(values)), float(np.percentile(values, 99)), float(values.max())
-
-
-def intervals(values: np.ndarray, count: int) -> Iterator[tuple[float, float, np.ndarray]]:
-    """Lower end, upper end and members (n,) bool of equally wide bins of values (n,); few values are a bin each."""
-    distinct = np.unique(values)
-    if len(distinct) <= _DISCRETE:
-        for value in distinct:
-            yield float(value), float(value), values == value
-        return
-    edges = np.linspace(values.min(), values.max(), count + 1)
-    number = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, count - 1)
-    for i in range(count):
-        yield float(edges[i]), float(edges[i + 1]), number == i
 
 
 def priced(costs: np.ndarray, success: np.ndarray, task: Task) -> np.ndarray:
@@ -298,7 +259,7 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         if is_expert(str(policy)):
             raise ValueError(
                 f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
-                "policy, or run the expert on certified episodes with evaluate"
+                "policy, or run the expert on certified episodes with evaluate or ballbot benchmark"
             )
         network = cast(PolicyController, make_controller(str(policy), task, named_robot(robot))).network
 
@@ -440,16 +401,16 @@ def _optima(
             yield {"episode": i, "error": f"only a feasible episode was found ({optimum.solver_status})"}
 
 
-def write(
-    result: FreshResult, bins: Sequence[Bin], worst: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], out: Path
-) -> None:
+def write(result: FreshResult, worst: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], out: Path) -> None:
     """Writes fresh.json, with the facts as "about", summary, bins and worst episodes; and bins, worst and fresh.csv.
 
     fresh.csv has a line for each episode.
     """
-    document = {"about": facts, "summary": [result.summary()], "bins": list(bins), "worst": list(worst)}
-    files.write(out / "fresh.json", to_json(document))
-    files.write_csv(out / "bins.csv", [asdict(entry) for entry in bins])
+    bins = result.bins()
+    files.write(
+        out / "fresh.json", to_json({"about": facts, "summary": [result.summary()], "bins": bins, "worst": list(worst)})
+    )
+    files.write_csv(out / "bins.csv", bins)
     flat = ("start", "constants")  # lists, which are in the JSON file
     files.write_csv(out / "worst.csv", [{key: entry[key] for key in entry if key not in flat} for entry in worst])
     files.write_csv(out / "fresh.csv", [result.episode(i) for i in range(len(result))])

@@ -11,7 +11,6 @@ import numpy as np
 
 from ballbot_gym import files, lazy
 from ballbot_gym.display import Displayed, percent, svg, text
-from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation.statistics import interval
 
 
@@ -107,22 +106,6 @@ class Row(Displayed):
             + text(at_zero, 64, "0", "middle")
             + text(270, 64, percent(most), "middle"),
         )
-
-    def show(self, episode: int = 0, physics: str | None = None, robot: str = PAPER) -> Path | None:
-        """The replay in 3D of a certified episode, run anew: in a notebook below the cell, elsewhere in the browser.
-
-        A row does not hold its physics and robot, and finds its controller by name.
-
-        Args: as of `evaluate`, and the index of the episode.
-
-        Returns:
-            The page that was written and opened; None in a notebook.
-
-        Raises:
-            ValueError: no such episode, physics or robot, or no controller of that name, as for a function of one's own; show
-                what `rollout` returns of it.
-        """
-        return lazy.load("ballbot_train.report.notebook:show_row")(self, episode, physics, robot)
 
     def plot(self, *others: "Row") -> Any:
         """A matplotlib Figure of the mean regret with its interval, beside that of other rows."""

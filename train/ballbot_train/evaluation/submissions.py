@@ -162,13 +162,12 @@ def submit(results: Path, name: str, link: str, out: Path, controller: str = "")
     Raises:
         ValueError: there is no recording in it, or one of several controllers.
     """
-    paths = [path for folder in (results, results / "certified") for path in (folder / recordings.FOLDER).glob("*.npz")]
-    found = [recordings.read(path) for path in sorted(paths)]
+    found = [recordings.read(path) for path in sorted((results / recordings.FOLDER).glob("*.npz"))]
     names = list(dict.fromkeys(recording.about["controller"] for recording in found))
     if not found:
         raise ValueError(
-            f"{results} holds no recordings; make them with evaluate(policy, task, out=...), ballbot evaluate POLICY "
-            f"--episodes {certified.EPISODES} or ballbot benchmark, without randomization"
+            f"{results} holds no recordings; make them with evaluate(policy, task, out=...) or ballbot benchmark, without "
+            "randomization"
         )
     if (controller or len(names) > 1) and controller not in names:
         raise ValueError(f"{results} holds recordings of {', '.join(names)}; say which with --controller")

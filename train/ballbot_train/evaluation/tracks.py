@@ -10,7 +10,7 @@ What delay costs is told beside them, because no controller could avoid it: J le
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -21,11 +21,6 @@ from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.results import Row, shown, summarize
 from ballbot_train.evaluation.robustness import Condition, StressResult
-
-HEADER = (
-    *("track", "task", "controller", "success, %", "failures", "mean regret, %", "95 % interval"),
-    *("delay costs, %", "not knowing costs, %", "controller loses, %"),
-)
 
 
 @dataclass(frozen=True)
@@ -99,21 +94,25 @@ def _last_if_nan(value: float) -> float:
     return value if math.isfinite(value) else math.inf
 
 
+def _percent(*values: float) -> str:
+    return " to ".join(shown(100 * value, ".2f") for value in values)
+
+
+_COLUMNS: dict[str, Callable[[TrackRow], str]] = {
+    "track": lambda row: row.track,
+    "task": lambda row: row.task,
+    "controller": lambda row: row.controller,
+    "success, %": lambda row: f"{100 * row.success:.4g}",
+    "failures": lambda row: f"{row.falls} of {row.episodes}",
+    "mean regret, %": lambda row: _percent(row.regret_mean),
+    "95 % interval": lambda row: _percent(row.regret_low, row.regret_high),
+    "delay costs, %": lambda row: _percent(row.delay_costs),
+    "not knowing costs, %": lambda row: _percent(row.not_knowing_costs),
+    "controller loses, %": lambda row: _percent(row.controller_loses),
+}
+HEADER = list(_COLUMNS)
+
+
 def cells(row: TrackRow) -> list[str]:
     """A line of the table."""
-
-    def percent(*values: float) -> str:
-        return " to ".join(shown(100 * value, ".2f") for value in values)
-
-    return [
-        row.track,
-        row.task,
-        row.controller,
-        f"{100 * row.success:.4g}",
-        f"{row.falls} of {row.episodes}",
-        percent(row.regret_mean),
-        percent(row.regret_low, row.regret_high),
-        percent(row.delay_costs),
-        percent(row.not_knowing_costs),
-        percent(row.controller_loses),
-    ]
+    return [text(row) for text in _COLUMNS.values()]

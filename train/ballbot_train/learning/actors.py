@@ -33,33 +33,27 @@ def spec_for(
     """
     fields: dict[str, Any] = {"hidden": hidden, "linear": linear, "squash": "tanh" if linear else "clip"}
     fields["history"] = history
+    frame, missing = None, ""
     if symmetry == "odd":
-        if not any(set(mirror.state) == {-1} for mirror in task.mirrors):
-            raise ValueError(f'{task.id} is not odd; give "none", "mirrors" or "frame" as its symmetry')
         fields["odd"] = True
+        missing = "" if any(set(mirror.state) == {-1} for mirror in task.mirrors) else "odd symmetry"
     elif symmetry == "mirrors":
-        if not task.mirrors:
-            raise ValueError(f'{task.id} has no mirror images; give "none" as its symmetry')
         fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
-    elif symmetry == "frame":
-        if task.frame is None:
-            raise ValueError(f'{task.id} has no frame; give "none" or "mirrors" as its symmetry')
-        fields["frame"] = task.frame
-    elif symmetry == "fine_frame":
-        if task.fine_frame is None:
-            raise ValueError(f'{task.id} has no fine frame; give "frame", "mirrors" or "none" as its symmetry')
-        fields["frame"] = task.fine_frame
+        missing = "" if task.mirrors else "mirror images"
     elif symmetry == "routes":
-        if task.routed_frame is None:
-            raise ValueError(f'{task.id} has no routes; give "frame", "mirrors" or "none" as its symmetry')
-        fields |= {"frame": task.routed_frame, "routes": _ROUTES}
+        frame, missing, fields["routes"] = task.routed_frame, "routes", _ROUTES
+    elif symmetry == "frame":
+        frame, missing = task.frame, "frame"
+    elif symmetry == "fine_frame":
+        frame, missing = task.fine_frame, "fine frame"
     elif symmetry == "centred":
-        frame = task.frame if task.fine_frame is None else task.fine_frame
-        if frame is None or FRAMES[frame].steady is None:
-            raise ValueError(
-                f'{task.id} has no frame with a steady motion; give "frame", "mirrors" or "none" as its symmetry'
-            )
-        fields |= {"frame": frame, "centred": True}
+        frame, missing, fields["centred"] = task.fine_frame or task.frame, "frame with a steady motion", True
+        frame = frame if frame is not None and FRAMES[frame].steady is not None else None
+    if frame is not None:
+        fields["frame"] = frame
+    elif missing:
+        others = 'give "none", "mirrors", "frame" or another as its symmetry'
+        raise ValueError(f"{task.id} has no {missing}; {others}")
     return PolicySpec.of(task, **fields)
 
 

@@ -26,7 +26,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
@@ -40,6 +40,7 @@ from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.optimum import Backoff, Optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import files, seeding
+from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
@@ -64,11 +65,11 @@ class DemoConfig:
     task: str = "stabilize"
     """Name of a task."""
     expert: str = "trajopt"
-    """Name of a controller in `CONTROLLERS`, or of a policy that comes with the package."""
+    """Name of a controller, as trajopt (a plan, tracked by TVLQR), nmpc or lqr, or of a shipped policy."""
     episodes: int = 200
     """Number of episodes."""
-    physics: Literal["bullet", "mujoco", "rk4"] = "bullet"
-    """Simulator."""
+    physics: Literal["bullet", "mujoco", "rk4"] = field(default_factory=lambda: cast(Any, default_physics()))
+    """Simulator; default, the first that is installed."""
     noise: float = 0.05
     """Exploration: each episode draws the standard deviation of its noise from [0, this], in units of the force limit."""
     pushes: float = 0.5
@@ -81,6 +82,7 @@ class DemoConfig:
     """Name of a robot in `ROBOTS`."""
 
     def __post_init__(self) -> None:
+        check_installed(self.physics)
         task = make_task(self.task, self.robot)
         check_names("expert", [self.expert], controllers.names(task, self.robot))
         if not 1 <= self.episodes <= _MOST_EPISODES:

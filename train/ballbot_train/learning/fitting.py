@@ -10,7 +10,7 @@ import torch
 from ballbot_baselines.lqr import equilibrium_gain
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_train.learning.actors import RoutedSymmetry, spec_for
+from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork
 
 
@@ -46,22 +46,12 @@ class Samples:
 
 
 class Fit:
-    """Fits a policy network to samples: Adam on the weighted mean squared error of its actions."""
+    """Fits a network to samples: Adam on the weighted mean squared error of its actions."""
 
-    def __init__(
-        self,
-        task: Task,
-        params: BallbotParams,
-        symmetry: RoutedSymmetry,
-        hidden: tuple[int, ...],
-        seed: int,
-        history: int = 0,
-    ):
-        """The network starts as LQR if the task ends at rest in an equilibrium, and at zero otherwise."""
-        torch.manual_seed(seed)
-        self.network = PolicyNetwork(spec_for(task, symmetry, hidden, True, history))
-        start_as_lqr(self.network, task, params)
-        self._optimizer = torch.optim.Adam(self.network.parameters())
+    def __init__(self, network: torch.nn.Module):
+        """Args: network: from observations (n, no) to actions (n, 2)."""
+        self.network = network
+        self._optimizer = torch.optim.Adam(network.parameters())
 
     def run(
         self, samples: Samples, gradient_steps: int, batch_size: int, learning_rate: float, rng: np.random.Generator
@@ -82,12 +72,14 @@ class Fit:
 
     def state_dict(self) -> dict[str, Any]:
         """Weights and the optimizer's state: tensors and plain values."""
-        return {"network": self.network.state_dict(), "optimizer": self._optimizer.state_dict()}
+        return state_of(self, _STATE)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
-        self.network.load_state_dict(state["network"])
-        self._optimizer.load_state_dict(state["optimizer"])
+        load_state(self, _STATE, state)
+
+
+_STATE = ("network", "_optimizer")
 
 
 def start_as_lqr(network: PolicyNetwork, task: Task, params: BallbotParams) -> None:

@@ -46,7 +46,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
-from ballbot_gym.batch import BallbotBatch, BatchEpisodes, run_episodes
+from ballbot_gym.batch import BallbotBatch, run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot
@@ -122,21 +122,6 @@ class Score:
     """Number of episodes that failed."""
 
 
-def _score(run: BatchEpisodes, task: Task, optima: np.ndarray) -> Score:
-    """Score of episodes whose optima cost so much, (B,)."""
-    ratio = run.cost.numpy() / optima
-    priced = fresh.priced(run.cost.numpy(), run.success.numpy(), task) / optima
-    standing = ratio[~run.failure.numpy()] - 1
-    return Score(
-        cost_ratio=float(priced.mean()),
-        regret_mean=float(standing.mean()) if standing.size else math.nan,
-        regret_median=float(np.median(standing)) if standing.size else math.nan,
-        regret_worst=float(standing.max()) if standing.size else math.nan,
-        success=float(run.success.double().mean()),
-        failures=int(run.failure.sum()),
-    )
-
-
 @dataclass(frozen=True)
 class Validation:
     """What a policy costs on the validation set, in the batched closed-form model."""
@@ -172,42 +157,30 @@ def score_and_validate(
     With a randomization the optima are those of its episodes.
     """
     known = certified.load(task, robot, randomization=randomization)
-    fresh_set = _validation_set(task, robot, episodes, randomization)
-    drawn = known.drawn
-    if not drawn.shape[1]:  # as on a track that moves no optimum
-        drawn = fresh.draw_robots(task, range(len(known)), _CERTIFIED_SEED, randomization, "validation")
-    scored, validated = _runs(policy, task, robot, randomization, (known.states, known.constants, drawn), fresh_set)
-    return _score(scored, task, known.costs), _validation(validated, task)
-
-
-def _validation_set(task: Task, robot: str, episodes: int, randomization: Randomization) -> tuple[np.ndarray, ...]:
-    """Initial states (B, 8), constants (B, nc) and what is drawn of the validation set."""
-    indices = range(episodes)
-    drawn = fresh.draw_robots(task, indices, _VALIDATION_SEED, randomization, "validation")
-    return *fresh.draw(task, indices, _VALIDATION_SEED, "validation", robot), drawn
-
-
-def _runs(
-    policy: Policy, task: Task, robot: str, randomization: Randomization, *sets: tuple[np.ndarray, ...]
-) -> tuple[BatchEpisodes, ...]:
-    """Runs all episodes of some sets of states (B, 8), constants (B, nc) and draws in one batch."""
-    states, constants, drawn = map(np.concatenate, zip(*sets, strict=True))
+    count = len(known)
+    x, c = fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot)
+    sets = ((count, _CERTIFIED_SEED), (episodes, _VALIDATION_SEED))
+    draws = [fresh.draw_robots(task, range(n), seed, randomization, "validation") for n, seed in sets]
+    if known.drawn.shape[1]:  # else the track moves no optimum
+        draws[0] = known.drawn
+    drawn, states, constants = map(np.concatenate, (draws, (known.states, x), (known.constants, c)))
     spec = getattr(policy, "spec", None)
     history = spec.history if isinstance(spec, PolicySpec) else 0
     batch = BallbotBatch(task, len(states), compile=False, robot=robot, randomization=randomization, history=history)
     run = run_episodes(batch, policy, states, constants, drawn=drawn if drawn.shape[1] else None)
-    lengths = [len(x) for x, *_ in sets]
-    columns = [part.split(lengths) for part in run if part is not None]  # all but the states
-    return tuple(BatchEpisodes(*parts, states=None) for parts in zip(*columns, strict=True))
-
-
-def _validation(run: BatchEpisodes, task: Task) -> Validation:
-    return Validation(
-        cost=float(fresh.priced(run.cost.numpy(), run.success.numpy(), task).mean()),
-        success=float(run.success.double().mean()),
-        failures=int(run.failure.sum()),
-        mean_cost=float(run.cost.mean()),
+    cost, success, failure = run.cost.double().numpy(), run.success.numpy(), run.failure.numpy()
+    priced = fresh.priced(cost, success, task)
+    standing = (cost[:count] / known.costs - 1)[~failure[:count]]
+    mean, median, worst = (float(of(standing)) if standing.size else math.nan for of in (np.mean, np.median, np.max))
+    ratio = float((priced[:count] / known.costs).mean())
+    score = Score(ratio, mean, median, worst, float(success[:count].mean()), int(failure[:count].sum()))
+    validation = Validation(
+        cost=float(priced[count:].mean()),
+        success=float(success[count:].mean()),
+        failures=int(failure[count:].sum()),
+        mean_cost=float(cost[count:].mean()),
     )
+    return score, validation
 
 
 @own_defaults()

@@ -95,7 +95,7 @@ def bootstrap_band(values: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.nd
 
 
 def read_runs(paths: Sequence[Path]) -> list[TrainingRun]:
-    """The trainings in folders: runs, or folders of runs such as those of `ballbot train --seeds`.
+    """The trainings in folders: runs, or folders of runs.
 
     Raises:
         ValueError: a folder holds none, or a run's files are damaged.

@@ -1,12 +1,12 @@
 """Figures of trajectories and of comparisons, in matplotlib."""
 
 import io
+import itertools
 import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import patches
@@ -22,13 +22,8 @@ from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.basins import AXES, BasinMap
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, StressRow, curve_of
-from ballbot_train.evaluation.transfer import REGRET as REGRET_ON_OWN_FLOOR
-from ballbot_train.evaluation.transfer import TransferRow
 from ballbot_train.report.labels import COLORS as COLORS
 from ballbot_train.report.labels import LABELS, color, label
-
-if TYPE_CHECKING:
-    from ballbot_train.evaluation.fresh import Bin, FreshResult  # it imports torch
 
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 
@@ -67,40 +62,29 @@ def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Cir
         [["position", "velocity", "path"], ["lean", "force", "path"]], width_ratios=[1, 1, 1.25]
     )
     panels = {
-        "position": ("ball position, m", 0, ("x", "y"), 1.0),
-        "velocity": ("ball velocity, m/s", 4, ("ẋ", "ẏ"), 1.0),
-        "lean": ("lean, deg", 2, ("γ", "θ"), 180 / math.pi),
+        "position": ("ball position, m", 0, "x solid, y dotted", 1.0),
+        "velocity": ("ball velocity, m/s", 4, "ẋ solid, ẏ dotted", 1.0),
+        "lean": ("lean, deg", 2, "γ solid, θ dotted", 180 / math.pi),
+        "force": ("force, N", None, "Fx solid, Fy dotted", 1.0),
     }
+    for key, (y_label, first, names, factor) in panels.items():
+        axis = axes[key]
+        for curve, i in itertools.product(curves, range(2)):
+            t, values = (
+                curve.trajectory.t,
+                curve.trajectory.u[:, i] if first is None else curve.trajectory.x[:, first + i],
+            )
+            held = "steps-post" if first is None and curve.trajectory.held else "default"
+            look = {"color": curve.color, "lw": 1.5, "alpha": 0.8 if i else 1.0, "drawstyle": held}
+            axis.plot(t[: len(values)], factor * values, ":" if i else curve.style, **look)
+        axis.set_ylabel(y_label)
+        axis.set_title(names, fontsize=9, color="0.35")
+        axis.grid(alpha=0.3)
+        axis.axhline(0, color="0.6", lw=0.6)
     for curve in curves:
-        t, x = curve.trajectory.t, curve.trajectory.x
-        for key, (_, first, names, factor) in panels.items():
-            for i, name in enumerate(names):
-                axes[key].plot(
-                    t,
-                    factor * x[:, first + i],
-                    _component_style(curve, i),
-                    color=curve.color,
-                    lw=1.5,
-                    alpha=_alpha(i),
-                    label=f"{name}" if curve is curves[0] else None,
-                )
-        _plot_forces(axes["force"], curve)
-        axes["path"].plot(x[:, 0], x[:, 1], curve.style, color=curve.color, lw=2, label=curve.label)
-    for key, (y_label, *_rest) in panels.items():
-        axes[key].set_ylabel(y_label)
-    axes["force"].set_ylabel("force, N")
+        axes["path"].plot(*curve.trajectory.x[:, :2].T, curve.style, color=curve.color, lw=2, label=curve.label)
     for key in ("lean", "force"):
         axes[key].set_xlabel("time, s")
-    for key in ("position", "velocity", "lean", "force"):
-        axes[key].grid(alpha=0.3)
-        axes[key].axhline(0, color="0.6", lw=0.6)
-    for key, names in (
-        ("position", "x solid, y dotted"),
-        ("velocity", "ẋ solid, ẏ dotted"),
-        ("lean", "γ solid, θ dotted"),
-        ("force", "Fx solid, Fy dotted"),
-    ):
-        axes[key].set_title(names, fontsize=9, color="0.35")
     _finish_path(axes["path"], curves, circles)
     return figure
 
@@ -163,35 +147,6 @@ def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
     return figure
 
 
-def transfer_figure(rows: Sequence[TransferRow]) -> Figure:
-    """For every task, the success of controllers made for one robot on another, by its floors; below it their mean regret.
-
-    The regret is over that robot's optimum on its own floor.
-    """
-    tasks = list(dict.fromkeys(row.task for row in rows))
-    floors = sorted({(row.friction, row.physics) for row in rows}, key=lambda floor: (-floor[0], floor[1]))
-    engines = len({row.physics for row in rows}) > 1
-    made = {task: list(dict.fromkeys((r.made_for, r.controller) for r in rows if r.task == task)) for task in tasks}
-    most = max(map(len, made.values()))
-    figure = Figure(figsize=((1.7 + 0.9 * len(floors)) * len(tasks) + 0.6, 1.6 + 0.45 * most), layout="constrained")
-    figure.suptitle(f"Success on the robot {rows[0].robot}, and mean {REGRET_ON_OWN_FLOOR}", fontsize=12)
-    for axis, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
-        shares = np.full((len(made[task]), len(floors)), np.nan)
-        for row in rows:
-            if row.task == task:
-                i, k = made[task].index((row.made_for, row.controller)), floors.index((row.friction, row.physics))
-                shares[i, k] = 100 * row.success
-                regret = f"{100 * row.regret_mean:+.3g} %" if math.isfinite(row.regret_mean) else "–"
-                axis.text(k, i, f"{100 * row.success:.0f} %\n{regret}", ha="center", va="center", fontsize=7)
-        axis.imshow(shares, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.6)
-        names = [f"{floor:g}".replace("inf", "∞") + engines * f"\n{physics}" for floor, physics in floors]
-        axis.set_xticks(range(len(floors)), names)
-        axis.set_yticks(range(len(made[task])), [f"{label(name)}, {robot}" for robot, name in made[task]], fontsize=8)
-        axis.set_title(task, fontsize=10)
-        axis.set_xlabel("friction of the floor", fontsize=9)
-    return figure
-
-
 def basin_figure(maps: Sequence[BasinMap]) -> Figure:
     """The initial states from which each controller recovers, coloured, on those that the robot's limits allow, grey."""
     controllers = list(maps[0].recovered)
@@ -218,51 +173,6 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
     return figure
 
 
-def fresh_figure(result: "FreshResult", bins: "Sequence[Bin]") -> Figure:
-    """Fresh episodes by every quantity that makes them hard: the share without success, with its interval, and mean cost."""
-    names = list(result.measures)
-    figure = Figure(figsize=(max(6.0, 3.6 * len(names)), 6.3), layout="constrained")
-    axes = figure.subplots(2, len(names), squeeze=False)
-    summary = result.summary()
-    figure.suptitle(
-        f"{label(result.policy)} on {len(result)} fresh episodes of {result.task.id}:\n"
-        f"{summary.success:.2%} success, {summary.failures} failures",
-        fontsize=12,
-    )
-    for k, name in enumerate(names):
-        _plot_bins(axes[0][k], axes[1][k], [entry for entry in bins if entry.measure == name and entry.episodes])
-        axes[1][k].set_xlabel(name, fontsize=9)
-    axes[0][0].set_ylabel("without success, %\n(dark: limit violated)", fontsize=9)
-    axes[1][0].set_ylabel("mean cost", fontsize=9)
-    return figure
-
-
-def _plot_bins(above: Axes, below: Axes, bins: "Sequence[Bin]") -> None:
-    middles = [(entry.low + entry.high) / 2 for entry in bins]
-    apart = min(np.diff(middles), default=1.0)
-    widths = [entry.high - entry.low or 0.8 * apart for entry in bins]
-    missed = np.array([100 * (1 - entry.success) for entry in bins])
-    low = np.array([100 * (1 - entry.success_high) for entry in bins])
-    high = np.array([100 * (1 - entry.success_low) for entry in bins])
-    whiskers = np.clip([missed - low, high - missed], 0, None)  # rounding can put an end on the wrong side
-    above.bar(middles, missed, widths, color="#e8a87c", yerr=whiskers, error_kw={"lw": 0.6, "ecolor": "0.5"})
-    above.bar(middles, [100 * entry.failures / entry.episodes for entry in bins], widths, color="#8b1a1a")
-    above.set_ylim(0, max(1.0, 1.1 * missed.max(), min(100.0, 1.05 * high[missed > 0].max(initial=0))))
-    below.bar(middles, [entry.cost_mean for entry in bins], widths, color="#1f6fb2")
-    for axis in (above, below):
-        axis.grid(alpha=0.3)
-
-
-def add_circles(axis: Axes, circles: Sequence[Circle]) -> None:
-    """Draws circles on a ground path, below everything else."""
-    for circle in circles:
-        line = "-" if circle.filled else "--"
-        shape = patches.Circle(
-            (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
-        )
-        axis.add_patch(shape).set_zorder(0)
-
-
 def save(figure: Figure, path: Path) -> Path:
     """Writes a figure as a PNG."""
     plain(figure)
@@ -285,26 +195,13 @@ def _folded(text: str) -> str:
     return "\n".join(textwrap.wrap(text, 28))
 
 
-def _component_style(curve: Curve, i: int) -> str:
-    return curve.style if i == 0 else ":"
-
-
-def _alpha(i: int) -> float:
-    return 1.0 if i == 0 else 0.8
-
-
-def _plot_forces(axis: Axes, curve: Curve) -> None:
-    trajectory = curve.trajectory
-    for i in range(2):
-        style, common = _component_style(curve, i), {"color": curve.color, "lw": 1.2, "alpha": _alpha(i)}
-        if trajectory.held:
-            axis.step(trajectory.t[:-1], trajectory.u[:, i], style, where="post", **common)
-        else:
-            axis.plot(trajectory.t, trajectory.u[:, i], style, **common)
-
-
 def _finish_path(axis: Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
-    add_circles(axis, circles)
+    for circle in circles:
+        line = "-" if circle.filled else "--"
+        shape = patches.Circle(
+            (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
+        )
+        axis.add_patch(shape).set_zorder(0)
     start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
     axis.plot(*start[:2], "o", color="k", ms=5)
     axis.plot(*end[:2], "s", color="k", ms=5)

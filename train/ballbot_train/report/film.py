@@ -1,4 +1,4 @@
-"""Replays as a strip of pictures or as a film, with plots by matplotlib."""
+"""Replays as a strip of pictures or as a film."""
 
 import io
 import math
@@ -6,21 +6,16 @@ import tempfile
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import imageio.v2 as imageio
+import matplotlib
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from ballbot_gym import dynamics, files
-from ballbot_gym.drawing import Drawing
 from ballbot_gym.picture import picture
-from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
 from ballbot_train.report.replay import LEAST_SLIP, Replay
 
@@ -28,11 +23,8 @@ Format = Literal["png", "mp4", "gif", "webp"]
 
 _FAILED = "#c01818"
 _GIF_COLORS = 128
-_INCHES = (
-    9.0,
-    12.8,
-)  # of a film's figure: the narrowest and the widest, between which text has the same size in pixels
-_NOTE = 10  # points, of what is said in a take's corner
+_FONT = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
+_COLUMNS = 4
 _STRIP_SIZE = (520, 390)  # pixels of a strip's picture
 _FALLEN = 45.0  # deg: at a smaller tilt a failure is the touch of an obstacle, or a lost grip
 _PAUSE = 1.5  # s, for which a film that loops shows its last picture
@@ -45,8 +37,8 @@ def write_strip(replay: Replay, path: Path, frames: int, seconds: float) -> Path
     axes = figure.subplots(rows, frames, squeeze=False)
     for row, take in zip(axes, replay.takes, strict=True):
         for axis, t in zip(row, np.linspace(0, seconds, frames), strict=True):
-            _View(axis, *_STRIP_SIZE).draw(replay.drawing(take, t))
-            axis.set_aspect("equal")
+            axis.imshow(picture(replay.drawing(take, t), *_STRIP_SIZE), interpolation="antialiased")
+            axis.set(xticks=[], yticks=[])
             held = min(t, take.trajectory.duration)
             axis.set_title(f"{held:.2f} s, {_tilt(take.trajectory.state(held)):.0f}°", fontsize=9)
         if rows > 1:
@@ -63,7 +55,7 @@ def write_film(
     width: int = 1280,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Writes a film of the takes side by side, above their tilts, forces and ground paths.
+    """Writes a film of the takes side by side.
 
     Args:
         replay: the takes.
@@ -125,136 +117,35 @@ def film_times(seconds: float, fps: int, speed: float) -> np.ndarray:
 
 
 def film_frames(replay: Replay, times: Sequence[float] | np.ndarray, width: int = 1280) -> Iterator[np.ndarray]:
-    """Yields frames (h, width, 3), uint8, at times of the episode, s."""
-    film = _Film(replay, float(np.max(times)), width)
-    for t in times:
-        yield film.frame(float(t))
-
-
-class _View:
-    """A picture of a drawing that fills an axes."""
-
-    def __init__(self, axis: Axes, width: int, height: int):
-        """Args: width and height in pixels."""
-        self._size = width, height
-        axis.set_xticks([])
-        axis.set_yticks([])
-        for spine in axis.spines.values():
-            spine.set_color("0.85")
-        blank = np.full((height, width, 3), 255, np.uint8)
-        self.image = axis.imshow(blank, aspect="auto", interpolation="antialiased")
-
-    def draw(self, drawing: Drawing) -> None:
-        """Shows a moment in place of the one before."""
-        self.image.set_data(picture(drawing, *self._size))
-
-
-class _Stage(NamedTuple):
-    """The changing parts of one take: the robot, its tilt, how the take ends, and a word that appears when it fails."""
-
-    view: _View
-    tilt: Text
-    note: Text
-    end: Text
-
-
-class _Film:
-    """A figure whose fixed parts are drawn once, and whose moving parts are drawn over them for every frame."""
-
-    def __init__(self, replay: Replay, seconds: float, width: int):
-        self._replay = replay
-        inches = min(max(width / 100, _INCHES[0]), _INCHES[1])
-        self._figure = Figure(figsize=(inches, inches * 9 / 16), dpi=width / inches)
-        self._canvas = FigureCanvasAgg(self._figure)
-        self._figure.text(0.01, 0.975, replay.title, fontsize=12, va="center")
-        self._clock = self._figure.text(0.99, 0.975, "", fontsize=12, va="center", ha="right", family="monospace")
-        self._moving: list[Artist] = [self._clock]
-        self._add_stages()
-        self._add_traces(seconds)
-        for artist in self._moving:
-            artist.set_animated(True)
-        figures.plain(self._figure)
-        self._canvas.draw()
-        self._fixed = self._canvas.copy_from_bbox(self._figure.bbox)
-
-    def frame(self, t: float) -> np.ndarray:
-        self._clock.set_text(f"{t:5.2f} s")
-        for take, stage in zip(self._replay.takes, self._stages, strict=True):
-            stage.view.draw(self._replay.drawing(take, t))
-            slip = take.slip_at(t)
-            slips = f"\nslips, {slip:.1f} m/s" if slip > LEAST_SLIP else ""
-            stage.tilt.set_text(f"{_tilt(take.trajectory.state(t)):.0f}°{slips}")
-            ended = t >= take.trajectory.duration
-            stage.end.set_visible(take.failed and ended)
-            stage.note.set_visible(ended or not take.failed)
-        for cursor in self._cursors:
-            cursor.set_xdata([t, t])
-        for take, dot in zip(self._replay.takes, self._dots, strict=True):
-            dot.set_data(*take.trajectory.state(t)[:2, None])
-        self._canvas.restore_region(self._fixed)
-        for artist in self._moving:
-            self._figure.draw_artist(artist)
-        pixels = np.asarray(self._canvas.buffer_rgba())[:, :, :3]
-        return pixels[: len(pixels) // 2 * 2, : pixels.shape[1] // 2 * 2].copy()  # H.264 wants even sizes
-
-    def _add_stages(self) -> None:
-        count = len(self._replay.takes)
-        columns = min(count, 4)
-        rows = math.ceil(count / columns)
-        width, height = (0.99 - 0.005) / columns, 0.62 / rows
-        letter = 0.6 * _NOTE * self._figure.dpi / 72  # its width in pixels: wide ones are wider, spaces narrower
-        self._stages: list[_Stage] = []
-        for i, take in enumerate(self._replay.takes):
-            left, bottom = 0.005 + i % columns * width, 0.95 - (i // columns + 1) * height
-            axis = self._figure.add_axes((left + 0.003, bottom, width - 0.006, height - 0.055))
-            box = axis.get_window_extent()
-            view = _View(axis, round(box.width), round(box.height))
-            axis.set_title(take.label, fontsize=11, color=take.color, loc="left", pad=4)
-            corner = {"transform": axis.transAxes, "va": "top"}
-            tilt = axis.text(0.03, 0.97, "", fontsize=16, color=take.color, **corner)
-            end = axis.text(0.97, 0.97, "", fontsize=16, color=_FAILED, ha="right", weight="bold", **corner)
-            if take.failed:
-                end.set_text("fell" if _tilt(take.trajectory.x[-1]) > _FALLEN else "failed")
-            note = axis.text(
-                0.97,
-                0.03,
-                "\n".join(textwrap.fill(part, round(box.width / letter)) for part in take.note.split("; ")),
-                fontsize=_NOTE,
-                color="0.2",
-                ha="right",
-                transform=axis.transAxes,
-            )
-            self._stages.append(_Stage(view, tilt, note, end))
-            self._moving += [view.image, tilt, note, end]
-
-    def _add_traces(self, seconds: float) -> None:
-        tilt, force, path = (
-            self._figure.add_axes((left, 0.075, width, 0.21))
-            for left, width in ((0.05, 0.3), (0.41, 0.3), (0.76, 0.23))
-        )
-        for take in self._replay.takes:
-            t, u = take.trajectory.t, take.trajectory.u
-            tilt.plot(t, np.degrees(take.trajectory.tilt), color=take.color, lw=1.6)
-            force.plot(t[: len(u)], np.hypot(*u.T), color=take.color, lw=1.2, drawstyle=_drawstyle(take.trajectory))
-            path.plot(*take.trajectory.x[:, :2].T, color=take.color, lw=1.6)
-        tilt.set(xlim=(0, seconds), xlabel="time, s", title="tilt, deg")
-        force.set(xlim=(0, seconds), xlabel="time, s", title="force, N")
-        path.set(title="ground path, m")
-        path.set_aspect("equal", adjustable="datalim")
-        figures.add_circles(path, figures.marker_circles(self._replay.markers))
-        for axis in (tilt, force, path):
-            axis.grid(alpha=0.3)
-            axis.tick_params(labelsize=8)
-            axis.title.set_fontsize(9)
-            axis.xaxis.label.set_fontsize(8)
-        self._cursors = [axis.axvline(0, color="0.2", lw=1) for axis in (tilt, force)]
-        self._dots = [path.plot([], [], "o", color=take.color, ms=6)[0] for take in self._replay.takes]
-        self._moving += [*self._cursors, *self._dots]
-
-
-def _drawstyle(trajectory: Trajectory) -> str:
-    """The matplotlib style of forces over time."""
-    return "steps-post" if trajectory.held else "default"
+    """Yields frames (h, width, 3), uint8, at times of the episode, s: the takes side by side, at most four in a row."""
+    width, height = width // 2 * 2, width * 9 // 32 * 2  # H.264 wants even sizes
+    line = max(height // 32, 9)  # px, the height of the words
+    font, large = (ImageFont.truetype(_FONT, size) for size in (line, 3 * line // 2))
+    columns = min(len(replay.takes), _COLUMNS)
+    wide, high = width // columns, (height - 2 * line) // math.ceil(len(replay.takes) / columns)
+    letters = max(5, round(1.5 * wide / line))  # that fit into a line
+    for t in map(float, times):
+        frame = Image.new("RGB", (width, height), "white")
+        pen = ImageDraw.Draw(frame)
+        pen.text((line // 2, line // 2), replay.title, "black", font)
+        pen.text((width - line // 2, line // 2), f"{t:.2f} s", "black", font, "ra")
+        for i, take in enumerate(replay.takes):
+            left, top = i % columns * wide + 2, i // columns * high + 2 * line
+            right, bottom = left + wide - 4, top + high - 4
+            shown = picture(replay.drawing(take, t), max(right - left, 1), max(bottom - top, 1))
+            frame.paste(Image.fromarray(shown), (left, top))
+            slip, ended = take.slip_at(t), t >= take.trajectory.duration
+            tilt = f"{_tilt(take.trajectory.state(t)):.0f}°" + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
+            label = textwrap.fill(take.label, letters)
+            pen.text((left + 3, top + 2), label, take.color, font)
+            pen.text((left + 3, top + 3 * line // 2 * (1 + label.count("\n"))), tilt, take.color, large)
+            if take.failed and ended:
+                fell = "fell" if _tilt(take.trajectory.x[-1]) > _FALLEN else "failed"
+                pen.text((right - 4, top + 3 * line // 2), fell, _FAILED, large, "ra")
+            if ended or not take.failed:
+                note = "\n".join(textwrap.fill(part, letters) for part in take.note.split("; "))
+                pen.text((right - 4, bottom - 4), note, "#333333", font, "rd", align="right")
+        yield np.asarray(frame)
 
 
 def _tilt(x: np.ndarray) -> float:

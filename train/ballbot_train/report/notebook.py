@@ -13,13 +13,12 @@ from matplotlib.figure import Figure
 
 from ballbot_gym import files
 from ballbot_gym.display import Moving
-from ballbot_gym.engines import default_physics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import checked_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.report import figures, labels
 from ballbot_train.report.page import replay_page
-from ballbot_train.report.replay import Replay, Take, certified_replay, playable
+from ballbot_train.report.replay import Replay, Take, playable
 
 if TYPE_CHECKING:
     from ballbot_train.evaluation.results import Row
@@ -45,11 +44,6 @@ def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
         for i, (name, one) in enumerate(zip(names, shown, strict=True))
     ]
     return _figure(figures.trajectory_figure("", curves, figures.marker_circles(_markers(shown))))
-
-
-def show_row(row: "Row", episode: int, physics: str | None, robot: str) -> Path | None:
-    """See `ballbot_train.evaluation.results.Row.show`."""
-    return _show(certified_replay(row.task, [row.controller], episode, physics or default_physics(), robot=robot))
 
 
 def plot_rows(rows: "Sequence[Row]") -> Figure:

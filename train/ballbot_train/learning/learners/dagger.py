@@ -39,9 +39,9 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry, check_start, started
+from ballbot_train.learning.actors import RoutedSymmetry, check_start, spec_for, started
 from ballbot_train.learning.datasets import StreamedDemos, load_demos
-from ballbot_train.learning.fitting import Fit, Samples
+from ballbot_train.learning.fitting import Fit, Samples, start_as_lqr
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.shards import is_set
@@ -198,7 +198,10 @@ class Dagger:
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._task, self._params, self._seed = task, params, seed
         self._randomization, self._history = randomization, history
-        self._fit = Fit(task, params, config.symmetry, config.hidden, seed, history)
+        torch.manual_seed(seed)
+        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
+        start_as_lqr(self._network, task, params)
+        self._fit = Fit(self._network)
         none = np.zeros((0, len(task.observation_scale) * (1 + history) + 2 * history))
         self._streamed = samples if isinstance(samples, StreamedDemos) else None
         self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, 2)))
@@ -209,7 +212,7 @@ class Dagger:
 
     @property
     def network(self) -> PolicyNetwork:
-        return self._fit.network
+        return self._network
 
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes

@@ -24,6 +24,7 @@ from ballbot_train.learning.actors import Symmetry, average_of
 from ballbot_train.learning.critics import value_of_living, weigh_gradients
 from ballbot_train.learning.curricula import CurriculumBatch
 from ballbot_train.learning.datasets import Demos
+from ballbot_train.learning.fitting import Fit, Samples
 from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.learning.state import load_state, state_of
@@ -364,39 +365,23 @@ class TrainingEnv(VecEnvWrapper):
         return features
 
 
-class Imitation:
+class Imitation(Fit):
     """Imitation of an expert by an actor: behaviour cloning, and a loss to add to that of reinforcement learning."""
 
     def __init__(self, actor: nn.Module, demos: Demos):
         """Args: actor: observations (n, no) to mean actions (n, 2)."""
-        self._actor = actor
-        self._observations, self._labels = torch.as_tensor(demos.observations), torch.as_tensor(demos.actions)
-        self._optimizer = torch.optim.Adam(actor.parameters())
+        super().__init__(actor)
+        self._samples = Samples.of(demos.observations, demos.actions)
 
     def loss(self) -> torch.Tensor:
         """Mean squared difference from the expert's actions in demonstrated states, drawn at random."""
-        chosen = torch.randint(len(self._labels), (_CLONE_BATCH,))
-        return nn.functional.mse_loss(self._actor(self._observations[chosen]), self._labels[chosen])
+        chosen = torch.randint(len(self._samples), (_CLONE_BATCH,))
+        return nn.functional.mse_loss(self.network(self._samples.observations[chosen]), self._samples.actions[chosen])
 
     def clone(self, learning_rate: float) -> dict[str, float]:
         """Takes gradient steps of behaviour cloning; returns figures to log."""
-        total = 0.0
-        self._optimizer.param_groups[0]["lr"] = learning_rate
-        for _ in range(_CLONE_STEPS):
-            loss = self.loss()
-            self._optimizer.zero_grad()
-            loss.backward()
-            self._optimizer.step()
-            total += float(loss.detach())
-        return {"loss/cloning": total / _CLONE_STEPS}
-
-    def state_dict(self) -> dict[str, Any]:
-        """State of the optimizer. The actor belongs to the model."""
-        return self._optimizer.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes back to a state."""
-        self._optimizer.load_state_dict(state)
+        rng = np.random.default_rng(int(torch.randint(2**31, ())))
+        return {"loss/cloning": self.run(self._samples, _CLONE_STEPS, _CLONE_BATCH, learning_rate, rng)}
 
 
 class ScopedRng:

@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -183,30 +181,6 @@ class SymmetricReplay(NStepReplayBuffer):
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class Critics(ContinuousCritic):
-    """SB3's critics, each with another network."""
-
-    def __init__(
-        self,
-        observation_space: gymnasium.Space,
-        action_space: gymnasium.spaces.Box,
-        net_arch: list[int],
-        *,
-        features_dim: int,
-        activation_fn: type[torch.nn.Module],
-        network: "CriticNetwork",
-        **kwargs: Any,
-    ):
-        """Args: network: makes one critic's network; the others are SB3's."""
-        super().__init__(
-            observation_space, action_space, net_arch, features_dim=features_dim, activation_fn=activation_fn, **kwargs
-        )
-        inputs = features_dim + get_action_dim(action_space)
-        self.q_networks = [network(inputs, net_arch, activation_fn) for _ in range(self.n_critics)]
-        for index, critic in enumerate(self.q_networks):
-            self.add_module(f"qf{index}", critic)
-
-
 class CentredMean(torch.nn.Module):
     """The mean action of an actor in a frame, which keeps the frame's steady motion exactly; see `PolicyNetwork`."""
 
@@ -252,8 +226,12 @@ class OwnPolicy(SACPolicy):
         return CentredActor(**kwargs, frame=self._centre).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return Critics(**kwargs, network=self._network).to(self.device)
+        critic = super().make_critic(features_extractor)
+        inputs, hidden = critic.features_extractor.features_dim + 2, cast(list[int], self.net_arch)
+        critic.q_networks = [self._network(inputs, hidden, self.activation_fn) for _ in critic.q_networks]
+        for index, network in enumerate(critic.q_networks):
+            critic.add_module(f"qf{index}", network)
+        return critic.to(self.device)
 
 
 CriticNetwork = Callable[[int, list[int], type[torch.nn.Module]], torch.nn.Module]
