@@ -81,7 +81,7 @@ def test_machine_code_of_a_single_env_computes_the_bits_of_python(task, params):
     assert code is not None
     x, c = task.sample(np.random.default_rng(1), params)
     x, c, u, steps = tuple(x.tolist()), tuple(c.tolist()), (3.0, -2.0), 40
-    judge = Judge(code, task)
+    judge = Judge(code, task, params)
     judge.set_constants(c)
     did = judge.judge(x, u, x, steps, 0.0)
     assert did is not None
