@@ -16,6 +16,7 @@ from browser import start_chromium
 
 from ballbot_gym import certified, dynamics
 from ballbot_gym.env import BallbotEnv, make_task
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller
@@ -95,6 +96,21 @@ def test_every_scenario_runs_as_in_python_over_an_episode(engine, tmp_path):
             cost = sum(env.task.cost(tuple(a), tuple(b), c) * 0.02 for a, b in zip(x, u, strict=False))
             assert run["cost"] == pytest.approx(cost, abs=10 * close)
             assert (run["ended"] not in ("", "goal")) == episode.failure
+
+
+def test_a_robot_that_nobody_told_moves_as_in_python_on_its_track(engine, tmp_path):
+    factors = dict(zip(("body_mass", "com_height", "force"), (1.3, 0.9, 0.9), strict=True))
+    script = f"""
+    const [robot] = robotsOf(DATA.scenarios[1], null, {list(factors.values())}), xs = [robot.x];
+    while (robot.steps < 100) {{ robot.advance(); xs.push(robot.x); }}
+    answer(xs);
+    """
+    env = BallbotEnv(SCENARIOS[1].task, physics="rk4", randomization="unknown")
+    controller = in_double(shipped_policies(env.task)[BEST[SCENARIOS[1].task]], env.task, env.params)
+    own = env.reset(seed=0)[1]["drawn"]
+    drawn = [factors.get(name, value) for name, value in zip(Randomization.DRAWN, own, strict=True)]
+    episode = rollout(env, controller, options=start_of(SCENARIOS[1], env.task) | {"drawn": drawn})
+    np.testing.assert_allclose(run_in_node(engine + script, tmp_path), episode.trajectory.x[:101], atol=CLOSE)
 
 
 def test_the_optimum_drives_along_its_trajectory_and_costs_what_is_certified(engine, tmp_path):
@@ -232,6 +248,19 @@ def test_in_the_browser_an_episode_is_that_of_python_and_shows_its_regret(opened
     np.testing.assert_allclose(by_policy, episode.trajectory.x[-1], atol=CLOSE)
     regret = episode.cost / certified.load(env.task, "paper").costs[SCENARIOS[1].episode] - 1
     assert cells[0][5] == f"regret {100 * regret:.1f} %"
+
+
+def test_in_the_browser_a_robot_that_nobody_told_has_no_regret(opened):
+    """The page's optima are of the robot that everybody knows."""
+    opened.execute_script("playground.open(1); document.querySelector('.drawn').click(); playground.setPlaying(false)")
+    bounds = np.array([(0.7, 1.4), (0.85, 1.15), (0.85, 1.1)])
+    factors = np.array(opened.execute_script("return playground.robot"))
+    assert ((bounds[:, 0] <= factors) & (factors <= bounds[:, 1])).all()
+    cells = advance(opened, 50)[2]
+    assert [row[0] for row in cells] == ["SHAC policy", "LQR"]
+    assert "%" not in cells[0][5]
+    opened.execute_script("document.querySelector('.told').disabled || document.querySelector('.told').click()")
+    assert advance(opened, 50)[2][2][0] == "optimum"
 
 
 def test_buttons_and_keys_push_along_the_screen_and_a_drag_on_a_robot_pushes_it_that_way(opened):

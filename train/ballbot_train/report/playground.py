@@ -6,7 +6,6 @@ weights. The model and the tasks are printed as JavaScript from the lines that P
 """
 
 import base64
-import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -22,6 +21,7 @@ from ballbot_baselines.lqr import LqrController
 from ballbot_gym import certified, drawing, dynamics, files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.evaluation.controllers import policy_path, task_name
@@ -30,6 +30,11 @@ from ballbot_train.report import labels
 from ballbot_train.report.page import asset, render, scene_data
 from ballbot_train.report.printed import Functions, frame_functions, javascript_function
 
+_UNKNOWN = (
+    "body_mass",
+    "com_height",
+    "force",
+)  # factors that the reader may change, within those of the track "unknown"
 LARGEST = 2_000_000
 """Bytes that the page may have."""
 
@@ -122,6 +127,7 @@ def engine_script(policies: Sequence[str] = ()) -> str:
     data = {
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
+        "unknown": {name: getattr(TRACKS["unknown"], name) for name in _UNKNOWN},
         "reach": REACH,
         **scene_data(params),
         "push_scale": drawing.PUSH_SCALE,
@@ -227,12 +233,21 @@ def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
 
 
 def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> str:
-    """The functions `step` and `push`, and `MODELS`: the functions of every shipped task by the task's name."""
+    """The functions `step` and `push`, of a robot with the factors `_UNKNOWN`, and `MODELS`: those of every shipped task."""
     dt = make_task("stabilize").control_dt
     substeps = dynamics.substeps_for(dt)
+
+    def robot(factors: casadi.SX) -> BallbotParams:
+        given = dict(zip(_UNKNOWN, casadi.vertsplit(factors), strict=True))
+        return TRACKS["unknown"].robot(params, tuple(given.get(name, 1.0) for name in Randomization.DRAWN))
+
     parts = [
-        javascript_function("step", lambda x, u: dynamics.step(params, x, u, dt, substeps), {"x": 8, "u": 2}),
-        javascript_function("push", functools.partial(dynamics.pushed, params), {"x": 8, "impulse": 2}),
+        javascript_function(
+            "step", lambda x, u, r: dynamics.step(robot(r), x, u, dt, substeps), {"x": 8, "u": 2, "robot": 3}
+        ),
+        javascript_function(
+            "push", lambda x, impulse, r: dynamics.pushed(robot(r), x, impulse), {"x": 8, "impulse": 2, "robot": 3}
+        ),
     ]
     models = []
     for name in BEST:

@@ -122,11 +122,14 @@ class Lqr {
   }
 }
 
+const KNOWN = [1, 1, 1]; // factors on mass, height of the centre of mass, and force, that all controllers reckon with
+
 /** One ballbot in a scenario under one controller, as BallbotEnv with physics="rk4". */
 class Robot {
-  constructor(controller, scenario) {
+  constructor(controller, scenario, robot = KNOWN) {
     this.controller = controller;
     this.scenario = scenario;
+    this.robot = robot;
     this.model = MODELS[scenario.task];
     this.reset(scenario.state);
   }
@@ -160,8 +163,8 @@ class Robot {
       this.ended = "force";
       return;
     }
-    const held = force.map((f) => Math.min(Math.max(f, -limit), limit));
-    this.move(held, step(this.x, held));
+    const held = force.map((f) => this.robot[2] * Math.min(Math.max(f, -limit), limit));
+    this.move(held, step(this.x, held, this.robot));
     this.judge();
   }
 
@@ -179,7 +182,7 @@ class Robot {
   /** A horizontal impulse on the body's centre of mass, N·s. */
   hit(impulse) {
     if (this.ended || !impulse.every(Number.isFinite)) return;
-    this.x = push(this.x, impulse);
+    this.x = push(this.x, impulse, this.robot);
   }
 
   judge() {
@@ -226,7 +229,7 @@ class Driver {
 
   act(k, x) {
     this.stick = this.stick.map((value, i) => value + SMOOTHING * (this.goal[i] - value));
-    const [none, first, second] = [[0, 0], [100, 0], [0, 100]].map((force) => step(x, force).slice(6));
+    const [none, first, second] = [[0, 0], [100, 0], [0, 100]].map((force) => step(x, force, KNOWN).slice(6));
     const [p, q] = this.stick.map((value, i) => {
       const wanted = STIFFNESS * (STEEPEST * value - x[2 + i]) - DAMPING * x[6 + i];
       return x[6 + i] + DATA.dt * wanted - none[i];
@@ -237,8 +240,8 @@ class Driver {
 }
 
 /** The robots of a scenario: the policy's, then LQR's; where a human drives, the human's, then the policy's. */
-function robotsOf(scenario, driver = null) {
+function robotsOf(scenario, driver = null, robot = KNOWN) {
   const learned = new Policy(DATA.policies[scenario.task], MODELS[scenario.task]);
   const controllers = driver ? [driver, learned] : [learned, new Lqr(scenario.lqr)];
-  return controllers.map((controller) => new Robot(controller, scenario));
+  return controllers.map((controller) => new Robot(controller, scenario, robot));
 }

@@ -40,8 +40,14 @@ class Playground {
     for (const button of document.querySelectorAll(".pushes button")) {
       button.onclick = () => this.pushOnScreen(Number(button.dataset.x), Number(button.dataset.y));
     }
+    for (const slider of document.querySelectorAll(".unknown input")) {
+      [slider.min, slider.max] = DATA.unknown[slider.name].map((factor) => Math.round(100 * factor));
+      slider.oninput = () => this.setRobot();
+    }
+    find(".told").onclick = () => this.setRobot(KNOWN);
+    find(".drawn").onclick = () => this.setRobot(Object.values(DATA.unknown).map(([low, high]) => low + Math.random() * (high - low)));
     this.listen();
-    this.open(0);
+    this.setRobot(KNOWN, 0);
     requestAnimationFrame((now) => this.tick(now));
   }
 
@@ -67,6 +73,19 @@ class Playground {
     return Number(find(".impulse").value);
   }
 
+  /** The robot's factors, from the sliders unless they are given, and the scenario anew. */
+  setRobot(factors = null, index = this.index) {
+    const sliders = [...document.querySelectorAll(".unknown input")];
+    sliders.forEach((slider, i) => {
+      if (factors) slider.value = Math.round(100 * factors[i]);
+      slider.nextElementSibling.textContent = `${slider.value} %`;
+    });
+    this.robot = sliders.map((slider) => Number(slider.value) / 100);
+    this.isKnown = this.robot.every((factor) => factor === 1);
+    find(".told").disabled = this.isKnown;
+    this.open(index, Boolean(this.driver));
+  }
+
   /** Opens a scenario; where the reader drives, in an episode whose optimum is known. */
   open(index, driven = false) {
     if (driven && DATA.scenarios[index].optimum === null) index = DATA.scenarios.findIndex((scenario) => scenario.optimum !== null);
@@ -86,8 +105,9 @@ class Playground {
     find(".hint").hidden = false;
     this.driver = driven ? new Driver() : null;
     this.held = new Set(); // keys
-    this.robots = robotsOf(this.scenario, this.driver);
-    this.best = this.scenario.best && new Optimum(this.scenario);
+    this.robots = robotsOf(this.scenario, this.driver, this.robot);
+    // the page has the optima of the robot that everybody knows, and a regret over them would be one over something else
+    this.best = this.isKnown && this.scenario.best && new Optimum(this.scenario);
     const { label, color } = DATA.policies[task];
     const learned = { label: `${label} policy`, color, alpha: 1 };
     const ghost = DATA.ghost_opacity + 0.15;
@@ -159,6 +179,7 @@ class Playground {
   finish() {
     this.setPlaying(false);
     const [mine] = this.robots;
+    if (!mine.failed && !this.best) return this.say(`It cost ${mine.cost.toFixed(1)}. The optimum of this robot is not in the page.`);
     if (mine.failed) return this.say(`You ${verdict(mine)} after ${(mine.steps * DATA.dt).toFixed(1)} s. Restart to try again.`);
     const policy = this.regret(this.robots[1]);
     this.say(`Your regret is ${this.share100(mine).toFixed(1)} %.${policy ? ` The policy's: ${policy.replace("regret ", "")}.` : ""}`);
