@@ -5,7 +5,6 @@ the learners' settings. Pictures are loaded when they come into view. Notebooks 
 page is written anew. The script that sorts the report's tables sorts the site's too.
 """
 
-import importlib
 import itertools
 import json
 import re
@@ -85,7 +84,7 @@ def settings_tables() -> str:
         if warm and columns == {task: algorithm.settings(task) for task in TASKS}:
             continue
         rows = [f"| setting | meaning | {' | '.join(columns)} |", f"|---|---|{'---|' * len(columns)}"]
-        meanings = meanings_of(getattr(importlib.import_module(algorithm.module), algorithm.config))
+        meanings = meanings_of(type(columns["turn"]))
         for field in fields(columns["turn"]):
             values = " | ".join(_shown(getattr(settings, field.name)) for settings in columns.values())
             name = field.name.replace("_", "\\_<wbr>")  # a narrow column breaks it there

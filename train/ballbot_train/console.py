@@ -185,3 +185,12 @@ def check_least(least: int, **numbers: int) -> None:
     for name, number in numbers.items():
         if number < least:
             raise ValueError(f"{name} must be at least {least}, not {number}")
+
+
+def option(name: str, value: Any) -> list[str]:
+    """A setting as words of a command."""
+    if isinstance(value, bool):
+        return [f"--{name}" if value else f"--no-{name}"]
+    if isinstance(value, dict):
+        return [word for part, each in value.items() for word in option(f"{name}.{part}", each)]
+    return [f"--{name}", *map(str, value if isinstance(value, tuple | list) else [value])]

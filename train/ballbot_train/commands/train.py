@@ -12,7 +12,7 @@ from ballbot_gym import certified
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train.console import RobotName, check_names, console, physics_or_default
+from ballbot_train.console import RobotName, check_names, console, option, physics_or_default
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.learners import LEARNERS, check_settings
@@ -171,8 +171,8 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
 
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--task", nargs="?", default=Run.task, const=Run.task)  # tyro says what is wrong with no value
-    for option in ("--demos", "--start"):
-        early.add_argument(option, nargs="?", const="")
+    for name in ("--demos", "--start"):
+        early.add_argument(name, nargs="?", const="")
     known = early.parse_known_args(arguments)[0]
     task, warm = known.task, {known.demos, known.start} - {None, "None"} != set()
     named = arguments[0] if arguments and not arguments[0].startswith("-") else None
@@ -198,17 +198,8 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
         if name in ("task", "seed") or (value != getattr(Run, name) and name != "resume"):
             words += [f"--{name.replace('_', '-')}", str(value)]
     for name, value in asdict(settings).items():
-        words += _option(name.replace("_", "-"), value)
+        words += option(name.replace("_", "-"), value)
     return shlex.join(words)
-
-
-def _option(name: str, value: Any) -> list[str]:
-    """A setting as words of a command."""
-    if isinstance(value, bool):
-        return [f"--{name}" if value else f"--no-{name}"]
-    if isinstance(value, dict):
-        return [word for part, each in value.items() for word in _option(f"{name}.{part}", each)]
-    return [f"--{name}", *map(str, value if isinstance(value, tuple | list) else [value])]
 
 
 def _command(

@@ -1,5 +1,6 @@
 """Reads demonstrations: a dataset as a whole, or shards one by one."""
 
+import itertools
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from ballbot_gym import files
 from ballbot_gym.checks import LARGEST
 from ballbot_gym.tasks import Task
 from ballbot_train import shards
+from ballbot_train.console import option
 from ballbot_train.policy_files import OBSERVATION_VERSION
 
 _IN_DATASET = {  # where Minari keeps the arrays of an episode, by their names in a shard
@@ -203,16 +205,7 @@ def command_of(path: str | Path) -> str:
         options = {"shards": str(path)}
     else:
         settings, options = metadata_of(Path(path))["demos"], {"out": str(path)}
-    for name, value in settings.items():
-        options |= (
-            {f"{name}.{part}": each for part, each in value.items()} if isinstance(value, dict) else {name: value}
-        )
-    words = ["ballbot", "demos"]
-    for name, value in options.items():
-        if isinstance(value, bool):
-            words.append(f"--{name}" if value else f"--no-{name}")
-        else:
-            words += [f"--{name}", str(value)]
+    words = ["ballbot", "demos", *itertools.chain(*itertools.starmap(option, (settings | options).items()))]
     return shlex.join(words)
 
 

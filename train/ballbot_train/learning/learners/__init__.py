@@ -31,8 +31,6 @@ class Algorithm:
 
     module: str
     """The file, as for an import."""
-    config: str
-    """Name of the dataclass of its settings."""
     description: str
     """One line for the command line."""
     demonstrations: bool
@@ -158,8 +156,8 @@ def check_settings(settings: Any) -> None:
 _HERE = __name__
 
 LEARNERS: dict[str, Algorithm] = {
-    "dagger": Algorithm(f"{_HERE}.dagger", "DaggerConfig", "DAgger, labelled by the optimum", demonstrations=True),
-    "ppo": Algorithm(f"{_HERE}.ppo", "PpoConfig", "proximal policy optimization", demonstrations=True),
-    "sac": Algorithm(f"{_HERE}.sac", "SacConfig", "soft actor-critic", demonstrations=True),
-    "shac": Algorithm(f"{_HERE}.shac", "ShacConfig", "short-horizon actor-critic", demonstrations=False),
+    "dagger": Algorithm(f"{_HERE}.dagger", "DAgger, labelled by the optimum", demonstrations=True),
+    "ppo": Algorithm(f"{_HERE}.ppo", "proximal policy optimization", demonstrations=True),
+    "sac": Algorithm(f"{_HERE}.sac", "soft actor-critic", demonstrations=True),
+    "shac": Algorithm(f"{_HERE}.shac", "short-horizon actor-critic", demonstrations=False),
 }
