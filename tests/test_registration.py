@@ -42,7 +42,7 @@ def light(tmp_path):
 
 def test_ours_are_registered_like_everybody_s():
     assert list(TASKS) == ["stabilize", "turn", "orbit", "weave"]
-    assert list(ROBOTS) == ["paper", "rolling", "kugle"]
+    assert list(ROBOTS) == ["paper", "rolling", "kugle", "omni", "omni_strong"]
     for name, kind in TASKS.items():
         assert gymnasium.spec(kind.id).kwargs == {"task": name}
 

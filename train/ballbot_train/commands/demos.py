@@ -49,7 +49,7 @@ def demos(
         robot: the robot that is shown.
     """
     check_names("task", [task], TASKS)
-    physics = physics_or_default(physics)
+    physics = physics_or_default(physics, robot)
     config = DemoConfig(task, expert, episodes, physics, noise, pushes, backoff, seed, robot)
     kind = file_name(task, robot)
     named = out

@@ -95,7 +95,7 @@ def evaluate(
     if fresh:
         _fresh(policy, task, fresh, seed, optima, out, workers, robot, varied)
     if episodes:
-        _certified(chosen, episodes, physics_or_default(physics), out / "certified", workers, robot)
+        _certified(chosen, episodes, physics_or_default(physics, robot), out / "certified", workers, robot)
 
 
 def _fresh(

@@ -141,7 +141,7 @@ def _cells(
     made = make_packed(controller, policy_files, env.task, env.params)
     leans, values = grid(axis, points)
     for i, j in items:
-        x = np.zeros(8)
+        x = np.zeros(env.params.state_size)
         x[2], x[AXES[axis].component] = math.radians(leans[j]), values[i]
         try:
             recovered = rollout(env, made, seed=0, options={"state": x}).success
