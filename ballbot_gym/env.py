@@ -126,7 +126,8 @@ class BallbotEnv(gymnasium.Env):
                 10 ms for rk4.
             randomization: what varies, or a name in `TRACKS`; default, nothing. In Bullet each new `com_height` loads a URDF,
                 which takes 2 ms and 5 kB of memory that PyBullet never frees.
-            robot: a name in `ROBOTS`, "paper", "rolling" or "kugle", or a BallbotParams. Tasks draw other episodes for some.
+            robot: a name in `ROBOTS`, such as "paper", "rolling", "kugle" or "omni", or a BallbotParams. Tasks draw other
+                episodes for some.
             history: so many earlier observations follow the present one in each observation, the latest first, each with the
                 action (2) that was taken on it. Before the episode began they are the first one, with the action 0.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.

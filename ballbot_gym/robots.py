@@ -109,6 +109,11 @@ def named_robot(name: str) -> BallbotParams:
     return _params_of(ROBOTS[short])
 
 
+def without_wheels() -> tuple[str, ...]:
+    """Names of the robots that two forces move, for what knows no wheels."""
+    return tuple(name for name in ROBOTS if named_robot(name).wheels is None)
+
+
 def _params_of(robot: Robot) -> BallbotParams:
     return robot.urdf if isinstance(robot.urdf, BallbotParams) else _read(robot.urdf)
 

@@ -58,6 +58,7 @@ class Orbit(Task):
     | velocity_weight | of the squared velocity error | s/m² | 2 |
     | lean_rate_weight | of γ̇² + θ̇² | s | 0.02 |
     | effort_weight | of Fx² + Fy² | 1/(N² s) | 2e-5 |
+    | heading_weight | of 2 (1 − cos ψ), where a robot with wheels yaws by ψ | 1/s | 0 |
     | min_radius | smallest radius drawn | m | 1 |
     | max_radius | largest radius drawn | m | 3 |
     | min_steady_tilt | smallest steady tilt drawn | rad | 10° |

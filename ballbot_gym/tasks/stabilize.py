@@ -48,6 +48,7 @@ class Stabilize(Task):
     | position_weight | of x² + y² | 1/(m² s) | 1 |
     | rest_weight | of squared leans, speeds and lean rates | SI | 0.5 |
     | effort_weight | of Fx² + Fy² | 1/(N² s) | 5e-4 |
+    | heading_weight | of 2 (1 − cos ψ), where a robot with wheels yaws by ψ | 1/s | 0 |
     | start_position | how far x and y may be at the start | m | 2 |
     | start_speed | the same of ẋ and ẏ | m/s | 5 |
     | start_lean | the same of γ and θ | rad | 0.6 |

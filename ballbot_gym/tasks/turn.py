@@ -61,6 +61,7 @@ class Turn(Task):
     | time_weight | of time | 1/s | 5 |
     | lean_weight | of squared leans and lean rates | SI | 0.5 |
     | effort_weight | of Fx² + Fy² | 1/(N² s) | 2e-4 |
+    | heading_weight | of 2 (1 − cos ψ), where a robot with wheels yaws by ψ | 1/s | 0 |
     | min_speed | smallest speed drawn | m/s | 2 |
     | max_speed | largest speed drawn | m/s | 10 |
     | duration | longest episode | s | 8 |

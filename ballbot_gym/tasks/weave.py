@@ -63,6 +63,7 @@ class Weave(Task):
     | position_weight | of the squared distance to the goal | 1/(m² s) | 1 |
     | rest_weight | of squared leans, speeds and lean rates | SI | 0.5 |
     | effort_weight | of Fx² + Fy² | 1/(N² s) | 5e-4 |
+    | heading_weight | of 2 (1 − cos ψ), where a robot with wheels yaws by ψ | 1/s | 0 |
     | ball_radius | of the robot, counted when it touches | m | 0.1 |
     | duration | longest episode | s | 8 |
     | control_dt | how long each force is held | s | 0.02 |

@@ -10,6 +10,7 @@ from typing import Any, Literal, cast
 
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.lazy import missing
+from ballbot_gym.robots import PAPER, named_robot
 
 try:
     from rich.progress import (
@@ -85,8 +86,8 @@ class LineProgress(Progress):
                     )
 
 
-def physics_or_default(physics: Physics | None) -> Physics:
-    """The physics that was typed; else the default where nothing is typed, with a line if it needs one.
+def physics_or_default(physics: Physics | None, robot: str = PAPER) -> Physics:
+    """The physics that was typed; else the default of a robot where nothing is typed, with a line if it needs one.
 
     Raises:
         ImportError: it is not installed; the message says how to get it.
@@ -96,7 +97,7 @@ def physics_or_default(physics: Physics | None) -> Physics:
         return physics
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        chosen = default_physics()
+        chosen = default_physics(named_robot(robot))
     for warning in caught:
         console.print(str(warning.message), soft_wrap=True)
     return cast(Physics, chosen)

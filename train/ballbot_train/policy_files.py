@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_type_hints
 from ballbot_gym import files
 from ballbot_gym.checks import check_history
 from ballbot_gym.randomization import TRACKS
-from ballbot_gym.robots import PAPER, ROBOTS, file_name
+from ballbot_gym.robots import PAPER, ROBOTS, file_name, named_robot
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
 
@@ -81,6 +81,11 @@ class PolicySpec:
             raise ValueError(f"task must be text, not {self.task!r}")
         if self.robot not in ROBOTS:
             raise ValueError(f"robot must be one of {', '.join(ROBOTS)}, not {self.robot!r:.200}")
+        if named_robot(self.robot).wheels is not None:
+            raise ValueError(
+                f"policies command two forces, and {self.robot} has three wheels; train one with Stable-Baselines3 on "
+                "ballbot_gym.env.TwoForces, or on the env itself"
+            )
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
         check_history(self.history)

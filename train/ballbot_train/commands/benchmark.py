@@ -55,7 +55,7 @@ def benchmark(
             with the experts that are made for each track.
     """
     chosen = controllers_of(tasks, controllers, robot, tracks=bool(randomization))
-    physics = physics_or_default(physics)
+    physics = physics_or_default(physics, robot)
     settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes)}
     if randomization:
         _benchmark_tracks(chosen, not controllers, seed, out, workers, robot, randomization, **settings)

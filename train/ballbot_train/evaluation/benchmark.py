@@ -206,9 +206,12 @@ def benchmark(
     seed: int = 0,
     robot: str = PAPER,
 ) -> list[Result]:
-    """Runs controllers by task, as `controllers_of` gives, and records what they do; the others as of `run_groups`."""
+    """Runs controllers by task, as `controllers_of` gives, and records what they do; the others as of `run_groups`.
+
+    Nothing is recorded of a robot with wheels, because `ballbot submit` knows none.
+    """
     groups = [Group(task, name, physics, robot) for task, names in controllers.items() for name in names]
-    return run_groups(groups, episodes, out, workers, seed=seed, record=True)
+    return run_groups(groups, episodes, out, workers, seed=seed, record=named_robot(robot).wheels is None)
 
 
 def _write_recording(group: Group, motions: Sequence[recordings.Motion], out: Path) -> None:

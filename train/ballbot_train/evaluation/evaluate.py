@@ -129,14 +129,14 @@ def evaluate(
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), task_name(env.task)
         motions: list[recordings.Motion] = []
-        keep = None if out is None else motions.append
+        keep = None if out is None or env.params.wheels is not None else motions.append
         results = list(iterate_episodes(env, controller, *named, indices, 0, known, keep))
         row = summarize(results)
         if out is not None:
             ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
             facts = provenance() | ran
             write_leaderboard([row], results, facts, Path(out))
-            if not env.randomization.active:
+            if keep is not None and not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
                 about = recordings.about(env.task, named[1], env.params, env.physics, named[0], digest)
                 recordings.write_in(Path(out), about, motions)

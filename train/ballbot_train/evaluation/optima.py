@@ -133,8 +133,8 @@ def _check_start(task: Task, params: BallbotParams, index: int) -> None:
     begin = task.at(c, 0.0)
     if violated := task.violated(x, begin):  # as a state does that is not finite
         raise ValueError(f"{kind}.draw_state draws {x.tolist()} {where}, which is beyond the limit of {violated}")
-    force = np.full(2, 0.1 * params.force_limit)
-    cost, more = (float(task.cost(x, u, begin)) for u in (np.zeros(2), force))
+    force = np.full(params.action_size, 0.1 * params.force_limit)
+    cost, more = (float(task.cost(x, u, begin)) for u in (0 * force, force))
     if not (0 <= cost < math.inf and 0 <= more < math.inf):
         raise ValueError(
             f"{kind}.cost gives {cost:g} without force and {more:g} with one {where}; make it finite and ≥ 0"

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ballbot_gym import files
-from ballbot_gym.robots import ROBOTS
+from ballbot_gym.robots import without_wheels
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import is_file
 from ballbot_train.evaluation.robustness import STRESSES
@@ -89,7 +89,7 @@ class Controls:
     def _build_choices(self) -> None:
         gui, playground = self._gui, self._playground
         self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_task, lambda: playground.world.task_name)
-        self._bind(gui.add_dropdown("Robot", tuple(ROBOTS)), playground.set_robot, lambda: playground.world.robot)
+        self._bind(gui.add_dropdown("Robot", without_wheels()), playground.set_robot, lambda: playground.world.robot)
         self._controller = gui.add_dropdown("Controller", tuple(self._options()))
         self._bind(self._controller, self._choose, self._chosen)
         self._bind(gui.add_text("Policy file", "", hint=_FILE_HINT), self._choose_file, self._file)

@@ -48,6 +48,8 @@ class World:
         check_names("task", [task], TASKS)
         check_names("robot", [robot], ROBOTS)
         self.task_name, self.robot, self.params = task, robot, named_robot(robot)
+        if self.params.wheels is not None:
+            raise ValueError(f"the playground knows no robot with wheels, as {robot}; watch it with ballbot replay")
         self.task: Task = make_task(task, robot)
         self.policies: list[str] = []
         self.controllers: list[str] = []
