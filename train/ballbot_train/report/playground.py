@@ -238,7 +238,7 @@ def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> st
     substeps = dynamics.substeps_for(dt)
 
     def robot(factors: casadi.SX) -> BallbotParams:
-        given = dict(zip(_UNKNOWN, casadi.vertsplit(factors), strict=True))
+        given: dict[str, Any] = dict(zip(_UNKNOWN, casadi.vertsplit(factors), strict=True))
         return TRACKS["unknown"].robot(params, tuple(given.get(name, 1.0) for name in Randomization.DRAWN))
 
     parts = [
