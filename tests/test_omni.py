@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 
 from ballbot_baselines.lqr import discrete_lqr
+from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import dynamics, omni
 from ballbot_gym.engines import make_simulator
-from ballbot_gym.env import BallbotEnv, TwoForces
+from ballbot_gym.env import BallbotEnv, TwoForces, make_task
 from ballbot_gym.omni import Wheels
 from ballbot_gym.robots import named_robot
+from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
+from ballbot_train.play.world import World
+from ballbot_train.policy_files import PolicySpec
 
 SPREAD = np.array([1, 1, 0.8, 0.8, 2, 2, 2, 2, 3, 3, 5.0])
 
@@ -242,3 +246,42 @@ def test_two_forces_balance_it_and_hold_its_heading():
     assert np.abs(info["state"][8:]).max() < 0.01
     with pytest.raises(ValueError, match="takes a BallbotEnv of a robot with wheels"):
         TwoForces(BallbotEnv(physics="rk4"))
+
+
+def test_a_tracked_plan_comes_to_rest_at_the_cost_that_it_said():
+    task = make_task("stabilize", "omni", duration=3.0)
+    robot, start = named_robot("omni"), np.array([0.3, -0.2, 0.05, 0.0, 0.1, 0.2, 0.0, 0.0, 0.3, 0.0, 0.0])
+    controller = TrajoptController(task, robot)
+    episode = rollout(BallbotEnv(task, robot=robot, physics="rk4"), controller, options={"state": start})
+    assert episode.success
+    assert controller.plan.is_optimal
+    assert episode.cost == pytest.approx(controller.plan.cost, rel=1e-3)
+    limits = dynamics.limits(robot, controller.plan.trajectory.x[:-1], controller.plan.trajectory.u)
+    assert np.min(limits) >= 0
+
+
+def test_a_free_heading_costs_nothing(robot):
+    x, held = np.zeros(11), make_task("turn", "omni")
+    x[8] = 0.5
+    free = make_task("turn", "omni", heading_weight=0.0)
+    costs = [task.cost(x, np.zeros(3), np.ones(1)) for task in (held, free)]
+    assert costs[0] - costs[1] == pytest.approx(2 * (1 - math.cos(0.5)))
+    assert (
+        free.problem()
+        == "Turn("
+        + ", ".join(part for part in held.problem()[5:-1].split(", ") if not part.startswith("heading_weight"))
+        + ")"
+    )
+
+
+def test_what_knows_no_wheels_says_so(robot):
+    from ballbot_baselines import batched
+
+    task = make_task("stabilize", "omni")
+    assert not batched.solves(task, robot)
+    with pytest.raises(NotImplementedError, match="no robot with wheels"):
+        batched.find_optima(task, robot, np.zeros((1, 8)), np.zeros((1, 0)))
+    with pytest.raises(ValueError, match="omni has three wheels"):
+        PolicySpec.of(task, robot="omni")
+    with pytest.raises(ValueError, match="the playground knows no robot with wheels"):
+        World("stabilize", "omni")
