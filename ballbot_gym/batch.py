@@ -199,7 +199,7 @@ class BallbotBatch:
         self.params = checked_robot(robot, params)
         self.task = make_task(task, self.params, **task_fields)
         self.limit_names = limit_names(self.task, self.params)
-        self.randomization, self.history = checked_randomization(randomization), check_history(history)
+        self.randomization, self.history = checked_randomization(randomization, self.params), check_history(history)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
         for name in ModelNumbers._fields:

@@ -154,7 +154,7 @@ class BallbotEnv(gymnasium.Env):
         fps = round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_modes": usable_render_modes(), "render_fps": fps}
         self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
-        self.randomization = checked_randomization(randomization)
+        self.randomization = checked_randomization(randomization, self.params)
         self._disturbance = (
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )

@@ -248,11 +248,11 @@ def track_of(randomization: Randomization) -> str:
     return next((name for name, track in TRACKS.items() if track == randomization), "")
 
 
-def checked_randomization(randomization: Any) -> Randomization:
+def checked_randomization(randomization: Any, params: BallbotParams | None = None) -> Randomization:
     """The randomization that was given, also by its name in `TRACKS` or as the dict of all its fields, or none for None.
 
     Raises:
-        ValueError: no track of that name.
+        ValueError: no track of that name, or it pushes a robot with wheels, params.
         TypeError: it is something else, such as a dict of some fields.
     """
     if randomization is None:
@@ -266,6 +266,8 @@ def checked_randomization(randomization: Any) -> Randomization:
         raise TypeError(
             f"randomization must be a Randomization, for instance Randomization(lean_noise=0.01), not {randomization!r}"
         )
+    if params is not None and params.wheels is not None and randomization.pushes:
+        raise ValueError("pushes are forces Fx, Fy, which a robot with wheels does not have; leave out push_impulse")
     return randomization
 
 

@@ -13,6 +13,7 @@ from ballbot_gym import dynamics, omni
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.env import BallbotEnv, TwoForces, make_task
 from ballbot_gym.omni import Wheels
+from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
@@ -281,6 +282,8 @@ def test_what_knows_no_wheels_says_so(robot):
     assert not batched.solves(task, robot)
     with pytest.raises(NotImplementedError, match="no robot with wheels"):
         batched.find_optima(task, robot, np.zeros((1, 8)), np.zeros((1, 0)))
+    with pytest.raises(ValueError, match="pushes are forces Fx, Fy, which a robot with wheels does not have"):
+        BallbotEnv(robot="omni", physics="rk4", randomization=Randomization(push_impulse=(1.0, 2.0)))
     with pytest.raises(ValueError, match="omni has three wheels"):
         PolicySpec.of(task, robot="omni")
     with pytest.raises(ValueError, match="the playground knows no robot with wheels"):
