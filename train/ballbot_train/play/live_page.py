@@ -108,7 +108,7 @@ class PlayPage:
                 self.single_steps -= 1
             return False
         for _ in range(_MOST_STEPS):
-            if not self.clock.take():
+            if self.clock.take() is None:
                 break
             if not self.playground.step():
                 self.clock.stop()
