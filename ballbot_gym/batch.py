@@ -7,7 +7,9 @@ Eager batches give bit-identical results for the same seed and actions, and so d
 and compiled batches agree to rounding. So does a compiled batch of one env, which computes sines with another library.
 """
 
+import functools
 import logging
+import operator
 import shutil
 import types
 from collections.abc import Callable, Sequence
@@ -580,10 +582,7 @@ def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
 
 def any_of(conditions: Any) -> torch.Tensor:
     """Elementwise or."""
-    first, *others = conditions
-    for condition in others:
-        first = first | condition
-    return first
+    return functools.reduce(operator.or_, conditions)
 
 
 def tilt_of(x: tuple) -> torch.Tensor:

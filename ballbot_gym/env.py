@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym import dynamics, omni
+from ballbot_gym import dynamics
 from ballbot_gym.checks import (
     check_constant_names,
     check_history,
@@ -32,7 +32,6 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.viewer import PageScene
 
-_YAW_RATE = 2.0  # rad/s: how fast `TwoForces` turns the body back
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
@@ -541,32 +540,6 @@ class BallbotEnv(gymnasium.Env):
         if self._disturbance is not None and self.randomization.varies_episodes:
             info["drawn"] = np.array(self._disturbance.get_state().drawn)
         return seen, info
-
-
-class TwoForces(gymnasium.ActionWrapper):
-    """Gives a robot with wheels the action of the others, (2,): a force Fx, Fy.
-
-    Its unit is what the wheels together give in every direction at standstill, `omni.LEAST_FORCE` times the pull of one.
-    The wheels' torque on the ball is that of a rolling robot. A small feedback holds the heading ψ at 0.
-    """
-
-    def __init__(self, env: gymnasium.Env):
-        """Args: env: a `BallbotEnv` of a robot with wheels, wrapped or not."""
-        super().__init__(env)
-        ballbot: Any = env.unwrapped
-        if not isinstance(ballbot, BallbotEnv) or ballbot.params.wheels is None:
-            raise ValueError("TwoForces takes a BallbotEnv of a robot with wheels, as robot='omni'")
-        self._ballbot = ballbot
-        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-
-    def action(self, action: np.ndarray) -> np.ndarray:
-        """The wheels' action (3,) for an action (2,)."""
-        params, x = self._ballbot.params, self._ballbot.get_state().x
-        force = (
-            omni.LEAST_FORCE * params.force_limit * real_array(action, "action", (2,)).astype(np.float64).clip(-1, 1)
-        )
-        yaw_torque = -params.axial_inertia * (_YAW_RATE**2 * math.sin(x[8]) + 2 * _YAW_RATE * x[9])
-        return np.array(omni.wheel_forces(params, x, tuple(force.tolist()), yaw_torque)) / params.force_limit
 
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")

@@ -11,12 +11,13 @@ from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import dynamics, omni
 from ballbot_gym.engines import make_simulator
-from ballbot_gym.env import BallbotEnv, TwoForces, make_task
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.omni import Wheels
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
+from ballbot_gym.two_forces import TwoForces
 from ballbot_train.play.world import World
 from ballbot_train.policy_files import PolicySpec
 

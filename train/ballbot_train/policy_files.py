@@ -84,7 +84,7 @@ class PolicySpec:
         if named_robot(self.robot).wheels is not None:
             raise ValueError(
                 f"policies command two forces, and {self.robot} has three wheels; train one with Stable-Baselines3 on "
-                "ballbot_gym.env.TwoForces, or on the env itself"
+                "ballbot_gym.two_forces.TwoForces, or on the env itself"
             )
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
