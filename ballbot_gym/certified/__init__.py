@@ -28,7 +28,7 @@ from ballbot_gym.trajectory import Trajectory
 
 EPISODES = 200
 TRAJECTORIES = 20
-_OF_A_TRACK = 5  # trajectories in the file of a track, of which there are many
+_FEW = 5  # trajectories in the file of a track, of which there are many, and of a robot with wheels, whose states are larger
 
 _CHEAPER = 1e-7  # relative: optima that differ by less are the same
 _ENDS = (slice(None, -1), slice(1, None))  # of control steps
@@ -100,7 +100,7 @@ class EvaluationSet:
         """Writes the set, with what defines its optima, so that it is never read for another problem or robot."""
         params, varied = checked_robot(robot), randomization.moves_optima
         names = _PER_EPISODE if varied else _PER_EPISODE[:-2]
-        trajectories = self.trajectories[:_OF_A_TRACK] if varied else self.trajectories
+        trajectories = self.trajectories[:_FEW] if varied or params.wheels is not None else self.trajectories
         arrays = {
             "task": np.array(task.problem()),
             **({} if params == named_robot(PAPER) else {"robot": np.array(repr(params))}),

@@ -6,17 +6,16 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from ballbot_gym.robots import file_name
-from ballbot_train.commands.options import WorkersOption
+from ballbot_train.commands.options import UNNAMED, WorkersOption
 from ballbot_train.console import console, progress_bars
 from ballbot_train.executors import Workers
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
 
 
 def demos(
-    config: Annotated[DemoConfig, tyro.conf.arg(name="")] = DemoConfig(),
+    config: Annotated[DemoConfig, UNNAMED] = DemoConfig(),
     shards: str | None = None,
     out: Path | None = None,
     workers: WorkersOption = Workers(),

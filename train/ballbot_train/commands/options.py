@@ -14,7 +14,10 @@ try:
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
-WorkersOption = Annotated[Workers, tyro.conf.arg(name=""), tyro.conf.DisallowNone]
+UNNAMED = tyro.conf.arg(name="")
+"""Of a dataclass whose fields are options of their own names."""
+
+WorkersOption = Annotated[Workers, UNNAMED, tyro.conf.DisallowNone]
 """The options --workers and --ray of every command that does much work."""
 
 
