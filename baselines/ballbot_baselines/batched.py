@@ -399,7 +399,7 @@ class _Batch:
         relaxed = self._solve(_Guesses.joined(of, motions), _ROUGH_GOAL, free_time=True)
         chosen = _contenders(np.array(of), relaxed, search.BASIN_DOUBT)
         arrivals = np.ceil(relaxed.x[chosen, 0, 8] * n / task.control_dt).astype(int)
-        costs: dict[tuple[int, int], float] = {}
+        tried: dict[int, dict[int, float]] = {i: {} for i in chosen.tolist()}  # costs by number of steps
         wanted = [
             (i, s)
             for i, arrival in zip(chosen.tolist(), arrivals.tolist(), strict=True)
@@ -414,13 +414,13 @@ class _Batch:
                 for i, s in wanted
             ]
             found = self._keep(_Guesses.joined([of[i] for i, _ in wanted], resampled), _GOAL)
-            costs.update(zip(wanted, found.tolist(), strict=True))
+            for (i, s), cost in zip(wanted, found.tolist(), strict=True):
+                tried[i][s] = cost
             wanted = []
-            for i in chosen.tolist():
-                tried = {s: cost for (j, s), cost in costs.items() if j == i}
-                best = min(tried, key=lambda s: tried[s], default=0)
-                if tried and math.isfinite(tried[best]):
-                    wanted += [(i, s) for s in (best - 1, best + 1) if s not in tried]
+            for i, costs in tried.items():
+                best = min(costs, key=costs.__getitem__, default=0)
+                if costs and math.isfinite(costs[best]):
+                    wanted += [(i, s) for s in (best - 1, best + 1) if s not in costs]
 
     def _weave(self) -> None:
         """Slaloms: likely choices of sides are compared with forces held longer, over the time until LQR is right about the
