@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ballbot_gym.robots import ROBOTS
 from ballbot_train.evaluation.results import Result
 from ballbot_train.evaluation.robustness import StressResult
 
@@ -65,4 +66,4 @@ class DelayedController:
 def task_and_robot(policy):
     """The names of both in the name of a shipped policy, as TASK-ROBOT-LEARNER."""
     task, *others = policy.split("-")
-    return task, "rolling" if "rolling" in others else "paper"
+    return task, next((robot for robot in ROBOTS if robot in others), "paper")

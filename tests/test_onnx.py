@@ -109,6 +109,8 @@ def test_the_file_of_another_robot_names_it_and_its_force_limit(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     task = make_task("turn", "kugle")
     policy = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))), {})
+    with pytest.raises(ValueError, match="was made for the robot kugle; give --robot kugle"):
+        export(str(policy))
     export(str(policy), robot="kugle")
     about = session(tmp_path / "runs" / "export" / "turn-kugle-mine.onnx").get_modelmeta().custom_metadata_map
     assert about["robot"] == "kugle"
