@@ -18,6 +18,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -181,8 +182,12 @@ class _Batch:
         self._task, self._params, self._x0, self._c, self._optima = task, params, x0, c, optima
         self._backoff = backoff
         self._solver = ilqr(task, params)
-        # where each episode comes to rest, if it does
-        self._ends = np.array([task.reference(x, constants, params).x[-1] for x, constants in zip(x0, c, strict=True)])
+
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        """(B, 8) where each episode comes to rest, of a task that ends there."""
+        episodes = zip(self._x0, self._c, strict=True)
+        return np.array([self._task.reference(x, c, self._params).x[-1] for x, c in episodes])
 
     def search(self, forces: np.ndarray | None) -> None:
         task = self._task
@@ -196,11 +201,10 @@ class _Batch:
         else:
             self._follow_paths(np.arange(len(self._x0)))
 
-    def _given(
-        self, of: np.ndarray, c: np.ndarray | None = None, then_rest: bool = False, free_time: bool = False
-    ) -> np.ndarray:
-        """Parameters of `ilqr`, (J, np), of episodes `of` (J,), or with other constants (B, nc). With `then_rest`, LQR's
-        cost-to-go counts.
+    def _given(self, of: np.ndarray, steps: int, c: np.ndarray | None = None, free_time: bool = False) -> np.ndarray:
+        """Parameters of `ilqr`, (J, np), of episodes `of` (J,), or with other constants (B, nc).
+
+        LQR's cost-to-go counts where so many control steps end before the episode does.
         """
         c = (self._c if c is None else c)[of]
         _, *given = shooting_parameters(self._task, self._params, c[0], self._backoff)
@@ -209,7 +213,7 @@ class _Batch:
         rows[:, first : first + c.shape[1]] = c
         if free_time or self._solver.rest is None:
             return rows
-        return np.column_stack([rows, self._solver.ends(self._ends[of], float(then_rest))])
+        return np.column_stack([rows, self._solver.ends(self._ends[of], float(steps < self._task.steps))])
 
     def _solve(
         self,
@@ -219,14 +223,13 @@ class _Batch:
         c: np.ndarray | None = None,
         free_time: bool = False,
         chosen_sides: np.ndarray | None = None,
-        then_rest: bool = False,
     ) -> Solutions:
         """Solves guesses with some options in turn until they are solved, and on chosen sides (J, obstacles) of obstacles."""
         task, n = self._task, guesses.a.shape[1]
         solver, lengths = (
             (ilqr(task, self._params, True), 1.0) if free_time else (self._solver, coarseness * task.control_dt)
         )
-        given = self._given(guesses.of, c, then_rest, free_time)
+        given = self._given(guesses.of, coarseness * n, c, free_time)
         if free_time:
             bounds = task.control_dt / 4, task.duration / n
             given = np.column_stack([given, np.tile(bounds, (len(given), 1))])
@@ -266,9 +269,7 @@ class _Batch:
         """
         if not len(guesses.of):
             return np.zeros(0)
-        rests = self._solver.rest is not None and guesses.a.shape[1] < self._task.steps
-        found = self._solve(guesses, tries, chosen_sides=chosen_sides, then_rest=rests)
-        return self._kept(guesses, found)
+        return self._kept(guesses, self._solve(guesses, tries, chosen_sides=chosen_sides))
 
     def _kept(self, guesses: _Guesses, found: Solutions) -> np.ndarray:
         if self._solver.rest is not None and guesses.a.shape[1] < self._task.steps:
@@ -312,7 +313,7 @@ class _Batch:
         assert rest is not None
         left = self._task.steps - guesses.a.shape[1]
         last = found.x[:, -1]
-        x, a, costs = self._solver.stay(last, dt, self._given(guesses.of), left, ends)
+        x, a, costs = self._solver.stay(last, dt, self._given(guesses.of, self._task.steps), left, ends)
         expected = rest.costs(last - ends)
         whole = replace(
             found,
@@ -329,7 +330,7 @@ class _Batch:
         """The cheapest simulated recoveries. Where none in the plane of the fall survives, those to its sides are tried."""
         task, x0, count, rest = self._task, self._x0, len(self._x0), self._solver.rest
         n = task.steps if rest is None else min(task.steps, round(_SECONDS / task.control_dt))
-        given, times = self._given(np.arange(count)), task.control_dt * np.arange(n)
+        given, times = self._given(np.arange(count), task.steps), task.control_dt * np.arange(n)
         best = np.full(count, np.inf)
         x, a = np.zeros((count, n + 1, 8)), np.zeros((count, n, 2))
 
@@ -342,9 +343,8 @@ class _Batch:
                 kept[rows[cheaper]] = values[cheaper]
 
         side = righting.leaning_aside(x0, np.ones(count)).T
-        targets = np.array([task.reference(x, c, self._params).x[0, :2] for x, c in zip(x0, self._c, strict=True)])
         path = np.zeros((count, n, 8))
-        path[..., :2] = targets[:, None]
+        path[..., :2] = self._ends[:, None, :2]
         for family in (_FAMILY, _SIDEWAYS_FAMILY):
             rows = np.flatnonzero(np.isinf(best))
             for bandwidth, seconds, lean, fade in family if len(rows) else ():
@@ -447,7 +447,7 @@ class _Batch:
 
     def _pass_obstacles(self, likely: Mapping[int, np.ndarray], steps: int) -> None:
         """The best of likely choices of sides (k, obstacles) of episodes, whose first control steps are optimized."""
-        task, coarse, rests = self._task, search.COARSE, steps < self._task.steps
+        task, coarse = self._task, search.COARSE
         of = [i for i, choices in likely.items() for _ in choices]
         paths = [
             task.routed_path(self._x0[i], self._c[i], tuple(chosen.tolist()))[: steps + 1]
@@ -455,20 +455,20 @@ class _Batch:
             for chosen in choices
         ]
         along, sides = self._along(of, paths, coarse), self._sides(of, paths)
-        rough = self._solve(along, _SIDES, coarse, chosen_sides=sides, then_rest=rests)
+        rough = self._solve(along, _SIDES, coarse, chosen_sides=sides)
         chosen = _contenders(along.of, rough, _SIDES_DOUBT)
         if not len(chosen):
             return
         x = np.array([guess.resampled(states, steps) for states in rough.x[chosen]])
         a = np.repeat(rough.a[chosen], coarse, axis=1)
         near = _Guesses(along.of[chosen], x, a, np.full(len(chosen), steps))
-        found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=sides[chosen], then_rest=rests)
-        self._pass_later(near, found, rests)
+        found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=sides[chosen])
+        self._pass_later(near, found)
         left = chosen[np.isinf(self._kept(near, found))]
         if len(left):
             self._keep(self._along([of[i] for i in left], [paths[i] for i in left]), _PATH)
 
-    def _pass_later(self, guesses: _Guesses, found: Solutions, then_rest: bool) -> None:
+    def _pass_later(self, guesses: _Guesses, found: Solutions) -> None:
         """Replaces the best solution of every episode by one that passes the obstacles a control step later or earlier, where
         that is cheaper.
 
@@ -484,7 +484,7 @@ class _Batch:
             for part in (found.x, found.a, found.multipliers)
         )
         x[:, 0] = found.x[two, 0]
-        given = self._given(guesses.of[two], then_rest=then_rest)
+        given = self._given(guesses.of[two], a.shape[1])
         moved = self._solver.solve(
             x,
             a,
