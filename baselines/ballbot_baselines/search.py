@@ -273,16 +273,14 @@ def likely_sides(
     found: list[np.ndarray] = [np.zeros((0, 0), int)] * len(c)
     last = np.zeros(len(c), int)
     obstacles = [np.asarray(task.passed_obstacles(each)) for each in c]
-    goals = np.array([task.reference(*episode, params).x[-1, :2] for episode in zip(x0, c, strict=True)])
-    across = x0[:, sides.ACROSS] - np.pad(goals[:, 1:], ((0, 0), (0, 3)))
+    goal_y = np.array([task.reference(*episode, params).x[-1, 1] for episode in zip(x0, c, strict=True)])
     along = np.array([guess.resampled(states[:, :1], task.steps)[:, 0] for states in free])
     counts = np.array([len(each) for each in obstacles])
     for count in np.unique(counts):
         rows = np.flatnonzero(counts == count)
         own = np.array([obstacles[i] for i in rows])
-        passed = np.abs(along[rows, :, None] - own[:, None, :, 0]).argmin(1)
-        own[..., 1] -= goals[rows, None, 1]
-        predicted = costs[rows, None] + sides.predict_costs(task, params, across[rows], own[..., 1:], passed)
+        more, passed = sides.predict_costs(task, params, x0[rows], goal_y[rows], along[rows], own)
+        predicted = costs[rows, None] + more
         choices = sides.choices(count)
         for i, prices in zip(rows.tolist(), predicted, strict=True):
             order = np.argsort(prices, kind="stable")

@@ -24,8 +24,7 @@ from ballbot_baselines.linearize import discretize, quadratic_cost
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
-ACROSS = [1, 3, 5, 7]
-"""y, θ, ẏ, θ̇ in a state."""
+_ACROSS = [1, 3, 5, 7]  # y, θ, ẏ, θ̇ in a state
 _REGULARIZATION = 1e-9  # of the kernel, m²: obstacles passed in the same control step
 
 
@@ -59,7 +58,7 @@ def predict(
     goal_y = task.reference(x0, c, params).x[-1, 1]
     model = _model(task, params)
     passed = np.array([int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]])
-    free = goal_y + model.free @ (np.asarray(x0)[ACROSS] - [goal_y, 0, 0, 0])
+    free = goal_y + model.free @ (np.asarray(x0)[_ACROSS] - [goal_y, 0, 0, 0])
     (prices,), (costs,) = _priced(model, passed[None], obstacles[None, :, 1:], free[passed][None])
     sides = choices(len(passed))
     return Prediction(sides, costs, free + (sides * prices) @ model.responses[passed] @ model.responses.T)
@@ -71,21 +70,25 @@ def choices(obstacles: int) -> np.ndarray:
 
 
 def predict_costs(
-    task: Task, params: BallbotParams, across: np.ndarray, obstacles: np.ndarray, passed: np.ndarray
-) -> np.ndarray:
+    task: Task, params: BallbotParams, x0: np.ndarray, goal_y: np.ndarray, along: np.ndarray, obstacles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """What every choice of sides costs more than the motion without obstacles, of many slaloms at once.
 
     Args:
         task, params: the slalom and the robot.
-        across: (B, 4) y relative to the goal, θ, ẏ and θ̇ at the start.
-        obstacles: (B, n, 2) y relative to the goal, and how near the ball's centre may come, m.
-        passed: (B, n) control steps at which the robot passes them.
+        x0: (B, 8) initial states.
+        goal_y: (B,) m.
+        along: (B, steps+1) x of one solution of each, m.
+        obstacles: (B, n, 3) as `Task.passed_obstacles` gives.
 
     Returns:
-        (B, 2^n), in the order of `choices`.
+        (B, 2^n), in the order of `choices`; and the control steps (B, n) at which obstacles are passed.
     """
     model = _model(task, params)
-    return _priced(model, passed, obstacles, np.einsum("bnk,bk->bn", model.free[passed], across))[1]
+    passed = np.abs(along[:, :, None] - obstacles[:, None, :, 0]).argmin(1)
+    across = x0[:, _ACROSS] - np.pad(goal_y[:, None], ((0, 0), (0, 3)))
+    relative = obstacles[..., 1:] - np.stack([goal_y, np.zeros(len(goal_y))], axis=-1)[:, None]
+    return _priced(model, passed, relative, np.einsum("bnk,bk->bn", model.free[passed], across))[1], passed
 
 
 @dataclass(frozen=True)
@@ -104,9 +107,9 @@ def _model(task: Task, params: BallbotParams) -> _Model:
     params = replace(params, wheels=None)  # with wheels it moves nearly as without
     dt, rest = task.control_dt, np.zeros((1, 8))
     a, b = (matrix[0] for matrix in discretize(params, rest, np.zeros((1, 2)), dt))
-    a, b = a[np.ix_(ACROSS, ACROSS)], b[ACROSS, 1:]
+    a, b = a[np.ix_(_ACROSS, _ACROSS)], b[_ACROSS, 1:]
     q, r = quadratic_cost(task, rest, np.zeros((1, 2)), np.zeros(len(task.constant_names)))
-    q, r = q[0][np.ix_(ACROSS, ACROSS)] * dt, r[0][1:, 1:] * dt
+    q, r = q[0][np.ix_(_ACROSS, _ACROSS)] * dt, r[0][1:, 1:] * dt
     p = scipy.linalg.solve_discrete_are(a, b, q, r)
     price = r + b.T @ p @ b
     closed = a - b @ np.linalg.solve(price, b.T @ p @ a)

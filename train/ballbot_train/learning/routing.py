@@ -77,7 +77,6 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
     known = np.argsort(distances)[np.linspace(0, episodes - 1, _DISTANCES).astype(int)]
     motions = [find_optimum(task, params, x[i], task.without_obstacles(c[i]), guesses=1) for i in known]
     nearest = np.abs(distances[:, None] - distances[known]).argmin(1)
-    across = x[:, [1, 3, 5, 7]] - np.pad(goals[:, 1:], ((0, 0), (0, 3)))
     obstacles = [_passed(task, each) for each in c]
     route = FRAMES[task.routed_frame].route
     assert route is not None
@@ -90,14 +89,14 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
         of_count = np.flatnonzero(counts == count)
         for rows in np.array_split(of_count, math.ceil(len(of_count) / _BATCH)):
             own = np.array([obstacles[i] for i in rows])
-            own[..., 1] -= goals[rows, None, 1]
             stretch = distances[rows] / distances[known][nearest[rows]]
             along = stretch[:, None] * np.array([motions[k].trajectory.x[:, 0] for k in nearest[rows]])
-            passed = np.abs(along[:, :, None] - own[:, None, :, 0]).argmin(1)
-            costs = sides.predict_costs(task, params, across[rows], own[..., 1:], passed)
+            costs, _ = sides.predict_costs(task, params, x[rows], goals[rows, 1], along, own)
             base = stretch**2 * np.array([motions[k].cost for k in nearest[rows]])
             relative = (costs - costs.min(1, keepdims=True)) / (base + costs.min(1))[:, None]
-            nearer = np.where(own[..., 1] < 0, 1, -1)  # the left of an obstacle below the goal's line
+            nearer = np.where(
+                own[..., 1] < goals[rows, None, 1], 1, -1
+            )  # the left of an obstacle below the goal's line
             for column in columns:
                 picked = [row_of[tuple(side)] for side in (farther[column, :count] * nearer).tolist()]
                 regrets[rows, column] = relative[np.arange(len(rows)), picked]
