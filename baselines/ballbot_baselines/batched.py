@@ -36,6 +36,7 @@ _SIDEWAYS_FAMILY = tuple(itertools.product((7.0, 10.0, 14.0), (1.0, 1.8), (-0.6,
 _MOTION = tuple(Options(bends=0, width=width, multiplier=1e-3) for width in (0.2, 0.02))
 _PATH = tuple(Options(bends=bends, width=width, multiplier=1e-2) for bends, width in ((3, 0.2), (6, 0.2), (1, 0.05)))
 _GOAL = tuple(replace(options, multiplier=0.1) for options in _PATH)
+_NEAR_GOAL = (Options(bends=1, width=0.005, multiplier=0.01), *_GOAL)  # where the goal's multipliers are about right
 _ROUGH_PATH, _ROUGH_GOAL = (
     tuple(replace(options, tolerance=1e-4, violation=1e-3) for options in tries) for tries in (_PATH, _GOAL)
 )
@@ -223,8 +224,12 @@ class _Batch:
         c: np.ndarray | None = None,
         free_time: bool = False,
         chosen_sides: np.ndarray | None = None,
+        end_multipliers: np.ndarray | None = None,
     ) -> Solutions:
-        """Solves guesses with some options in turn until they are solved, and on chosen sides (J, obstacles) of obstacles."""
+        """Solves guesses with some options in turn until they are solved, and on chosen sides (J, obstacles) of obstacles.
+
+        They may start from multipliers (J, ne) of the end.
+        """
         task, n = self._task, guesses.a.shape[1]
         solver, lengths = (
             (ilqr(task, self._params, True), 1.0) if free_time else (self._solver, coarseness * task.control_dt)
@@ -240,12 +245,13 @@ class _Batch:
             now, waiting = (waiting, ()) if len(left) * len(waiting) <= _FEW else (waiting[:1], waiting[1:])
             rows = np.tile(left, len(now))
             some, options = guesses.some(rows), [tried for tried in now for _ in left]
-            again = solver.solve(some.x, some.a, some.steps, lengths, given[rows], options)
-            found = again.some(np.arange(len(left))) if found is None else found
+            ends = None if end_multipliers is None else end_multipliers[rows]
+            again = solver.solve(some.x, some.a, some.steps, lengths, given[rows], options, end_multipliers=ends)
+            found = (again if len(now) == 1 else again.some(np.arange(len(left)))) if found is None else found
             right = again.solved
             if chosen_sides is not None:
                 right = right & (self._sides(some.of, again.x) == chosen_sides[rows]).all(axis=1)
-            for better in (again.solved & ~found.solved[rows], right):
+            for better in (again.solved & ~found.solved[rows], right) if found is not again else ():
                 first = np.unique(np.where(better, rows, -1), return_index=True)[1]
                 found.put(rows, again, first[better[first]])
             left = np.setdiff1d(left, rows[right])
@@ -261,7 +267,9 @@ class _Batch:
             found[row, : len(obstacles[i])] = search.side_choice(path, obstacles[i])
         return found
 
-    def _keep(self, guesses: _Guesses, tries: Sequence[Options], chosen_sides: np.ndarray | None = None) -> np.ndarray:
+    def _keep(
+        self, guesses: _Guesses, tries: Sequence[Options], end_multipliers: np.ndarray | None = None
+    ) -> np.ndarray:
         """Solves guesses, keeps the cheapest solution of every episode, and returns all costs (J,).
 
         After guesses that end early, LQR goes on. Where that costs something else than its cost-to-go, the whole episode is
@@ -269,7 +277,7 @@ class _Batch:
         """
         if not len(guesses.of):
             return np.zeros(0)
-        return self._kept(guesses, self._solve(guesses, tries, chosen_sides=chosen_sides))
+        return self._kept(guesses, self._solve(guesses, tries, end_multipliers=end_multipliers))
 
     def _kept(self, guesses: _Guesses, found: Solutions) -> np.ndarray:
         if self._solver.rest is not None and guesses.a.shape[1] < self._task.steps:
@@ -363,7 +371,7 @@ class _Batch:
         motions = [self._motion(path, self._task.control_dt, self._x0[i]) for i, path in zip(of, paths, strict=True)]
         return _Guesses.joined(of, [(x[::coarseness], a[::coarseness]) for x, a in motions])
 
-    def _motion(self, path: np.ndarray, length: float, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _motion(self, path: np.ndarray, length: float | np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, u = guess.along_path(self._params, path, length, start=x0)
         return x, u / self._params.force_limit
 
@@ -391,12 +399,11 @@ class _Batch:
         """The episodes of first-exit tasks, as `Shooting.in_whole_steps` does it for one."""
         task, n = self._task, FREE_TIME_INTERVALS
         of, paths = self._paths(np.arange(len(self._x0)))
-        motions = []
-        for i, path in zip(of, paths, strict=True):
-            length = (len(path) - 1) * task.control_dt / n
-            x, a = self._motion(guess.resampled(path, n), length, self._x0[i])
-            motions.append((np.column_stack([x, np.full(n + 1, length)]), a))
-        relaxed = self._solve(_Guesses.joined(of, motions), _ROUGH_GOAL, free_time=True)
+        lengths = np.array([len(path) - 1 for path in paths]) * task.control_dt / n
+        x, a = self._motion(np.array([guess.resampled(path, n) for path in paths]), lengths, self._x0[of])
+        x = np.concatenate([x, np.broadcast_to(lengths[:, None, None], (len(of), n + 1, 1))], axis=-1)
+        motions = _Guesses(np.array(of), x, a, np.full(len(of), n))
+        relaxed = self._solve(motions, _ROUGH_GOAL, free_time=True)
         chosen = _contenders(np.array(of), relaxed, search.BASIN_DOUBT)
         arrivals = np.ceil(relaxed.x[chosen, 0, 8] * n / task.control_dt).astype(int)
         tried: dict[int, dict[int, float]] = {i: {} for i in chosen.tolist()}  # costs by number of steps
@@ -406,14 +413,15 @@ class _Batch:
             for s in range(arrival - 1, arrival + 2)
         ]
         while wanted := [(i, s) for i, s in wanted if 1 <= s <= task.steps]:
-            resampled = [
-                (
-                    guess.resampled(relaxed.x[i, :, :8], s),
-                    guess.resampled(np.vstack([relaxed.a[i], relaxed.a[i, -1:]]), s)[:-1],
-                )
-                for i, s in wanted
-            ]
-            found = self._keep(_Guesses.joined([of[i] for i, _ in wanted], resampled), _GOAL)
+            rows, steps = np.array(wanted).T
+            x, a = np.zeros((len(rows), steps.max() + 1, 8)), np.zeros((len(rows), steps.max(), 2))
+            for s in np.unique(steps).tolist():
+                some = rows[steps == s]
+                x[steps == s, : s + 1] = guess.resampled(relaxed.x[some, :, :8], s)
+                held = np.concatenate([relaxed.a[some], relaxed.a[some, -1:]], axis=1)
+                a[steps == s, :s] = guess.resampled(held, s)[:, :-1]
+            guesses = _Guesses(motions.of[rows], x, a, steps)
+            found = self._keep(guesses, _NEAR_GOAL, relaxed.end_multipliers[rows])
             for (i, s), cost in zip(wanted, found.tolist(), strict=True):
                 tried[i][s] = cost
             wanted = []

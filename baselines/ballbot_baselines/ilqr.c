@@ -45,9 +45,11 @@ static void violation(int count, const real *g, const real *multiplier, int k, r
     }
 }
 
-/* Arrays of all episodes, C-contiguous: x (jobs, n+1, STATES) and a (jobs, n, 2) are guesses, and then results. Episodes of fewer
-   than n steps begin with steps of no length. */
+/* Arrays of all episodes, C-contiguous: x (episodes, most+1, STATES) and a (episodes, most, 2) are guesses, and then results.
+   `rows` are the episodes that are solved together. Those of fewer than n steps begin with steps of no length. */
 typedef struct {
+    int64_t most;
+    const int64_t *rows;
     const int64_t *steps;
     const options *each;
     const double *lengths, *given;
@@ -67,19 +69,19 @@ typedef struct {
     real merit[LANES], merit_new[LANES], cost[LANES], cost_new[LANES], *promised;
 } block;
 
-/* Episode j takes up lane k. */
-static void load(block *b, const problems *q, int64_t j, int k) {
-    const int64_t empty = b->n - q->steps[j];
+/* An episode takes up lane k. */
+static void load(block *b, const problems *q, int64_t next, int k) {
+    const int64_t j = q->rows[next], empty = b->n - q->steps[j];
     b->job[k] = j;
     ++b->active, b->tick[k] = 0, b->merit[k] = INFINITY;
     b->o[k] = q->each[j], b->width[0][k] = b->o[k].width, b->share[0][k] = 1, b->damping[0][k] = 0;
     for (int64_t t = 0; t <= b->n; ++t) {
         const int64_t s = t < empty ? 0 : t - empty;
-        for (int i = 0; i < STATES; ++i) b->x[t][i][k] = q->x_all[(j * (b->n + 1) + s) * STATES + i];
+        for (int i = 0; i < STATES; ++i) b->x[t][i][k] = q->x_all[(j * (q->most + 1) + s) * STATES + i];
         if (t == b->n) break;
         b->dt[t][0][k] = t < empty ? 0 : q->lengths[j];
-        for (int i = 0; i < 2; ++i) b->a[t][i][k] = t < empty ? 0 : q->a_all[(j * b->n + s) * 2 + i];
-        for (int i = 0; i < PATH; ++i) b->m[t][i][k] = t < empty ? 0 : q->path_prices[(j * b->n + s) * PATH + i];
+        for (int i = 0; i < 2; ++i) b->a[t][i][k] = t < empty ? 0 : q->a_all[(j * q->most + s) * 2 + i];
+        for (int i = 0; i < PATH; ++i) b->m[t][i][k] = t < empty ? 0 : q->path_prices[(j * q->most + s) * PATH + i];
     }
     for (int i = 0; i < END; ++i) b->e[i][k] = q->end_prices[j * END + i];
     for (int i = 0; i < PARAMS; ++i) b->p[i][k] = q->given[j * PARAMS + i];
@@ -97,12 +99,12 @@ static void unload(block *b, const problems *q, int k, int over) {
     real gap = 0, missed = 0;
     for (int64_t t = empty; t <= b->n; ++t) {
         const int64_t s = t - empty;
-        for (int i = 0; i < STATES; ++i) q->x_all[(j * (b->n + 1) + s) * STATES + i] = b->x[t][i][k];
+        for (int i = 0; i < STATES; ++i) q->x_all[(j * (q->most + 1) + s) * STATES + i] = b->x[t][i][k];
         if (t == b->n) break;
-        for (int i = 0; i < 2; ++i) q->a_all[(j * b->n + s) * 2 + i] = b->a[t][i][k];
-        for (int i = 0; i < 2 * STATES; ++i) q->gains_all[(j * b->n + s) * 2 * STATES + i] = b->gain[t][i][k];
-        for (int i = 0; i < STATES; ++i) q->slopes_all[(j * b->n + s) * STATES + i] = b->slope[t][i][k];
-        for (int i = 0; i < PATH; ++i) q->path_prices[(j * b->n + s) * PATH + i] = b->m[t][i][k];
+        for (int i = 0; i < 2; ++i) q->a_all[(j * q->most + s) * 2 + i] = b->a[t][i][k];
+        for (int i = 0; i < 2 * STATES; ++i) q->gains_all[(j * q->most + s) * 2 * STATES + i] = b->gain[t][i][k];
+        for (int i = 0; i < STATES; ++i) q->slopes_all[(j * q->most + s) * STATES + i] = b->slope[t][i][k];
+        for (int i = 0; i < PATH; ++i) q->path_prices[(j * q->most + s) * PATH + i] = b->m[t][i][k];
     }
     for (int i = 0; i < END; ++i) q->end_prices[j * END + i] = b->e[i][k];
     off(b, k, &gap, &missed);
@@ -213,11 +215,11 @@ static int decide(block *b, int k) {
     return ++b->tick[k] >= o->iterations && over < 0 ? EXHAUSTED : over;
 }
 
-/* Solves `jobs` episodes of at most n steps, each with its options. */
-void solve(int64_t jobs, int64_t n, const options *each, const int64_t *steps, const double *lengths, const double *given,
-           double *x, double *a, double *path_prices, double *end_prices, double *gains, double *slopes, double *costs, double *missed, int64_t *status,
-           int64_t *iterations) {
-    const problems q = {steps, each, lengths, given, x, a, path_prices, end_prices, gains, slopes, costs, missed, status, iterations};
+/* Solves `jobs` of the episodes, of at most n steps, each with its options. */
+void solve(int64_t jobs, int64_t n, int64_t most, const int64_t *rows, const options *each, const int64_t *steps,
+           const double *lengths, const double *given, double *x, double *a, double *path_prices, double *end_prices,
+           double *gains, double *slopes, double *costs, double *missed, int64_t *status, int64_t *iterations) {
+    const problems q = {most, rows, steps, each, lengths, given, x, a, path_prices, end_prices, gains, slopes, costs, missed, status, iterations};
     block *b = calloc(1, sizeof *b);
     b->n = n;
 #define MAKE(name) b->name = calloc((size_t)n + 1, sizeof *b->name)

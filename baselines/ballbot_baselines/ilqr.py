@@ -155,7 +155,7 @@ class Ilqr:
         library, self.states, self._sizes = _COMPILED[kind]
         self._solve, self._follow = library.solve, library.follow
         count, pointer = ctypes.c_int64, ctypes.c_void_p
-        self._solve.argtypes, self._solve.restype = [count, count, *[pointer] * 14], None
+        self._solve.argtypes, self._solve.restype = [count, count, count, *[pointer] * 15], None
         self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 9], None
 
     def solve(
@@ -184,45 +184,23 @@ class Ilqr:
         """
         jobs, n = a.shape[:2]
         x, a = np.array(x, np.float64, order="C"), np.array(a, np.float64, order="C")
-        steps, (lengths, given) = np.broadcast_to(steps, jobs), self._given(jobs, lengths, given)
+        steps = np.array(np.broadcast_to(steps, jobs), np.int64)
+        lengths, given = self._given(jobs, lengths, given)
         each = [options] * jobs if isinstance(options, Options) else options
         numbers = {one: astuple(one) for one in set(each)}
         settings = np.array([numbers[one] for one in each], np.float64).reshape(jobs, len(fields(Options)))
         m, e = np.zeros((jobs, n, self._sizes["PATH"])), np.zeros((jobs, self._sizes["END"]))
-        if multipliers is None:
-            m[:], e[:] = settings[:, -1:, None], settings[:, -1:]
-        else:
-            m[:], e[:] = multipliers, end_multipliers
+        m[:] = settings[:, -1:, None] if multipliers is None else multipliers
+        e[:] = settings[:, -1:] if end_multipliers is None else end_multipliers
         gains, slopes = np.zeros((jobs, n, 2, self.states)), np.zeros((jobs, n, self.states))
-        found = Solutions(x, a, gains, slopes, np.zeros(jobs), np.zeros(jobs, bool), m, e)
+        costs, missed, (status, iterations) = np.zeros(jobs), np.zeros(jobs), np.zeros((2, jobs), np.int64)
+        arrays = (settings, steps, lengths, given, x, a, m, e, gains, slopes, costs, missed, status, iterations)
         alike = -(-steps // _ALIKE)
         for group in np.unique(alike):
             rows = np.flatnonzero(alike == group)
-            self._solve_alike(found, rows, min(n, group * _ALIKE), steps, lengths, given, settings)
-        return found
-
-    def _solve_alike(self, found: Solutions, rows: np.ndarray, n: int, *given: np.ndarray) -> None:
-        """Solves some problems, of at most n steps, in place; the number of steps, length, parameters and options of all."""
-        some = found.some(rows)
-        x, a, gains, slopes, m = (
-            np.ascontiguousarray(part[:, : n + more])
-            for part, more in ((some.x, 1), (some.a, 0), (some.gains, 0), (some.slopes, 0), (some.multipliers, 0))
-        )
-        missed, status, iterations = np.zeros(len(rows)), *np.zeros((2, len(rows)), np.int64)
-        steps, lengths, parameters, settings = (part[rows] for part in given)
-        # named, because all have to live as long as the call
-        arrays = (settings, np.ascontiguousarray(steps, np.int64), lengths, parameters, x, a, m, some.end_multipliers)
-        arrays += (gains, slopes, some.costs, missed, status, iterations)
-        self._solve(len(rows), n, *(array.ctypes.data for array in arrays))
-        for kept, values in zip(
-            (found.x, found.a, found.gains, found.slopes, found.multipliers), (x, a, gains, slopes, m), strict=True
-        ):
-            kept[rows, : values.shape[1]] = values
-        found.costs[rows], found.solved[rows], found.end_multipliers[rows] = (
-            some.costs,
-            status == OPTIMAL,
-            some.end_multipliers,
-        )
+            longest = min(n, int(group) * _ALIKE)
+            self._solve(len(rows), longest, n, *(array.ctypes.data for array in (rows, *arrays)))
+        return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, m, e)
 
     def follow(
         self, x0: np.ndarray, length: float, given: np.ndarray, paths: np.ndarray, settings: tuple[float, float]
