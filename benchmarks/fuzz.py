@@ -187,8 +187,8 @@ def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ..
 def _entries(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_train import jobs
 
-    path = folder / "job.jsonl"
-    path.write_text("".join(json.dumps({"item": i, "entry": {"cost": 1.5}}) + "\n" for i in range(9)))
+    path = folder / "job.json"
+    path.write_text(json.dumps([{"cost": 1.5}] * 9))
     return [path], lambda: jobs._read(path, 9), ()
 
 

@@ -230,24 +230,26 @@ def _equal(a: np.ndarray, b: np.ndarray) -> bool:
 
 def _with_a_kill(
     made: Callable[..., dict[str, np.ndarray]], folder: Path, nodes: Cluster, episodes: int
-) -> tuple[dict[str, np.ndarray], dict[tuple[str, int], float], float]:
+) -> tuple[dict[str, np.ndarray], dict[tuple[int, int], float], float]:
     """What it makes, when every item was written, and the time that it took."""
-    written: dict[tuple[str, int], float] = {}
-    write = jobs._Progress.write
+    written: dict[tuple[int, int], float] = {}
+    stream = jobs.stream
 
-    def write_and_kill(self: Any, i: int, text: str) -> None:
-        write(self, i, text)
-        assert (self.job.name, i) not in written, "an item arrived twice"
-        written[self.job.name, i] = time.perf_counter()
-        if len(written) == episodes // 4:
-            nodes.remove_node(next(iter(nodes.worker_nodes)), allow_graceful=False)
+    def stream_and_kill(*arguments: Any) -> Iterator[tuple[int, list[jobs.Entry]]]:
+        for number, entries in stream(*arguments):
+            for i in range(len(entries)):
+                assert (number, i) not in written, "an item arrived twice"
+                written[number, i] = time.perf_counter()
+            if nodes.worker_nodes and len(written) >= episodes // 4:
+                nodes.remove_node(next(iter(nodes.worker_nodes)), allow_graceful=False)
+            yield number, entries
 
-    jobs._Progress.write = write_and_kill
+    jobs.stream = stream_and_kill
     began = time.perf_counter()
     try:
         found = made(folder / f"{made.__name__}-nodes", Workers(ray=nodes.address), episodes)
     finally:
-        jobs._Progress.write = write
+        jobs.stream = stream
     return found, written, time.perf_counter() - began
 
 

@@ -52,18 +52,18 @@ def test_the_episodes_of_every_controller_are_the_certified_ones():
     assert all(r.failure and 0.8 * env.task.survival_pay < r.cost for r in results)  # without a force the robot falls
 
 
-def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path, monkeypatch):
+def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path):
     def run():
-        return benchmark.benchmark({"stabilize": ["lqr"]}, 4, "rk4", tmp_path, 1)
+        return benchmark.benchmark({"stabilize": ["lqr"]}, 7, "rk4", tmp_path, 1)
 
     first = run()
-    (path,) = tmp_path.rglob("*.jsonl")
-    lines = path.read_text().splitlines(keepends=True)
-    kept = json.loads(lines[0])
-    kept["entry"]["cost"] = 123.0  # would be overwritten if the episode ran again
-    path.write_text(json.dumps(kept) + "\n" + lines[1])  # as if killed after the second episode
+    path, last = sorted(tmp_path.rglob("unfinished/*.json"))
+    kept = json.loads(path.read_text())
+    kept[0]["cost"] = 123.0  # would be overwritten if the episode ran again
+    path.write_text(json.dumps(kept))
+    last.unlink()  # as if killed after the first job
     again = run()
-    assert [r.episode for r in again] == [0, 1, 2, 3]
+    assert [r.episode for r in again] == list(range(7))
     assert again[0].cost == 123.0
     assert [r.cost for r in again[1:]] == [r.cost for r in first[1:]]
 

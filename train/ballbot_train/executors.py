@@ -1,39 +1,42 @@
 """Where work is done: in this process, in processes of this machine, or on the nodes of a Ray cluster.
 
-Each of the three is a `Pool`. It runs tasks, which are generator functions, and gives back what they yield as soon as they
-yield it. Items of `jobs` and trials of `learning.tuning` are tasks. A task gets its arguments and
-nothing else, so a worker needs no file of this machine.
+Each of the three has the `submit` of `concurrent.futures`. A task gets its arguments and nothing else, so a worker needs no
+file of this machine. Jobs of `jobs` and trials of `learning.tuning` are tasks.
 """
 
-import math
 import os
 import pickle
 import shutil
 import signal
 import time
 import traceback
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from multiprocessing import get_context, parent_process
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Thread
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from ballbot_gym import registry
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import Robot
 from ballbot_train.console import console
 
-_NODE_SECONDS = 5.0  # how often the nodes of a cluster are counted
+NODE_SECONDS = 5.0
+"""How often the nodes of a cluster are counted."""
+TRIES = 3
+"""Of a task whose worker or node dies."""
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
+_PER_CORE = 2  # tasks in flight for every core of a cluster, so that no core waits for its next one
 
 
 class WorkerError(RuntimeError):
-    """Worker processes died, and died again when their items were tried once more; or there is no cluster."""
+    """Workers died, and died again when their tasks were tried once more; or there is no cluster."""
 
 
 @dataclass(frozen=True)
@@ -69,189 +72,136 @@ class Workers:
         return (self.workers or os.cpu_count() or 1) if self.ray is None else 0
 
 
-@dataclass(frozen=True)
-class Event:
-    """What happened to a task."""
-
-    key: Hashable
-    """Of the task, as given to `Pool.start`."""
-    kind: Literal["yielded", "ended", "worker died", "node died"]
-    value: Any = None
-    """What the task yielded."""
-
-
 class Pool(Protocol):
-    """Runs tasks. An exception that a task raises is raised by `events`."""
+    """Runs tasks. Of its futures `result_of` gives the results."""
 
-    def has_room(self) -> bool:
-        """Whether another task may be started. Who starts no others keeps few tasks in memory."""
+    def most(self) -> int:
+        """How many tasks to have in flight at most. Who submits no more keeps few in memory."""
         ...
 
-    def start(self, key: Hashable, function: Callable[..., Iterator[Any]], *arguments: Any) -> None:
-        """Runs a generator function of a module on a worker."""
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
+        """Calls a function of a module on a worker."""
         ...
 
-    def events(self) -> list[Event]:
-        """What happened since the last call; waits until something has. Those of one task are in order."""
-        ...
 
-    def stop(self, key: Hashable) -> None:
-        """Ends a task at once. No more is heard of it."""
-        ...
+def result_of(future: Future) -> Any:
+    """What the function of a task returned.
+
+    Raises:
+        WorkerError: the worker died.
+        Exception: what the function raised.
+    """
+    try:
+        value, error, text = future.result()
+    except Exception as died:  # a task gives its own errors back
+        raise WorkerError(str(died).strip().partition("\n")[0] or type(died).__name__) from died
+    if error is not None:
+        raise error from WorkerError(f"in a worker:\n{text}")
+    return value
+
+
+def _attempt(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, Exception | None, str]:
+    """What a task returned; or what it raised, and where. An error that cannot be pickled becomes a RuntimeError."""
+    try:
+        return function(*arguments), None, ""
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            error = RuntimeError(repr(error))
+        return None, error, traceback.format_exc()
 
 
 @contextmanager
-def open_pool(workers: int | Workers, serial: bool = False, per_core: int = 2) -> Iterator[Pool]:
+def open_pool(workers: int | Workers, serial: bool = False) -> Iterator[Pool]:
     """The pool of some workers. At the end of the block whatever still runs is stopped.
 
     Args:
         workers: a number of processes of this machine, or `Workers`.
         serial: do everything in this process.
-        per_core: tasks in flight for every core of a cluster; with two, no core waits for its next task.
     """
     workers = Workers.of(workers)
-    with ExitStack() as stack:
-        if serial:
-            yield _Serial()
-        elif workers.ray is None:
-            pool = _Processes(workers.here)
-            stack.callback(pool.close)
+    if serial:
+        yield _Serial()
+    elif workers.ray is None:
+        pool = _Processes(workers.here)
+        try:
             yield pool
-        else:
-            yield stack.enter_context(_cluster(workers, per_core))
+        finally:
+            pool.close()
+    else:
+        with _cluster(workers) as pool:
+            yield pool
 
 
 class _Serial:
-    """The calling process, which does one task at a time."""
+    """The calling process, which does a task when it is submitted."""
 
-    def __init__(self) -> None:
-        self._running: dict[Hashable, Iterator[Any]] = {}
+    def most(self) -> int:
+        return 1
 
-    def has_room(self) -> bool:
-        return not self._running
-
-    def start(self, key: Hashable, function: Callable[..., Iterator[Any]], *arguments: Any) -> None:
-        self._running[key] = function(*arguments)
-
-    def events(self) -> list[Event]:
-        key, generator = next(iter(self._running.items()))
-        for value in generator:
-            return [Event(key, "yielded", value)]
-        del self._running[key]
-        return [Event(key, "ended")]
-
-    def stop(self, key: Hashable) -> None:
-        self._running.pop(key, None)
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
+        future: Future = Future()
+        future.set_result(_attempt(function, arguments))
+        return future
 
 
 class _Processes:
-    """Processes of this machine. Each does one task at a time, so one that dies takes only its own task with it."""
+    """Processes of this machine. Each is a pool of its own, so one that dies takes only its own task with it."""
 
     def __init__(self, count: int):
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
-        self._context = get_context("spawn")  # a forked child would share PyBullet's clients and CasADi's state
         self._count = count
-        self._idle: list[tuple[Any, Connection]] = []
-        self._busy: dict[Connection, tuple[Hashable, Any]] = {}
+        self._last: dict[ProcessPoolExecutor, Future] = {}
 
-    def has_room(self) -> bool:
-        return len(self._busy) < self._count
+    def most(self) -> int:
+        return self._count
 
-    def start(self, key: Hashable, function: Callable[..., Iterator[Any]], *arguments: Any) -> None:
-        while self._idle:
-            process, ours = self._idle.pop()
-            if process.is_alive():
-                break
-        else:
-            ours, theirs = self._context.Pipe()
-            process = self._context.Process(target=_serve, args=(theirs, *registry.registered()))
-            process.start()
-            theirs.close()  # so that the pipe ends with the process
-        assert isinstance(ours, Connection)
-        self._busy[ours] = key, process
-        try:
-            ours.send((function, arguments))
-        except OSError:  # it has just died, which `events` will find
-            return
-
-    def events(self) -> list[Event]:
-        found = []
-        for ours in wait(list(self._busy)):
-            assert isinstance(ours, Connection)
-            key, process = self._busy[ours]
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
+        for pool in [pool for pool, last in self._last.items() if last.done()]:
             try:
-                kind, value = ours.recv()
-            except (EOFError, OSError):
-                kind, value = "worker died", None
-                process.join()
-            if kind == "raised":
-                assert value is not None
-                raise value[0] from WorkerError(f"in a worker:\n{value[1]}")
-            if kind != "yielded":
-                del self._busy[ours]
-                if kind == "ended":
-                    self._idle.append((process, ours))
-            found.append(Event(key, kind, value))
-        return found
-
-    def stop(self, key: Hashable) -> None:
-        for ours, (running, process) in list(self._busy.items()):
-            if running == key:
-                process.terminate()
-                del self._busy[ours]
+                self._last[pool] = pool.submit(_attempt, function, arguments)
+                return self._last[pool]
+            except BrokenExecutor:  # its process has died
+                del self._last[pool]
+        pool = worker_process()
+        self._last[pool] = pool.submit(_attempt, function, arguments)
+        return self._last[pool]
 
     def close(self) -> None:
-        for process, ours in [*self._idle, *((process, ours) for ours, (_, process) in self._busy.items())]:
-            process.terminate()
-            ours.close()
+        for pool in self._last:
+            end_process(pool)
 
 
-def _serve(connection: Connection, modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
-    """Does the tasks that come through a pipe until it ends. Modules and robots are those that users registered."""
-    prepare_worker(modules, robots)
-    try:
-        while True:
-            for message in _messages(*connection.recv()):
-                connection.send(message)
-    except (EOFError, OSError):  # the run was killed, and may already go on in another process
-        os._exit(1)
+def worker_process() -> ProcessPoolExecutor:
+    """A process that does tasks, with what users registered in this one. It ends with this one."""
+    # a forked child would share PyBullet's clients and CasADi's state
+    return ProcessPoolExecutor(1, get_context("spawn"), _prepare, registry.registered())
 
 
-def prepare_worker(modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
-    """Gives this process what users registered in the one that started it, and lets it end with that one."""
+def end_process(pool: ProcessPoolExecutor) -> None:
+    """Ends a `worker_process` at once, whatever it does."""
+    for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
+        process.terminate()
+    pool.shutdown(cancel_futures=True)
+
+
+def _prepare(modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which then ends its workers
     Thread(target=_end_with_the_run, daemon=True).start()
     registry.restore(modules, robots)
 
 
 def _end_with_the_run() -> None:
-    """Ends this worker as soon as the run is killed. Else it would finish its item, which can take minutes, for nobody."""
+    """Ends this worker as soon as the run is killed. Else it would finish its task, which can take minutes, for nobody."""
     run = parent_process()
     if run is not None:
         wait([run.sentinel])
         os._exit(1)
 
 
-def _messages(function: Callable[..., Iterator[Any]], arguments: tuple[Any, ...]) -> Iterator[tuple[str, Any]]:
-    try:
-        for value in function(*arguments):
-            yield "yielded", value
-    except Exception as error:
-        yield "raised", (_sendable(error), traceback.format_exc())
-    else:
-        yield "ended", None
-
-
-def _sendable(error: Exception) -> Exception:
-    """The error, or a RuntimeError that says the same if it cannot be pickled."""
-    try:
-        return pickle.loads(pickle.dumps(error))
-    except Exception:
-        return RuntimeError(repr(error))
-
-
 @contextmanager
-def _cluster(workers: Workers, per_core: int) -> Iterator[Pool]:
+def _cluster(workers: Workers) -> Iterator[Pool]:
     """A pool of tasks on a Ray cluster. Connects to the cluster, unless this process is connected to one already.
 
     Raises:
@@ -280,7 +230,7 @@ def _cluster(workers: Workers, per_core: int) -> Iterator[Pool]:
                     f"no Ray cluster can be used at {workers.ray} ({error}); `ray start --head` starts one, and --ray local "
                     "starts one for this run alone"
                 ) from error
-        pool = _Ray(ray, workers.workers, per_core)
+        pool = _Ray(ray, workers.workers)
         try:
             yield pool
         finally:
@@ -313,82 +263,43 @@ def _code(folder: Path) -> list[str]:
 
 
 class _Ray:
-    """Tasks of one core each on the nodes of the cluster to which this process is connected.
+    """Tasks of one core each on the nodes of the cluster to which this process is connected."""
 
-    Ray repeats no task by itself, because a task that is started anew would repeat what it has yielded. Who started the
-    task hears that its worker or node died, and starts what is left.
-    """
-
-    def __init__(self, ray: Any, workers: int | None, per_core: int):
-        self._ray, self._workers, self._per_core = ray, workers, per_core
+    def __init__(self, ray: Any, workers: int | None):
+        self._ray, self._workers = ray, workers
         # a name with a module, so that nodes import the function rather than unpickle it
-        self._task = ray.remote(num_cpus=1, max_retries=0, num_returns="streaming")(_stream)
-        self._running: dict[Any, Hashable] = {}
-        self._counted, self._nodes, self._cores = -math.inf, 0, 0
-        self._count_nodes()
+        self._task = ray.remote(num_cpus=1, max_retries=0)(_on_node)
+        self._running: set[Future] = set()
+        self._counted, self._cores, self._said = 0.0, 0, ""
 
-    def has_room(self) -> bool:
-        self._count_nodes()
-        most = self._workers or max(1, self._per_core * self._cores)
-        return len(self._running) < most
+    def most(self) -> int:
+        """Counts nodes and cores now and then, and says when they change."""
+        if time.monotonic() - self._counted > NODE_SECONDS:
+            self._counted = time.monotonic()
+            nodes = [node for node in self._ray.nodes() if node["Alive"]]
+            self._cores = int(sum(node["Resources"].get("CPU", 0) for node in nodes))
+            said = f"Ray: {len(nodes)} nodes with {self._cores} cores"
+            if said != self._said:
+                console.print(said)
+            self._said = said
+        return self._workers or max(1, _PER_CORE * self._cores)
 
-    def start(self, key: Hashable, function: Callable[..., Iterator[Any]], *arguments: Any) -> None:
-        self._running[self._task.remote(function, arguments, *registry.registered())] = key
-
-    def events(self) -> list[Event]:
-        ready = []
-        while not ready:
-            tasks = list(self._running)
-            if self._ray.wait(tasks, num_returns=1, timeout=_NODE_SECONDS)[0]:
-                ready = self._ray.wait(tasks, num_returns=len(tasks), timeout=0)[0]
-            self._count_nodes()
-        return [self._event(task) for task in ready]
-
-    def _event(self, task: Any) -> Event:
-        key, failed = self._running[task], self._ray.exceptions
-        try:
-            return Event(key, "yielded", self._ray.get(next(task)))
-        except StopIteration:
-            kind = "ended"
-        except failed.RayTaskError as error:
-            raise error.cause if isinstance(error.cause, Exception) else error from error
-        except failed.RuntimeEnvSetupError as error:
-            raise WorkerError(f"a node of the cluster cannot be prepared: {error}") from error
-        except failed.NodeDiedError:
-            kind = "node died"
-        except failed.RayError:  # a worker that crashed or was out of memory, or a result that was lost with its node
-            kind = "worker died"
-        del self._running[task]
-        return Event(key, kind)
-
-    def stop(self, key: Hashable) -> None:
-        for task, running in list(self._running.items()):
-            if running == key:
-                self._ray.cancel(task, force=True)
-                del self._running[task]
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
+        future = self._task.remote(function, arguments, *registry.registered()).future()
+        self._running.add(future)
+        future.add_done_callback(self._running.discard)
+        return future
 
     def close(self) -> None:
-        for key in list(self._running.values()):
-            self.stop(key)
-
-    def _count_nodes(self) -> None:
-        """Counts nodes and cores now and then, and says when they change."""
-        if time.monotonic() - self._counted < _NODE_SECONDS:
-            return
-        self._counted = time.monotonic()
-        nodes = [node for node in self._ray.nodes() if node["Alive"]]
-        counts = len(nodes), int(sum(node["Resources"].get("CPU", 0) for node in nodes))
-        if counts != (self._nodes, self._cores):
-            self._nodes, self._cores = counts
-            console.print(f"Ray: {self._nodes} nodes with {self._cores} cores")
+        for future in list(self._running):
+            self._ray.cancel(future.object_ref, force=True)  # pyright: ignore[reportAttributeAccessIssue] Ray's own
 
 
-def _stream(
-    function: Callable[..., Iterator[Any]],
-    arguments: tuple[Any, ...],
-    modules: tuple[str, ...],
-    robots: dict[str, Robot],
-) -> Iterator[Any]:
-    registry.restore(modules, robots)
-    for value in function(*arguments):  # noqa: UP028  # `yield from` hands on what Ray sends, which few iterators take
-        yield value
+def _on_node(
+    function: Callable[..., Any], arguments: tuple[Any, ...], modules: tuple[str, ...], robots: dict[str, Robot]
+) -> tuple[Any, Exception | None, str]:
+    def call(*given: Any) -> Any:
+        registry.restore(modules, robots)
+        return function(*given)
+
+    return _attempt(call, arguments)

@@ -1,24 +1,24 @@
-"""Work that outlives an interruption: jobs on parallel workers, whose finished items are kept as they come.
+"""Work that outlives an interruption: jobs on parallel workers, whose results are kept as they come.
 
-Each job is one file of JSON lines, with a line for every finished item. Workers compute and this process writes, so workers
-may be on other machines; `executors` says where. A run that is killed at any moment and started again therefore does only the
-items that no line holds. A folder belongs to one configuration until it is released, and to one process at a time.
+Each finished job is one file of JSON, with an entry for every item. Workers compute and this process writes, so workers may
+be on other machines; `executors` says where. A run that is killed at any moment and started again therefore does only the
+jobs that have no file. A folder belongs to one configuration until it is released, and to one process at a time.
 """
 
 import json
 import os
 import shutil
 from collections import Counter, deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
-from ballbot_train.executors import Pool, WorkerError, Workers, open_pool
+from ballbot_train.executors import NODE_SECONDS, TRIES, Pool, WorkerError, Workers, open_pool, result_of
 
 try:
     import filelock
@@ -35,13 +35,15 @@ _FOLDER = "unfinished"
 _LOCK = ".lock"
 _LIMIT = 2**32  # bytes of a job's file
 _held: dict[Path, filelock.BaseFileLock] = {}
-_new: set[Path] = set()  # folders that this process claimed first, and in which nothing is finished yet
-_WORKER_DEATHS, _NODE_DEATHS = 2, 5  # of one item, after which it is not tried again
+_new: set[Path] = set()  # folders that this process claimed first, and in which no job is finished yet
 
 
 @dataclass(frozen=True)
 class Job:
-    """Items that one worker does one after another. Small items belong into one job, because starting a job takes time."""
+    """Items that one worker does one after another, and which are kept together when the last is done.
+
+    Small items belong into one job, because starting a job takes time.
+    """
 
     name: str
     """Of its file; different for every job of a run."""
@@ -72,7 +74,7 @@ def unfinished(out: Path) -> Path:
 
 
 def _path_of(out: Path, name: str) -> Path:
-    return unfinished(out) / f"{name}.jsonl"
+    return unfinished(out) / f"{name}.json"
 
 
 def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Mapping[str, Any] | None = None) -> None:
@@ -141,7 +143,7 @@ def release(out: Path, marker: str = MARKER) -> None:
 
 
 def forget(out: Path, name: str) -> None:
-    """Deletes the entries of a job, which are kept elsewhere now."""
+    """Deletes the result of a job, which is kept elsewhere now."""
     _path_of(out, name).unlink(missing_ok=True)
 
 
@@ -203,15 +205,14 @@ def stream(
 ) -> Iterator[tuple[int, list[Entry]]]:
     """Does what is not done yet, and gives each job when it is done.
 
-    The calling process writes every entry when it comes, whoever computed it. An item whose process dies is tried once
-    more. If that process dies too, the item is left out, all others are done, and a WorkerError says which are missing. An
-    item whose node dies is tried on others, five times at most. A run that ends before its first item is finished leaves
-    no claim of the folder, because there is nothing to continue.
+    The calling process writes every result when it comes, whoever computed it. A job whose worker or node dies is tried
+    again, three times in all. Then it is left out, all others are done, and a WorkerError says which are missing. A run that
+    ends before its first job is finished leaves no claim of the folder, because there is nothing to continue.
 
     Args:
         jobs: what there is to do. They are taken when workers have room for them.
         out: folder of the results; unfinished ones are in a folder within.
-        workers: a number of processes, or `Workers`. The calling process does no item itself, so that it outlives any of
+        workers: a number of processes, or `Workers`. The calling process does no job itself, so that it outlives any of
             them; but with 1 process and $BALLBOT_IN_PROCESS set, it does them all, for debuggers and tests.
         on_progress: called with a job's group and a number of its items that are there.
 
@@ -219,54 +220,46 @@ def stream(
         The number of a job that is done, and its entries in the order of its items.
 
     Raises:
-        WorkerError: processes died, so that items are missing.
+        WorkerError: processes died, so that jobs are missing.
         ValueError: another process is using the folder, or there are no workers.
     """
     workers = Workers.of(workers)
     serial = workers.here == 1 and bool(os.environ.get("BALLBOT_IN_PROCESS"))
-    waiting = _begun(jobs, out, on_progress)
-    again = deque[_Progress]()
-    running: dict[Hashable, _Progress] = {}
-    lost: list[str] = []
-
-    def ended(progress: _Progress) -> Iterator[tuple[int, list[Entry]]]:
-        if progress.lost:
-            lost.extend(f"{progress.job.name}, item {progress.job.items[i]}" for i in sorted(progress.lost))
-        else:
-            yield progress.number, progress.entries()
-
+    waiting, again = enumerate(jobs), deque[tuple[int, Job]]()
+    running: dict[Future, tuple[int, Job]] = {}
+    deaths, lost = Counter[int](), list[str]()
     with _locked(out), ExitStack() as stack:
         stack.push(lambda error, *_: release(out) if error and out.resolve() in _new else None)
+        unfinished(out).mkdir(parents=True, exist_ok=True)
         pool: Pool | None = None  # a cluster takes seconds to start, and there may be nothing to do
         while True:
-            while pool is None or pool.has_room():
-                progress = next(waiting, None) or (again.popleft() if again else None)
-                if progress is None:
+            while pool is None or len(running) < pool.most():
+                number, job = next(waiting, None) or (again.popleft() if again else (-1, None))
+                if job is None:
                     break
-                if not progress.missing:
-                    yield from ended(progress)
+                if (done := _read(_path_of(out, job.name), len(job.items))) is not None:
+                    on_progress(job.group, len(job.items))
+                    yield number, done
                     continue
                 pool = pool or stack.enter_context(open_pool(workers, serial))
-                pool.start(progress.number, _texts, progress.job, progress.missing)
-                running[progress.number] = progress
-            if pool is None or not running:
+                running[pool.submit(_result, job)] = number, job
+            if not running:
                 break
-            for event in pool.events():
-                progress = running[event.key]
-                if event.kind == "yielded":
-                    progress.write(*event.value)
-                    _new.discard(out.resolve())
-                    on_progress(progress.job.group, 1)
+            for future in wait(running, NODE_SECONDS, FIRST_COMPLETED).done:
+                number, job = running.pop(future)
+                try:
+                    text = result_of(future)
+                except WorkerError as died:
+                    deaths[number] += 1
+                    if deaths[number] < TRIES:
+                        again.append((number, job))  # last in turn, when other processes may have left memory
+                    else:
+                        lost.append(f"{job.name}, items {', '.join(map(str, job.items))} ({died})")
                     continue
-                del running[event.key]
-                if event.kind == "ended":
-                    yield from ended(progress)
-                elif event.kind == "node died":
-                    progress.note_death(_NODE_DEATHS)
-                    waiting = chain([progress], waiting)
-                else:
-                    progress.note_death(_WORKER_DEATHS)
-                    again.append(progress)  # last in turn, when other processes may have left memory
+                files.write(_path_of(out, job.name), text)
+                _new.discard(out.resolve())
+                on_progress(job.group, len(job.items))
+                yield number, json.loads(text)
     if lost:
         raise WorkerError(
             f"worker processes died, most likely out of memory, at {'; '.join(lost)}. Everything else is kept: the "
@@ -274,79 +267,20 @@ def stream(
         )
 
 
-def _begun(jobs: Iterable[Job], out: Path, on_progress: Callable[[str, int], None]) -> Iterator["_Progress"]:
-    """Every job with what an earlier run did of it."""
-    unfinished(out).mkdir(parents=True, exist_ok=True)
-    for number, job in enumerate(jobs):
-        progress = _Progress(number, job, _path_of(out, job.name))
-        on_progress(job.group, len(job.items) - len(progress.missing))
-        yield progress
+def _result(job: Job) -> str:
+    """The entries of a job as JSON, on a worker."""
+    entries = list(job.function(*job.arguments, job.items))
+    if len(entries) != len(job.items):
+        raise ValueError(f"{job.name} gives {len(entries)} entries for {len(job.items)} items")
+    return json.dumps(entries)
 
 
-class _Progress:
-    """A job, and what its file holds of it."""
-
-    def __init__(self, number: int, job: Job, path: Path):
-        self.number, self.job, self.path = number, job, path
-        done = _read(path, len(job.items))
-        if path.exists() and len(done) < len(job.items):  # a kill may have left half a line, which would spoil the next
-            files.write(path, "".join(_line(i, json.dumps(entry)) for i, entry in done.items()))
-        self._done = set(done)
-        self._deaths: Counter[tuple[int, int]] = Counter()
-        self.lost: set[int] = set()
-        """Positions of items that are not tried any more."""
-
-    @property
-    def missing(self) -> tuple[int, ...]:
-        """Positions of the items that are to be done."""
-        return tuple(i for i in range(len(self.job.items)) if i not in self._done and i not in self.lost)
-
-    def write(self, i: int, text: str) -> None:
-        """Keeps the entry of an item."""
-        with self.path.open("a") as file:
-            file.write(_line(i, text))
-        self._done.add(i)
-
-    def note_death(self, most: int) -> None:
-        """Notes that the worker died at the first missing item, which is lost when it happened so often."""
-        if missing := self.missing:
-            self._deaths[missing[0], most] += 1
-            if self._deaths[missing[0], most] >= most:
-                self.lost.add(missing[0])
-
-    def entries(self) -> list[Entry]:
-        """All entries, in the order of the items."""
-        entries = _read(self.path, len(self.job.items))
-        if len(entries) < len(self.job.items):
-            raise ValueError(
-                f"{self.path} holds {len(entries)} of {len(self.job.items)} items though the run has ended; run the command "
-                "again"
-            )
-        return list(entries.values())
-
-
-def _texts(job: Job, positions: Sequence[int]) -> Iterator[tuple[int, str]]:
-    """Does the items at some positions of a job, on a worker: each position and its entry as JSON."""
-    items = tuple(job.items[i] for i in positions)
-    for i, entry in zip(positions, job.function(*job.arguments, items), strict=True):
-        yield i, json.dumps(entry)
-
-
-def _line(i: int, text: str) -> str:
-    return f'{{"item": {i}, "entry": {text}}}\n'
-
-
-def _read(path: Path, items: int) -> dict[int, Entry]:
-    """The finished ones of a number of items by their position, in order; a damaged line is none."""
+def _read(path: Path, items: int) -> list[Entry] | None:
+    """The entries of a finished job; None where it has none, or a damaged file."""
     if not path.exists():
-        return {}
-    found = {}
-    for text in files.read(path, _LIMIT).decode(errors="replace").split("\n")[:-1]:
-        try:
-            line = json.loads(text)
-            i, entry = line["item"], line["entry"]
-        except (ValueError, KeyError, TypeError, RecursionError):
-            continue
-        if isinstance(i, int) and 0 <= i < items:
-            found[i] = entry
-    return dict(sorted(found.items()))
+        return None
+    try:
+        entries = files.read_json(path, _LIMIT)
+    except files.FileError:
+        return None
+    return entries if isinstance(entries, list) and len(entries) == items else None

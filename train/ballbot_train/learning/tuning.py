@@ -20,14 +20,16 @@ A search is a folder:
 | ppo.yml or sac.yml | settings of the four ids in the format of rl-zoo3 |
 
 A search that is killed goes on where it stopped; trials that were running begin anew. Trials run in this process, in several,
-or on a Ray cluster. The study stays with this process: workers only train, and say what they reach.
+or on a Ray cluster. The study stays with this process: workers get the trials that have come to their end, by which they
+prune, and say what theirs reached.
 """
 
 import json
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +42,7 @@ from ballbot_gym.lazy import missing
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.executors import Pool, Workers, open_pool
+from ballbot_train.executors import NODE_SECONDS, TRIES, Pool, WorkerError, Workers, open_pool, result_of
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
 
@@ -139,7 +141,7 @@ def run(
     jobs.claim(out, asdict(search), "config.json")
     try:
         study = open_study(search, out)
-        with open_pool(workers, serial=workers.here == 1, per_core=1) as pool:
+        with open_pool(workers, serial=workers.here == 1) as pool:
             _search(study, search, trials, out, pool, on_trial)
         return write_tables(study, search, out)
     except (sqlalchemy.exc.DBAPIError, optuna.exceptions.StorageInternalError) as error:
@@ -161,7 +163,6 @@ def open_study(search: Search, out: Path) -> "optuna.Study":
     study.sampler = optuna.samplers.TPESampler(
         seed=len(study.trials), n_startup_trials=_STARTUP_TRIALS, multivariate=False
     )
-    study.pruner = optuna.pruners.MedianPruner(n_startup_trials=_STARTUP_TRIALS, n_warmup_steps=1)
     if not study.trials:
         study.enqueue_trial(encoded(SPACES[search.learner], LEARNERS[search.learner].settings(search.task)))
     for stale in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):  # of a search that was killed
@@ -195,65 +196,70 @@ def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
 def _search(
     study: "optuna.Study", search: Search, trials: int, out: Path, pool: Pool, on_trial: Callable[[int], None]
 ) -> None:
-    """Runs trials on the workers of a pool. Each yields its cost after every evaluation, and may be pruned then."""
-    running: dict[Hashable, tuple[optuna.Trial, Any]] = {}
-    evaluated: Counter[Hashable] = Counter()
-    deaths: Counter[Hashable] = Counter()
+    """Runs trials on the workers of a pool."""
+    running: dict[Future, optuna.Trial] = {}
+    deaths = Counter[int]()
+
+    def start(trial: optuna.Trial) -> None:
+        completed = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
+        running[pool.submit(_attempt, search, settings_of(search, trial.params), completed)] = trial
+
     while True:
         ended = len(_ended(study))
         on_trial(ended)
-        while ended + len(running) < trials and pool.has_room():
-            trial = study.ask(SPACES[search.learner])
-            settings = settings_of(search, trial.params)
-            running[trial.number] = trial, settings
-            pool.start(trial.number, _attempt, search, settings)
+        while ended + len(running) < trials and len(running) < pool.most():
+            start(study.ask(SPACES[search.learner]))
         if not running:
             return
-        for event in pool.events():
-            if event.key not in running:  # it has just been pruned
-                continue
-            trial, settings = running[event.key]
-            if event.kind == "yielded" and isinstance(event.value, float):
-                evaluated[event.key] += 1
-                trial.report(event.value, evaluated[event.key])
-                if evaluated[event.key] == search.evaluations or not trial.should_prune():
+        for future in wait(running, NODE_SECONDS, FIRST_COMPLETED).done:
+            trial = running.pop(future)
+            try:
+                reached = result_of(future)
+            except WorkerError as died:
+                deaths[trial.number] += 1
+                if deaths[trial.number] < TRIES:
+                    start(trial)
                     continue
-                study.tell(trial, state=optuna.trial.TrialState.PRUNED)  # others were better by then
-                pool.stop(event.key)
-            elif event.kind == "yielded":
-                _end(study, trial, event.value)
-                continue
-            elif event.kind != "ended":
-                deaths[event.key] += event.kind == "worker died"
-                evaluated[event.key] = 0
-                if deaths[event.key] < 2:
-                    pool.start(event.key, _attempt, search, settings)
-                    continue
-                _end(study, trial, {"error": "its worker died twice"})
-            del running[event.key]
+                reached = {"steps": [], "error": f"its worker died: {died}"}
+            _end(study, trial, reached)
             write_tables(study, search, out)
 
 
-def _end(study: "optuna.Study", trial: "optuna.Trial", reached: Mapping[str, Any]) -> None:
-    """Ends a trial with what it reached, or with the error that ended it."""
+def _end(study: "optuna.Study", trial: "optuna.Trial", reached: dict[str, Any]) -> None:
+    """Ends a trial with what it reached."""
+    for step, cost in enumerate(reached.pop("steps"), 1):
+        trial.report(cost, step)
     for name, value in reached.items():
         trial.set_user_attr(name, value)
     if "error" in reached:
         study.tell(trial, state=optuna.trial.TrialState.FAIL)
-    else:
+    elif "costs" in reached:
         study.tell(trial, float(np.mean(reached["costs"])))
+    else:
+        study.tell(trial, state=optuna.trial.TrialState.PRUNED)
 
 
-def _attempt(search: Search, settings: Any) -> Iterator[float | dict[str, Any]]:
-    """A trial, on a worker: as `outcome_of`, with the CPU time of it all, min. A failure is given in words."""
-    began = time.process_time()
+def _attempt(search: Search, settings: Any, completed: "list[optuna.trial.FrozenTrial]") -> dict[str, Any]:
+    """A trial, on a worker: its costs after every evaluation as "steps", what `outcome_of` gives at the end, and the CPU
+    time, min. A failure is an "error" in words. Where the median of the completed trials was better by then, it ends early.
+    """
+    pruner = optuna.pruners.MedianPruner(n_startup_trials=_STARTUP_TRIALS, n_warmup_steps=1)
+    study = optuna.create_study(pruner=pruner)
+    study.add_trials(completed)
+    trial, began, steps = study.ask(), time.process_time(), list[float]()
+    reached: dict[str, Any] = {"steps": steps}
     try:
-        for reached in outcome_of(search, settings):
-            if isinstance(reached, dict):
-                reached["cpu_minutes"] = (time.process_time() - began) / 60
-            yield reached
+        for each in outcome_of(search, settings):
+            if isinstance(each, dict):
+                reached |= each
+                break
+            steps.append(each)
+            trial.report(each, len(steps))
+            if len(steps) < search.evaluations and trial.should_prune():
+                break
     except (ValueError, FloatingPointError) as error:  # what torch answers to weights that are not finite
-        yield {"error": f"{error!r:.200}", "cpu_minutes": (time.process_time() - began) / 60}
+        reached["error"] = f"{error!r:.200}"
+    return reached | {"cpu_minutes": (time.process_time() - began) / 60}
 
 
 def outcome_of(search: Search, settings: Any) -> Iterator[float | dict[str, Any]]:
