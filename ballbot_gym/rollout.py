@@ -120,7 +120,7 @@ def rollout(
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
     _, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]
-    seen = _sensed(ballbot, x, 0.0)
+    seen = sensed(ballbot, x, 0.0)
     start = time.perf_counter()
     controller.reset(0.0, seen, c)
     reset_seconds = time.perf_counter() - start
@@ -132,7 +132,7 @@ def rollout(
         act_seconds.append(time.perf_counter() - start)
         _, _, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
         x, done = info["state"], terminated or truncated
-        seen = _sensed(ballbot, x, (len(forces) + 1) * dt)
+        seen = sensed(ballbot, x, (len(forces) + 1) * dt)
         cost += info["cost"]
         states.append(x)
         forces.append(info["force"])
@@ -151,7 +151,7 @@ def rollout(
     )
 
 
-def _sensed(env: BallbotEnv, x: np.ndarray, t: float) -> np.ndarray:
+def sensed(env: BallbotEnv, x: np.ndarray, t: float) -> np.ndarray:
     """State x (8,) as the env's sensors report it at time t, s. Each call draws new noise from the env's generator."""
     state = env.get_state().disturbance if env.randomization.is_noisy else None
     if state is None:

@@ -12,10 +12,12 @@ later than 20 ms after their time, or that memory grew by more than `--growth` M
 
 import math
 import multiprocessing
+import multiprocessing.process
 import resource
 import sys
 import time
 from array import array
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -71,9 +73,9 @@ class TimedClock(Clock):
         return late
 
 
-def memory(playground: Playground) -> float:
-    """Memory that the simulation and the process that plans take now, MiB."""
-    processes = ("self", playground.crew.background.other_pid)
+def memory(planners: Sequence[multiprocessing.process.BaseProcess]) -> float:
+    """Memory that the simulation and the processes that plan take now, MiB."""
+    processes = ("self", *(planner.pid for planner in planners))
     pages = sum(int(Path(f"/proc/{process}/statm").read_text().split()[1]) for process in processes)
     return pages * resource.getpagesize() / 2**20
 
@@ -118,6 +120,7 @@ def measure(
         out: folder of the tables.
     """
     playground = Playground(task, controller, ghosts, physics, episode=0, other_process=True)
+    planners = multiprocessing.active_children()
     viewer = Viewer(port=0)
     page = PlayPage(playground, viewer)
     clock = page.clock = TimedClock(page.clock.dt)
@@ -133,16 +136,16 @@ def measure(
     )
     waiter.start()
     began, cpu = time.perf_counter(), time.process_time()
-    end, count, sizes = began + 60 * minutes, 0, [memory(playground)]
+    end, count, sizes = began + 60 * minutes, 0, [memory(planners)]
     while (left := end - time.perf_counter()) > 0:
         page.run(min(_PUSH_EVERY, left))
         count += 1
         playground.push(_PUSH * math.cos(count), _PUSH * math.sin(count))
         if time.perf_counter() - began > _MINUTE * len(sizes):
-            sizes.append(memory(playground))
+            sizes.append(memory(planners))
             steps = int(np.sum(np.array(clock.late) > _LATE))
             print(f"minute {len(sizes) - 1}: {sizes[-1]:.0f} MiB, {steps} late steps", flush=True)
-    sizes.append(memory(playground))
+    sizes.append(memory(planners))
     seconds, late = time.perf_counter() - began, np.array(clock.late)
     here.send(None)
     waited: np.ndarray = here.recv()

@@ -17,7 +17,7 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.play import crew, views
+from ballbot_train.play import background, views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import Clock
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
@@ -29,7 +29,7 @@ STANDING, FALLING = 3, 5  # certified episodes of Stabilize in which LQR comes t
 @pytest.fixture
 def no_optimum(monkeypatch):
     """The optimum of the episode is not searched, which would compile a problem that no other test solves."""
-    monkeypatch.setattr(crew, "_optimum_costs", lambda task, *problem: np.zeros(task.steps + 1))
+    monkeypatch.setattr(background, "optimum_costs", lambda task, *problem: np.zeros(task.steps + 1))
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shippe
         go(playground, 0.9)
         assert not any(playground.main.x)
         go(playground, 2.5)
-        policy, lqr = playground.crew.runners
+        policy, lqr = playground.runners
         assert (policy.violated, lqr.violated) == ("", "tilt")
         assert views.drawing(playground).robots[0].label == "LQR fell"
         playground.restart()
@@ -106,7 +106,7 @@ def test_ghosts_get_the_same_start_and_the_same_pushes(play):
     for each in (playground, alone):
         each.push(3.0, -2.0)
         go(each, 0.5)
-    ghost, main = playground.crew.runners[1], alone.main
+    ghost, main = playground.runners[1], alone.main
     np.testing.assert_array_equal(ghost.x, main.x)
     assert playground.main.x != ghost.x
 
@@ -151,7 +151,7 @@ def test_nmpc_goes_on_through_the_ends_of_episodes_in_every_task(play, task):
     for _ in range(1000):
         playground.settle()
         playground.step()
-    assert playground.crew.notice == ""
+    assert playground.notice == ""
     assert all(score.failure == "" for score in playground.scores)
     assert views.drawing(playground).paths[-1].name in ("plan", "robot")
 
@@ -164,7 +164,7 @@ def test_what_the_controllers_do_not_know_changes_the_robot_alone(play):
     gain = playground.main.controller.act(0.0, np.ones(8))
     playground.set_plant("mass", 50.0)
     playground.set_plant("delay", 40.0)
-    assert playground.main.true.body_mass == pytest.approx(1.5 * playground.world.params.body_mass)
+    assert playground.main.env.episode_params.body_mass == pytest.approx(1.5 * playground.world.params.body_mass)
     np.testing.assert_array_equal(playground.main.controller.act(0.0, np.ones(8)), gain)
     go(playground, 0.02)
     assert playground.main.force == (0.0, 0.0)  # the delayed actuator has not seen a command yet
@@ -199,12 +199,12 @@ def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, no_optimu
     playground.set_robot("rolling")  # which has no such policy
     playground.settle()
     assert playground.step()
-    assert (playground.world.robot, playground.main.wanted, playground.crew.ghosts) == ("rolling", "lqr", ())
+    assert (playground.world.robot, playground.main.wanted, playground.ghosts) == ("rolling", "lqr", ())
     assert playground.world.params == named_robot("rolling")
     playground.set_task("orbit")
     playground.settle()
     assert playground.step()
-    assert (playground.world.task_name, playground.main.wanted, playground.crew.ghosts) == (
+    assert (playground.world.task_name, playground.main.wanted, playground.ghosts) == (
         "orbit",
         "lqr",
         (),
@@ -242,7 +242,7 @@ def test_wrong_input_is_refused_and_the_robot_goes_on(play):
         with pytest.raises(ValueError, match=message):
             change(playground)
         go(playground, 0.04)
-        assert playground.crew.notice == ""
+        assert playground.notice == ""
 
 
 @pytest.fixture
@@ -260,7 +260,7 @@ def test_a_saved_model_of_another_library_is_offered_where_it_fits(play, saved_m
     playground.settle()
     go(playground, 0.04)
     assert playground.main.name == saved_model
-    assert playground.crew.notice == ""
+    assert playground.notice == ""
     playground.set_task("orbit")  # its observations are others
     assert saved_model not in playground.controllers
     playground.set_task("stabilize")
@@ -277,7 +277,7 @@ def test_a_controller_that_fails_gives_no_force_and_is_named(play):
     playground.main.take_controller(Broken(), 0)
     go(playground, 0.02)
     assert playground.main.force == (0.0, 0.0)
-    assert "LQR" in playground.crew.notice
+    assert "LQR" in playground.notice
 
 
 def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
@@ -286,13 +286,13 @@ def test_where_a_planner_finds_no_way_lqr_starts_instead(play, monkeypatch):
     playground.set_controller("trajopt")
     playground.settle()
     assert playground.main.wanted == playground.main.name == "lqr"  # the old one stays
-    assert "no way" in playground.crew.notice
+    assert "no way" in playground.notice
     playground.main.wanted = "trajopt"
     playground.restart()
     playground.settle()
     assert playground.step()
     assert playground.main.name == "lqr"
-    assert "LQR does instead" in playground.crew.notice
+    assert "LQR does instead" in playground.notice
 
 
 # --- what is kept ---
@@ -367,9 +367,9 @@ def test_every_episode_of_a_track_has_a_robot_of_its_own(play):
     masses = []
     for episode in range(3):
         playground.start_certified(episode)
-        masses.append(playground.main.true.body_mass / playground.world.params.body_mass)
+        masses.append(playground.main.env.episode_params.body_mass / playground.world.params.body_mass)
     assert len(set(masses)) == 3
     assert 0.7 <= min(masses) < max(masses) <= 1.4
     playground.set_plant("mass", 10.0)  # a slider takes its place
     playground.start_certified(3)
-    assert playground.main.true.body_mass == pytest.approx(1.1 * playground.world.params.body_mass)
+    assert playground.main.env.episode_params.body_mass == pytest.approx(1.1 * playground.world.params.body_mass)

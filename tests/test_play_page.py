@@ -53,8 +53,8 @@ class Opened:
 
     def goes_on(self):
         """Waits for another tenth of a second of the simulation."""
-        before = self.playground.crew.steps
-        wait_for(lambda: self.playground.crew.steps > before + 5)
+        before = self.playground.steps
+        wait_for(lambda: self.playground.steps > before + 5)
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_a_policy_file_becomes_a_controller_that_can_be_chosen(opened, visitor):
     visitor.change("Controller", "LQR")
     wait_for(lambda: visitor.value("Policy file") == "")
     visitor.change("Policy file", "nowhere.json")
-    wait_for(lambda: "unknown controller 'nowhere.json'" in opened.playground.crew.notice)
+    wait_for(lambda: "unknown controller 'nowhere.json'" in opened.playground.notice)
 
 
 def test_what_a_file_is_called_is_shown_as_it_is(opened, visitor):
@@ -142,9 +142,9 @@ def test_nothing_moves_while_nobody_is_there(opened):
         opened.goes_on()
     wait_for(lambda: not opened.page.visitors)
     opened.do(lambda: None)
-    left = opened.playground.crew.steps
+    left = opened.playground.steps
     time.sleep(0.2)
-    assert opened.playground.crew.steps == left
+    assert opened.playground.steps == left
     with Visitor(opened.viewer.port):
         opened.goes_on()
 

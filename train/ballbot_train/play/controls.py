@@ -145,7 +145,7 @@ class Controls:
                     self._bind(
                         gui.add_checkbox(option, False),
                         lambda wanted, name=name: self._set_ghost(name, wanted),
-                        lambda name=name: name in playground.crew.ghosts,
+                        lambda name=name: name in playground.ghosts,
                     )
                 )
         self._episode.max = max(0, playground.world.episodes - 1)
@@ -181,7 +181,7 @@ class Controls:
         return name if is_file(name) else ""
 
     def _set_ghost(self, name: str, wanted: bool) -> None:
-        others = [ghost for ghost in self._playground.crew.ghosts if ghost != name]
+        others = [ghost for ghost in self._playground.ghosts if ghost != name]
         if wanted and len(others) >= MOST_GHOSTS:
             raise ValueError(f"at most {MOST_GHOSTS} ghosts")
         self._playground.set_ghosts([*others, name] if wanted else others)

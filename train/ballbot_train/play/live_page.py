@@ -125,7 +125,7 @@ class PlayPage:
             try:
                 action()
             except Exception as error:
-                self.playground.crew.notice = str(error) or repr(error)
+                self.playground.notice = str(error) or repr(error)
 
     # --- browsers ---
 
@@ -158,14 +158,14 @@ class PlayPage:
     # --- words ---
 
     def _write(self) -> None:
-        playground, crew = self.playground, self.playground.crew
+        playground = self.playground
         main, best = playground.main, playground.optimum_cost_so_far
         cost = f"cost {main.cost:.2f}" + (f", the optimum's {best:.2f}" if math.isfinite(best) else "")
         lines = [
             f"**{markdown_text(views.status(playground))}**",
             f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, {cost}",
         ]
-        lines += ["planning …"] * (crew.planning and not crew.preparing) + ["paused"] * self.paused
-        lines.append(f"*{markdown_text(crew.notice[:_NOTICE_LENGTH])}*" if crew.notice else _HELP)
+        lines += ["planning …"] * (playground.planning and not playground.preparing) + ["paused"] * self.paused
+        lines.append(f"*{markdown_text(playground.notice[:_NOTICE_LENGTH])}*" if playground.notice else _HELP)
         self._status.content = "  \n".join(lines)
         self._controls.show_scores([markdown_text(score.text) for score in playground.scores[-_SCORES_SHOWN:]])

@@ -1,4 +1,4 @@
-"""One ballbot of the playground: a simulator, a controller, what happened so far."""
+"""One ballbot of the playground: an environment, a controller, what happened so far."""
 
 import math
 from collections import deque
@@ -7,13 +7,12 @@ from concurrent.futures import Future
 import numpy as np
 
 from ballbot_gym import dynamics
-from ballbot_gym.engines import State, make_simulator
-from ballbot_gym.env import GRIP
+from ballbot_gym.engines import State
+from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Disturbance, Randomization
-from ballbot_gym.rollout import Controller
+from ballbot_gym.randomization import Randomization
+from ballbot_gym.rollout import Controller, sensed
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import outcome
 from ballbot_gym.trajectory import Trajectory
 
 TRACE_STEPS = 400
@@ -29,19 +28,11 @@ class Runner:
         self.making: Future | None = None
         """What makes the wanted controller."""
         self.controller: Controller | None = None
-        self.x: State = (0.0,) * 8
-        self.force = (0.0, 0.0)
-        self.cost = 0.0
-        self.violated = ""
-        """The limit that was violated, or ""."""
-        self.arrived = False
-        """Whether the goal of a first-exit task is reached."""
         self.trace: deque[tuple[float, float]] = deque(maxlen=TRACE_STEPS)
-        self._task, self._nominal = task, params
+        self._task, self._params, self._physics = task, params, physics
         self._controller_start = 0
-        self._simulator = make_simulator(physics, params, task.control_dt)
-        self.set_plant(Randomization())
-        self.begin(self.x)
+        self.env = self._made(Randomization())
+        """Its randomization is what the controller does not know: the true robot, its actuator, sensors and pushes."""
 
     @property
     def stands_still(self) -> bool:
@@ -56,16 +47,33 @@ class Runner:
         times = self._task.control_dt * np.arange(len(self._states))
         return Trajectory(times, np.array(self._states), np.array(self._forces))
 
-    def begin(self, x: State) -> None:
-        """Starts an episode in state x (8,)."""
-        self.x, self.cost = x, 0.0
-        self.force = (0.0, 0.0)
-        self.violated, self.arrived = "", False
-        self._simulator.reset(x)
-        self.trace.clear()
-        self._disturbance.begin(self._drawn)
-        self._states: list[State] = [x]
-        self._forces: list[tuple[float, ...]] = []
+    def begin(self, x: State, c: State, randomization: Randomization, seed: int) -> None:
+        """Starts an episode in state x (8,) with constants c. The seed is of all that is drawn in it."""
+        if randomization != self.env.randomization:
+            self.env.close()
+            self.env = self._made(randomization)
+        self.env.reset(seed=seed, options={"state": x, "constants": c})
+        self._go_from(x)
+        self.cost, self.violated, self.arrived = 0.0, "", False
+
+    def join(self, other: "Runner") -> None:
+        """Takes the place of another robot in its episode, and all that is drawn for it."""
+        self.env.close()
+        self.env = self._made(other.env.randomization)
+        self.env.reset()
+        self.env.set_state(other.env.get_state())
+        self._go_from(other.x)
+        self.cost, self.violated, self.arrived = other.cost, other.violated, other.arrived
+
+    def set_plant(self, randomization: Randomization) -> None:
+        """Changes what the controller does not know, in the middle of an episode."""
+        before = self.env.get_state()
+        self.env.close()
+        self.env = self._made(randomization)
+        self.env.reset(seed=0)
+        now = self.env.get_state()
+        kept = {name: getattr(before, name) for name in ("constants", "steps_left", "rng")}
+        self.env.set_state(now._replace(x=self.x, memory=(), **kept))
 
     def take_controller(self, controller: Controller | None, step: int) -> None:
         """Goes on under another controller, that was reset for this step, counted from the opening of the playground."""
@@ -81,83 +89,50 @@ class Runner:
         rest = self.rest_of_plan(step)
         return not self.stands_still and hasattr(self.controller, "predicted") and rest is not None and len(rest) < 2
 
-    def set_plant(self, randomization: Randomization) -> None:
-        """Changes what the controller does not know: the true robot, its actuator and its sensors."""
-        dt = self._task.control_dt
-        self._plant = randomization
-        self._drawn = randomization.draw((0.5,) * randomization.episode_draws, dt)
-        self._disturbance = Disturbance(randomization, self._nominal, dt)
-        self._disturbance.begin(self._drawn)
-        self.true = randomization.robot(self._nominal, self._drawn)
-        """The robot that is simulated."""
-        self._simulator.set_params(self.true)
-        self._simulator.reset(self.x)
-
-    def act(self, step: int, noise: tuple[float, ...]) -> tuple[float, float]:
-        """The force that the controller commands, N, within the robot's limit; the numbers are those of the sensors' noise.
+    def act(self, step: int, seconds: float) -> np.ndarray:
+        """(2,) the force, N, that the controller commands in a step, at that time of the episode.
 
         Raises:
             FloatingPointError: a force that is not finite.
         """
         assert self.controller is not None
-        seen = self._plant.sensed(self.x, noise, self._drawn, 0.0) if self._plant.is_noisy else self.x
-        t = (step - self._controller_start) * self._task.control_dt
-        u = np.asarray(self.controller.act(t, np.array(seen)), np.float64)
+        t, seen = (step - self._controller_start) * self._task.control_dt, sensed(self.env, np.array(self.x), seconds)
+        u = np.asarray(self.controller.act(t, seen), np.float64)
         if u.shape != (2,) or not np.isfinite(u).all():
             raise FloatingPointError(f"{self.name} commands {u} N")
-        limit = self._nominal.force_limit
-        a = u / limit
-        return limit * min(max(float(a[0]), -1.0), 1.0), limit * min(max(float(a[1]), -1.0), 1.0)
+        return u
 
-    def step(
-        self,
-        step: int,
-        command: tuple[float, float],
-        push: tuple[float, float],
-        outside: tuple[float, float],
-        c: tuple[float, ...],
-        seconds_left: float,
-    ) -> None:
-        """Holds a command, N, for one control step, after a push.
-
-        Args:
-            step: counted from the opening of the playground.
-            command: (2,) N.
-            push: (2,) N·s, an impulse on the body's centre of mass.
-            outside: (2,) N, a force on the ball during the step.
-            c: constants of the episode.
-            seconds_left: s, of the episode after this step: what a failure costs.
-        """
-        task = self._task
-        if any(push):
-            self.x = self._states[-1] = tuple(map(float, dynamics.pushed(self.true, self.x, push)))
-            self._simulator.reset(self.x)
-        self.force = self._disturbance.actuate(command)
-        total = (self.force[0] + outside[0], self.force[1] + outside[1])
-        kept = -1.0 if self._slips(total) else 0.0
-        x = self._simulator.step(total)
-        did = outcome(task, self.x, self.force, x, c, step + 1, (kept,))
-        self.cost += did.running
-        self.violated = (*task.limit_names, GRIP, "")[int(did.violated)]
-        self.arrived = task.first_exit and did.success > 0
+    def step(self, command: np.ndarray, push: np.ndarray) -> None:
+        """Holds a command (2,), N, for one control step, after a push (2,), N·s, on the body's centre of mass."""
+        if push.any():
+            pushed = dynamics.pushed(self.env.episode_params, self.x, tuple(push.tolist()))
+            self.x = self._states[-1] = tuple(map(float, pushed))
+            self.env.set_state(self.env.get_state()._replace(x=self.x, memory=()))
+        _, _, terminated, _, info = self.env.step(command / self._params.force_limit)
+        x = tuple(info["state"].tolist())
         if all(map(math.isfinite, x)):
             self.x = x
+        self.force, self.cost = tuple(info["force"].tolist()), self.cost + info["cost"]
+        self.violated = self.env.limit_names[info["violated"]] if info["failure"] else ""
+        self.arrived = terminated and info["success"]
         self.trace.append((self.x[0], self.x[1]))
         self._states.append(self.x)
         self._forces.append(self.force)
-        if self.violated:
-            self.cost += task.survival_reward * seconds_left
-
-    def _slips(self, total: tuple[float, float]) -> bool:
-        """Whether a force, N, asks the floor for more than it can give, where contact is not simulated."""
-        if not self.true.grips or self._simulator.floor_force() is not None:
-            return False
-        asked = dynamics.held_contact(self.true, self.x, total, self._task.control_dt)
-        return not dynamics.keeps_grip(self.true, asked)
 
     def close(self) -> None:
         """Releases the simulator; may be called again."""
-        self._simulator.close()
+        if self.making is not None:
+            self.making.cancel()
+        self.env.close()
+
+    def _made(self, randomization: Randomization) -> BallbotEnv:
+        return BallbotEnv(self._task, self._physics, robot=self._params, randomization=randomization)
+
+    def _go_from(self, x: State) -> None:
+        self.x, self.force = x, (0.0, 0.0)
+        self.trace.clear()
+        self._states: list[State] = [x]
+        self._forces: list[tuple[float, ...]] = []
 
 
 def failure_word(limit: str) -> str:

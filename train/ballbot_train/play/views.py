@@ -18,7 +18,7 @@ def drawing(playground: Playground) -> Drawing:
     """The present moment."""
     main, push = playground.main, playground.shown_push
     robots, paths = [], []
-    for i, runner in reversed(list(enumerate(playground.crew.runners))):
+    for i, runner in reversed(list(enumerate(playground.runners))):
         name, tint = f"ghost {i}" if i else "robot", _color(runner, i)
         force = np.array(runner.force) if runner is main and not main.violated else None
         alpha = GHOST_OPACITY if i else 1.0
@@ -40,8 +40,8 @@ def _color(runner: Runner, i: int) -> str:
 
 def status(playground: Playground) -> str:
     """What goes on, in a line."""
-    if playground.crew.preparing:
-        waiting = [labels.label(runner.wanted) for runner in playground.crew.runners if runner.controller is None]
+    if playground.preparing:
+        waiting = [labels.label(runner.wanted) for runner in playground.runners if runner.controller is None]
         return f"preparing {', '.join(waiting)} … the first time in a task, solvers are compiled"
     if playground.ended and playground.scores:
         return playground.scores[-1].text
@@ -57,5 +57,5 @@ def _plan(playground: Playground) -> np.ndarray | None:
     if hasattr(main.controller, "predicted"):
         predicted = getattr(main.controller, "predicted")  # noqa: B009
         return None if predicted is None else predicted[:, :2]
-    rest = main.rest_of_plan(playground.crew.steps)
+    rest = main.rest_of_plan(playground.steps)
     return None if rest is None or len(rest) < 2 else rest[:: max(1, len(rest) // _PLAN_POINTS), :2]

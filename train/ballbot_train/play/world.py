@@ -1,7 +1,6 @@
 """What is played: a task, a robot and the controllers that can be chosen, and what a user changes of them."""
 
 import contextlib
-import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -104,12 +103,6 @@ class World:
             raise ValueError(f"episode must be 0 to {self.episodes - 1}, not {episode}")
         return self.certified.states[episode], self.certified.constants[episode]
 
-    def certified_cost(self, episode: int | None) -> float:
-        """What the optimum of a certified episode costs; NaN for other episodes."""
-        if self.certified is None or episode is None:
-            return math.nan
-        return float(self.certified.costs[episode])
-
 
 def severity(stress: str, value: float) -> float:
     """The severity that a slider gives a stress; a ValueError for an unknown one, or a value outside of its `Span`."""
@@ -118,15 +111,6 @@ def severity(stress: str, value: float) -> float:
     if not span.low <= value <= span.high:
         raise ValueError(f"{stress} must be {span.low:g} to {span.high:g}, not {value:g}")
     return span.step * round(value / span.step)
-
-
-def drawn_robot(track: Randomization, rng: np.random.Generator, control_dt: float) -> Randomization:
-    """One robot of a track, as a randomization that varies nothing any more."""
-    low, high = track.delay_steps(control_dt)
-    late = control_dt * int(rng.integers(low, high + 1))
-    ranges = {f.name: getattr(track, f.name) for f in fields(track) if not isinstance(f.default, float)}
-    drawn = {name: (value, value) for name, ends in ranges.items() for value in [float(rng.uniform(*ends))]}
-    return replace(track, **drawn | {"actuator_delay": (late, late)})
 
 
 def randomization(severities: Mapping[str, float]) -> Randomization:
