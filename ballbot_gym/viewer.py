@@ -115,7 +115,7 @@ class Viewer:
         # Whoever sends garbage, or leaves while the server stops, would get a traceback onto the user's terminal.
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         # viser prints an address that may not be the one to open.
-        with contextlib.redirect_stdout(io.StringIO()), guard(self._gate, self._control):
+        with contextlib.redirect_stdout(io.StringIO()), guard(self._gate):
             self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         script = f"const LABEL = {json.dumps(label)};{_CONNECT_AGAIN}"
@@ -182,10 +182,6 @@ class Viewer:
             if not self._closed:
                 self._closed = True
                 self.server.stop()
-
-    def _control(self, uuid: str) -> Any:
-        """viser's control with this id; None if there is none."""
-        return self.server.gui._gui_input_handle_from_uuid.get(uuid)
 
     def _draw(self, drawing: Drawing) -> None:
         goal = drawing.robots[-1].x[:2] if self.follow and drawing.robots else np.zeros(2)

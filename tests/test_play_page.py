@@ -1,8 +1,7 @@
-"""The page of the live playground: its controls, who drives, what comes from outside, and how it looks in a browser."""
+"""The page of the live playground: its controls, and who may open it."""
 
 import contextlib
 import http.client
-import math
 import os
 import re
 import signal
@@ -23,7 +22,7 @@ from ballbot_train.policy_files import SHIPPED
 
 viser = pytest.importorskip("viser")
 
-from visitor import CAMERA, Visitor, wait_for  # noqa: E402 it needs what comes with viser
+from visitor import Visitor, wait_for  # noqa: E402 it needs what comes with viser
 
 STANDING = 3  # a certified episode of Stabilize in which LQR comes to rest
 
@@ -168,35 +167,6 @@ def test_an_episode_is_handed_to_the_browser_as_a_file(opened, visitor, tmp_path
     wait_for(lambda: "stabilize.npz" in visitor.files)
 
 
-NONSENSE = [
-    ("Speed", math.nan),
-    ("Speed", "fast"),
-    ("Speed", 1e18),
-    ("Masses, %", math.inf),
-    ("Masses, %", -1e300),
-    ("Task", "dance"),
-    ("Controller", "../../etc/passwd"),
-    ("Controller", {"a": 1}),
-    ("Certified episode", -5),
-    ("Certified episode", 1e300),
-    ("Policy file", "x" * 5000),
-    ("Push", "hard"),
-]
-
-
-def test_what_makes_no_sense_changes_nothing(quiet, opened, visitor):
-    shown = {label: visitor.value(label) for label, _ in NONSENSE}
-    for k, (label, value) in enumerate(NONSENSE):
-        visitor.change(label, value)
-        mass = (50.0, 20.0)[k % 2]
-        visitor.change("Masses, %", mass)  # it comes after it
-        wait_for(lambda mass=mass: opened.playground.plant["mass"] == mass)
-    with Visitor(opened.viewer.port) as late:
-        assert {label: late.value(label) for label in shown if label != "Masses, %"} == {
-            label: value for label, value in shown.items() if label != "Masses, %"
-        }
-
-
 def works(opened, visitor, k=0):
     """Whether the page does what its driver asks, for the k-th time."""
     speed = (2.0, 0.5)[k % 2]
@@ -204,83 +174,21 @@ def works(opened, visitor, k=0):
     wait_for(lambda: opened.page.clock.speed == speed)
 
 
-UPDATES = [
-    {"gui_api": 5},
-    {"value": 0.5, "gui_api": 5},
-    {"removed": True},
-    {"label": "<script>"},
-    {"no_such_field": 1},
-    {},
-]
-
-
-def test_only_values_of_controls_are_taken(quiet, opened, visitor):
-    for k, updates in enumerate(UPDATES):
-        visitor.update("Speed", **updates)
-        works(opened, visitor, k)
-        assert visitor.controls["Speed"]["label"] == "Speed"
+def test_what_cannot_be_done_is_said_and_goes_back(quiet, opened, visitor):
+    visitor.change("Task", "dance")
+    wait_for(lambda: "unknown task dance" in opened.playground.notice)
+    wait_for(lambda: visitor.value("Task") == "stabilize")
+    visitor.change("Speed", 0.0)
+    wait_for(lambda: "Speed must be 0.1 to 2, not 0" in opened.playground.notice)
     opened.goes_on()
 
 
-MESSAGES = [
-    {"type": "NoSuchMessage"},
-    {"type": "GuiUpdateMessage", "uuid": "no", "updates": {"value": 1}},
-    {"type": "GuiFormDirtyMessage", "uuid": "x" * 1000},
-    {"type": "ShareUrlRequest"},
-    {"type": "RunJavascriptMessage", "source": "alert(1)"},
-    {"type": "SceneNodeDragMessage", "phase": "sideways", "name": "/world"},
-    CAMERA | {"position": ["a", "b", "c"]},
-    CAMERA | {"wxyz": [math.nan] * 4, "position": [math.inf] * 3},
-    CAMERA | {"image_width": math.nan},
-]
-
-
-def test_no_message_ends_the_simulation(quiet, opened, visitor):
-    for k, message in enumerate(MESSAGES):
-        with Visitor(opened.viewer.port) as other:
-            other.send(**message)
-            other.press("push")
-            opened.goes_on()
-        works(opened, visitor, k)
-
-
-def test_nobody_uploads_files(quiet, opened, visitor):
-    upload = {"source_component_uuid": visitor.uuid("Speed"), "transfer_uuid": "1"}
-    start = {"type": "FileTransferStartUpload", "filename": "a", "mime_type": "b", "part_count": 1, "size_bytes": 3}
-    visitor.send(**start, **upload)
-    visitor.send(type="FileTransferPart", part_index=0, content=b"abc", **upload)
-    works(opened, visitor)
-
-
 def test_junk_ends_at_most_its_own_connection(quiet, opened, visitor):
-    for k, junk in enumerate(("text", b"", b"\x00" * 100, b"\xc1", b"x" * 100_000, b"\x91" * 50_000)):
+    for k, junk in enumerate(("text", b"", b"\x00" * 100, b"x" * 100_000)):
         with Visitor(opened.viewer.port) as other, contextlib.suppress(Exception):
             other.connection.send(junk)
             other.connection.ping().wait(1)
         works(opened, visitor, k)
-
-
-def test_a_flood_of_messages_does_not_hold_up_the_others(quiet, opened, visitor):
-    with Visitor(opened.viewer.port) as other:
-        stop = threading.Event()
-
-        def flood():
-            k = 0
-            while not stop.is_set():
-                k += 1
-                other.change("Speed", 0.1 + 0.1 * (k % 2))
-
-        thread = threading.Thread(target=flood, daemon=True)
-        thread.start()
-        time.sleep(0.5)
-        visitor.change("Masses, %", 50.0)
-        wait_for(lambda: opened.playground.plant["mass"] == 50.0, 10)
-        opened.goes_on()
-        stop.set()
-        other.connection.close()
-        thread.join(10)
-    visitor.change("Masses, %", 20.0)
-    wait_for(lambda: opened.playground.plant["mass"] == 20.0)
 
 
 def test_who_leaves_while_something_is_saved_or_dragged_harms_nothing(quiet, opened, visitor):

@@ -66,7 +66,13 @@ class Controls:
 
     def _bind(self, control: Any, apply: Callable[[Any], None], read: Callable[[], Any]) -> Any:
         """Lets a control change the playground. What is refused goes back to what holds."""
-        control.on_update(self._page.asking(lambda _, value: apply(value)))
+
+        def changed(_: Any, value: Any) -> None:
+            if hasattr(control, "min") and not control.min <= value <= control.max:
+                raise ValueError(f"{control.label} must be {control.min:g} to {control.max:g}, not {value:g}")
+            apply(value)
+
+        control.on_update(self._page.asking(changed))
         self._bound.append((control, read))
         return control
 
