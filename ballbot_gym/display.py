@@ -11,17 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ballbot_gym import drawing, lazy
+from ballbot_gym import lazy
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.tasks.marker import Marker
 
 if TYPE_CHECKING:
     from ballbot_gym.trajectory import Trajectory
-
-_WIDTH, _HEIGHT, _MARGIN = 310, 220, 38  # px of a panel
-_MOST_POINTS = 200  # of a line in a picture
 
 
 class Displayed:
@@ -34,8 +28,8 @@ class Displayed:
     def _table(self) -> dict[str, str]:
         return self.facts()
 
-    def _picture(self) -> str:
-        """An SVG."""
+    def plot(self) -> Any:
+        """A matplotlib Figure."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -48,8 +42,11 @@ class Displayed:
             for name, value in self._table().items()
         )
         table = "<table>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
-        line = '<div style="display:flex;flex-wrap:wrap;align-items:center;gap:1em">'
-        return f"{line}{table}{self._picture()}</div>"
+        try:
+            picture = lazy.load("ballbot_train.report.notebook:as_image")(self.plot())
+        except ModuleNotFoundError:  # what draws is not installed
+            picture = ""
+        return f'<div style="display:flex;flex-wrap:wrap;align-items:center;gap:1em">{table}{picture}</div>'
 
 
 class Moving(Displayed):
@@ -62,9 +59,6 @@ class Moving(Displayed):
 
     def _table(self) -> dict[str, str]:
         return self.facts() | self.motion.facts()
-
-    def _picture(self) -> str:
-        return motion_svg(self.motion, getattr(self, "markers", ()))
 
     def show(self, *others: Moving, labels: Sequence[str] = (), robot: str | BallbotParams = "paper") -> Path | None:
         """The replay in 3D: in a Jupyter notebook below the cell, elsewhere in the browser.
@@ -86,60 +80,6 @@ class Moving(Displayed):
     def plot(self, *others: Moving, labels: Sequence[str] = ()) -> Any:
         """A matplotlib Figure of positions, velocities, leans, forces and the path. Arguments and errors: as of `show`."""
         return lazy.load("ballbot_train.report.notebook:plot_motions")((self, *others), labels)
-
-
-def motion_svg(trajectory: Trajectory, markers: Sequence[Marker] = ()) -> str:
-    """The path seen from above, and the tilt over time, as an SVG."""
-    chosen = np.unique(np.linspace(0, len(trajectory.t) - 1, _MOST_POINTS).astype(int))
-    x = trajectory.x[chosen]
-    tilt = np.column_stack([trajectory.t, np.degrees(trajectory.tilt)])[chosen]
-    seconds = np.array([trajectory.t[[0, -1]], [0, 10]]).T  # what the axes show at least
-    panels = _panel(x[:, :2], "from above, m", markers=markers) + (
-        f'<g transform="translate({_WIDTH},0)">{_panel(tilt, "tilt, deg, over time, s", least=seconds)}</g>'
-    )
-    return svg(2 * _WIDTH, _HEIGHT, panels)
-
-
-def svg(width: int, height: int, body: str) -> str:
-    """An SVG in the colours of the page around it."""
-    style = f"flex:1 1 {2 * width // 3}px;max-width:{width}px;font:11px sans-serif"
-    return f'<svg viewBox="0 0 {width} {height}" style="{style}" fill="none" stroke-width="2" role="img">{body}</svg>'
-
-
-def text(x: float, y: float, words: str, anchor: str = "start") -> str:
-    """A text of an SVG."""
-    return f'<text x="{x:.0f}" y="{y:.0f}" fill="currentColor" text-anchor="{anchor}">{html.escape(words)}</text>'
-
-
-def _panel(line: np.ndarray, title: str, markers: Sequence[Marker] = (), least: np.ndarray | None = None) -> str:
-    """A line (n, 2) in a frame that names the ends of its axes. Without `least` (2, 2) both axes have one scale, as a map."""
-    rims = [np.array(marker.position) + side * marker.radius for marker in markers for side in (-1, 1)]
-    corners = np.array([*line, *rims]) if least is None else np.concatenate([line, least])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    space = np.array([_WIDTH, _HEIGHT]) - 2 * _MARGIN
-    scale = space / np.maximum(high - low, 1e-3)
-    if least is None:
-        scale = np.full(2, scale.min())
-        low, high = ((low + high) / 2 + side * space / scale / 2 for side in (-1, 1))
-    origin = (_MARGIN, _HEIGHT - _MARGIN)
-    places = (line - low) * scale * (1, -1) + origin
-    parts = [f'<rect x="{_MARGIN}" y="{_MARGIN}" width="{space[0]}" height="{space[1]}" stroke="#8888"/>']
-    for marker in markers:
-        x, y = (np.array(marker.position) - low) * scale * (1, -1) + origin
-        color = "rgb({:.0%},{:.0%},{:.0%})".format(*marker.color[:3])
-        kind = f'stroke="{color}" stroke-dasharray="4"' if marker.ring else f'fill="{color}" opacity="0.5"'
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{max(marker.radius * scale[0], 2):.1f}" {kind}/>')
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-    parts.append(f'<polyline points="{points}" stroke="{drawing.BODY}"/>')
-    parts.append('<circle cx="{:.1f}" cy="{:.1f}" r="4" fill="{}"/>'.format(*places[0], drawing.BODY))
-    bottom, right = _HEIGHT - _MARGIN, _WIDTH - _MARGIN
-    parts += [text(_WIDTH / 2, _MARGIN - 8, title, "middle")]
-    parts += [text(_MARGIN, bottom + 14, f"{low[0]:.3g}"), text(right, bottom + 14, f"{high[0]:.3g}", "end")]
-    parts += [
-        text(_MARGIN - 3, bottom, f"{low[1]:.3g}", "end"),
-        text(_MARGIN - 3, _MARGIN + 9, f"{high[1]:.3g}", "end"),
-    ]
-    return "".join(parts)
 
 
 def percent(share: float) -> str:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from ballbot_gym import files, lazy
-from ballbot_gym.display import Displayed, percent, svg, text
+from ballbot_gym.display import Displayed, percent
 from ballbot_train.evaluation.statistics import interval
 
 
@@ -87,25 +87,6 @@ class Row(Displayed):
             "median settle time": f"{self.settle_time_median:.2f} s",
             "mean force": f"{self.effort_mean:.0f} N",
         }
-
-    def _picture(self) -> str:
-        mean, low, high = self.regret_mean, self.regret_low, self.regret_high
-        if not all(map(math.isfinite, (mean, low, high))):
-            return ""
-        least, most = min(0.0, low), max(0.01, 1.2 * high)
-        at_zero, at_low, at_mean, at_high = (
-            30 + 240 * (value - least) / (most - least) for value in (0, low, mean, high)
-        )
-        return svg(
-            300,
-            70,
-            f'<path d="M30 40H270M{at_zero:.1f} 30V50" stroke="#8888"/>'
-            f'<path d="M{at_low:.1f} 40H{at_high:.1f}" stroke="#1f6fb2" stroke-width="6"/>'
-            f'<circle cx="{at_mean:.1f}" cy="40" r="5" fill="#1f6fb2"/>'
-            + text(150, 18, "mean regret with its 95 % interval", "middle")
-            + text(at_zero, 64, "0", "middle")
-            + text(270, 64, percent(most), "middle"),
-        )
 
     def plot(self, *others: "Row") -> Any:
         """A matplotlib Figure of the mean regret with its interval, beside that of other rows."""

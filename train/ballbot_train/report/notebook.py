@@ -1,6 +1,8 @@
 """`show` and `plot` of trajectories, episodes, optima and rows: 3D replays, below a notebook's cell too, and figures."""
 
+import base64
 import html
+import io
 import sys
 import tempfile
 import webbrowser
@@ -57,6 +59,13 @@ def plot_rows(rows: "Sequence[Row]") -> Figure:
     axis.set(ylim=(len(rows) - 0.5, -0.5), xlabel="mean regret with its 95 % interval, %")
     axis.grid(alpha=0.3)
     return _figure(figure)
+
+
+def as_image(figure: Figure) -> str:
+    """A small picture of a figure, as HTML."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="webp", dpi=55)
+    return f'<img alt="the figure" src="data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
 
 
 def _names(shown: Sequence[Moving], names: Sequence[str]) -> list[str]:
