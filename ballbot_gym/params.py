@@ -24,30 +24,42 @@ OMNI_URDF_PATH = URDF_FOLDER / "omni.urdf"
 
 STANDARD_GRAVITY = 9.81  # m/s²; a URDF carries no gravity
 
-# joint: type, axis, parent link, child link. The closed-form dynamics hold for these two chains only.
-_CHAIN = {
-    "x": ("prismatic", (1.0, 0.0, 0.0), "world", "slide"),
-    "y": ("prismatic", (0.0, 1.0, 0.0), "slide", "ball"),
-    "gamma": ("continuous", (0.0, 1.0, 0.0), "ball", "yoke"),
-    "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "body"),
-}
-_ROLLING_CHAIN = {
-    "x": ("prismatic", (1.0, 0.0, 0.0), "world", "slide_x"),
-    "y": ("prismatic", (0.0, 1.0, 0.0), "slide_x", "slide_y"),
-    "z": ("prismatic", (0.0, 0.0, 1.0), "slide_y", "hub"),
-    "roll": ("spherical", None, "hub", "ball"),
-    "gamma": ("continuous", (0.0, 1.0, 0.0), "hub", "yoke"),
-    "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "body"),
-}
-_OMNI_CHAIN = _ROLLING_CHAIN | {
-    "theta": ("continuous", (-1.0, 0.0, 0.0), "yoke", "frame"),
-    "psi": ("continuous", (0.0, 0.0, 1.0), "frame", "body"),
-}
 _NO_NUMBER = (str, bytes, bool, dict, list, tuple, type(None))
 _FILE_LIMIT = 16 * 2**20  # bytes
-_MASSLESS_LINKS = ("slide", "yoke")
-_ROLLING_MASSLESS_LINKS = ("slide_x", "slide_y", "hub", "yoke")
-_OMNI_MASSLESS_LINKS = (*_ROLLING_MASSLESS_LINKS, "frame")
+_BALL, _BODY, _SHAPE = "link[@name='ball']/", "link[@name='body']/", "visual/geometry/"
+_PLACES: dict[str, tuple[tuple[str, str], ...]] = {
+    "ball_mass": ((f"{_BALL}inertial/mass", "value"),),
+    "ball_radius": (
+        (f"{_BALL}{_SHAPE}sphere", "radius"),
+        (f"{_BALL}collision/geometry/sphere", "radius"),
+        ("joint[@name='x']/origin", "xyz"),
+    ),
+    "body_mass": ((f"{_BODY}inertial/mass", "value"),),
+    "body_radius": ((f"{_BODY}{_SHAPE}cylinder", "radius"),),
+    "body_length": ((f"{_BODY}{_SHAPE}cylinder", "length"),),
+    "com_height": ((f"{_BODY}inertial/origin", "xyz"), (f"{_BODY}visual/origin", "xyz")),
+    "inertia": ((f"{_BODY}inertial/inertia", "ixx"), (f"{_BODY}inertial/inertia", "iyy")),
+    "axial_inertia": ((f"{_BODY}inertial/inertia", "izz"),),
+    "ball_inertia": tuple((f"{_BALL}inertial/inertia", name) for name in ("ixx", "iyy", "izz")),
+    "force_limit": (("joint[@name='x']/limit", "effort"), ("joint[@name='y']/limit", "effort")),
+}
+"""Where a URDF has each number: element and attribute. The first place is read, and all are written."""
+_FRICTION = f"{_BALL}contact/lateral_friction", "value"
+_COMPARED = {
+    "joint": (
+        (".", "type"),
+        ("parent", "link"),
+        ("child", "link"),
+        ("axis", "xyz"),
+        ("origin", "xyz"),
+        ("origin", "rpy"),
+    ),
+    "link": (
+        *(("inertial/mass", "value"), ("inertial/origin", "xyz"), ("inertial/origin", "rpy")),
+        *(("inertial/inertia", name) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")),
+    ),
+}
+"""What a file must have as the packaged one does: the closed-form dynamics hold for these chains only."""
 
 
 class UrdfError(ValueError):
@@ -182,66 +194,40 @@ class BallbotParams:
                 chain differs from the one that the closed-form dynamics describe.
         """
         urdf = _Urdf(Path(path))
-        rolls, wheels = urdf.has_joint("roll"), urdf.wheels()
-        chain, massless = (_ROLLING_CHAIN, _ROLLING_MASSLESS_LINKS) if rolls else (_CHAIN, _MASSLESS_LINKS)
-        if wheels is not None:
-            chain, massless = _OMNI_CHAIN, _OMNI_MASSLESS_LINKS
-        for joint, (kind, axis, parent, child) in chain.items():
-            urdf.check_joint(joint, kind, axis, parent, child)
-        for link in massless:
-            urdf.check_massless(link)
-        ball_mass = urdf.positive_mass("ball")
-        ball_inertias = urdf.principal_inertias("ball")
-        if rolls and len(set(ball_inertias)) > 1:
-            raise urdf.error(f"link 'ball' must be round: its inertias {ball_inertias} kg·m² differ")
-        transverse, transverse_y, axial = urdf.principal_inertias("body")
-        if transverse != transverse_y:
-            raise urdf.error(f"link 'body' must be round: ixx = {transverse} differs from iyy = {transverse_y}")
-        return cls(
-            ball_mass=ball_mass,
-            ball_radius=urdf.visual("ball", "sphere", "radius"),
-            body_mass=urdf.positive_mass("body"),
-            body_radius=urdf.visual("body", "cylinder", "radius"),
-            body_length=urdf.visual("body", "cylinder", "length"),
-            com_height=urdf.com_height("body"),
-            inertia=transverse,
-            axial_inertia=axial,
-            force_limit=urdf.force_limit(),
-            gravity=float(gravity),
-            rolls=rolls,
-            ball_inertia=ball_inertias[0] if rolls else 0.0,
-            friction=urdf.friction("ball"),
-            wheels=wheels,
-        )
+        rolls, wheels = urdf.root.find("joint[@name='roll']") is not None, urdf.wheels()
+        numbers = {name: urdf.number(*places[0]) for name, places in _PLACES.items() if rolls or name != "ball_inertia"}
+        friction = math.inf if urdf.root.find(_FRICTION[0]) is None else urdf.number(*_FRICTION)
+        try:
+            params = cls(**numbers, gravity=float(gravity), rolls=rolls, friction=friction, wheels=wheels)
+        except ValueError as error:
+            raise urdf.error(str(error)) from None
+        urdf.check_alike(params._written(), rolls)
+        if (effort := urdf.number(*_PLACES["force_limit"][1])) != params.force_limit:
+            raise urdf.error(f"joints 'x' and 'y' must have one effort limit, not {params.force_limit} and {effort} N")
+        return params
 
     def to_urdf(self) -> str:
         """The URDF text of this robot: a packaged file with this robot's numbers. `from_urdf` reads it back exactly."""
-        urdf = _Urdf(OMNI_URDF_PATH if self.wheels else ROLLING_URDF_PATH if self.rolls else URDF_PATH)
-        if self.wheels is not None:
-            for field in fields(Wheels):
-                urdf.find("wheels").set(field.name, repr(getattr(self.wheels, field.name)))
-        urdf.find("link[@name='ball']/inertial/mass").set("value", repr(self.ball_mass))
-        urdf.find("link[@name='body']/inertial/mass").set("value", repr(self.body_mass))
-        body_inertia = urdf.find("link[@name='body']/inertial/inertia")
-        for name, value in (("ixx", self.inertia), ("iyy", self.inertia), ("izz", self.axial_inertia)):
-            body_inertia.set(name, repr(value))
-        # that of a solid sphere has no effect where the ball does not roll
-        ball_inertia = self.ball_inertia if self.rolls else 0.4 * self.ball_mass * self.ball_radius**2
-        for name in ("ixx", "iyy", "izz"):
-            urdf.find("link[@name='ball']/inertial/inertia").set(name, repr(ball_inertia))
-        for place in ("inertial", "visual"):
-            urdf.find(f"link[@name='body']/{place}/origin").set("xyz", f"0 0 {self.com_height!r}")
-        urdf.find("link[@name='ball']/visual/geometry/sphere").set("radius", repr(self.ball_radius))
-        if self.rolls:
-            urdf.find("link[@name='ball']/collision/geometry/sphere").set("radius", repr(self.ball_radius))
-        cylinder = urdf.find("link[@name='body']/visual/geometry/cylinder")
-        cylinder.set("radius", repr(self.body_radius))
-        cylinder.set("length", repr(self.body_length))
-        urdf.find("joint[@name='x']/origin").set("xyz", f"0 0 {self.ball_radius!r}")
-        for joint in ("x", "y"):
-            urdf.find(f"joint[@name='{joint}']/limit").set("effort", repr(self.force_limit))
-        urdf.set_friction("ball", self.friction)
-        return ElementTree.tostring(urdf.root, encoding="unicode")
+        return ElementTree.tostring(self._written(), encoding="unicode")
+
+    def _written(self) -> ElementTree.Element:
+        root = _Urdf(OMNI_URDF_PATH if self.wheels else ROLLING_URDF_PATH if self.rolls else URDF_PATH).root
+        for field in fields(Wheels) if self.wheels else ():
+            _found(root, "wheels").set(field.name, repr(getattr(self.wheels, field.name)))
+        for name, places in _PLACES.items():
+            value = getattr(self, name)
+            if name == "ball_inertia" and not self.rolls:
+                value = 0.4 * self.ball_mass * self.ball_radius**2  # a solid sphere's, which has no effect
+            for query, attribute in places:
+                if (element := root.find(query)) is not None:  # only a ball that rolls collides
+                    element.set(attribute, f"0 0 {value!r}" if attribute == "xyz" else repr(value))
+        ball = _found(root, _BALL[:-1])
+        if (contact := ball.find("contact")) is not None:
+            ball.remove(contact)
+        if self.friction != math.inf:
+            contact = ElementTree.SubElement(ball, "contact")
+            ElementTree.SubElement(contact, "lateral_friction").set("value", repr(self.friction))
+        return root
 
 
 @cache
@@ -319,154 +305,74 @@ class _Urdf:
     def error(self, text: str) -> UrdfError:
         return UrdfError(f"{self.path}: {text}")
 
-    def find(self, query: str) -> ElementTree.Element:
-        element = self.root.find(query)
-        if element is None:
-            raise self.error(f"no {query}")
-        return element
-
-    def _named(self, tag: str, name: str) -> ElementTree.Element:
-        elements = self.root.findall(f"{tag}[@name='{name}']")
+    def element(self, query: str) -> ElementTree.Element:
+        """The element of a query that begins with a link or a joint by name."""
+        whole, _, inner = query.partition("/")
+        tag, name = whole.removesuffix("']").split("[@name='")
+        elements = self.root.findall(whole)
         if not elements:
             raise self.error(f"{tag} '{name}' is missing")
         if len(elements) > 1:
             raise self.error(f"{tag} '{name}' is there {len(elements)} times; it must be there once")
-        return elements[0]
-
-    def _child(self, tag: str, name: str, query: str) -> ElementTree.Element:
-        element = self._named(tag, name).find(query)
-        if element is None:
-            raise self.error(f"{tag} '{name}' has no <{query.replace('/', '><')}>")
+        if (element := elements[0].find(inner or ".")) is None:
+            raise self.error(f"{tag} '{name}' has no <{inner.replace('/', '><')}>")
         return element
 
-    def _number(self, element: ElementTree.Element, attribute: str, where: str) -> float:
-        text = element.get(attribute)
-        if text is None:
-            raise self.error(f"{where} has no attribute '{attribute}'")
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise self.error(f"{where}: {attribute} = '{text}' is not a number")
-        return value
-
-    def _vector(self, element: ElementTree.Element | None, default: str, where: str) -> tuple[float, ...]:
-        text = default if element is None else element.get("xyz", default)
-        try:
-            vector = tuple(float(part) for part in text.split())
-        except ValueError:
-            vector = ()
-        if len(vector) != 3 or not all(map(math.isfinite, vector)):
-            raise self.error(f"{where}: xyz = '{text}' is not three numbers")
-        return vector
-
-    def has_joint(self, name: str) -> bool:
-        return self.root.find(f"joint[@name='{name}']") is not None
+    def number(self, query: str, attribute: str) -> float:
+        """A number, of a vector the last."""
+        text = self.element(query).get(attribute, "")
+        parts = _parts(text)
+        if isinstance(parts, str) or len(parts) != (3 if attribute == "xyz" else 1):
+            raise self.error(
+                f"{query}: {attribute} = '{text}' is not {'three numbers' if attribute == 'xyz' else 'a number'}"
+            )
+        return parts[-1]
 
     def wheels(self) -> Wheels | None:
         """Those of the element <wheels>, if there is one."""
-        element = self.root.find("wheels")
-        if element is None:
+        if (element := self.root.find("wheels")) is None:
             return None
+        numbers = {field.name: _parts(element.get(field.name, "")) for field in fields(Wheels)}
+        for name, parts in numbers.items():
+            if isinstance(parts, str) or len(parts) != 1:
+                raise self.error(f"wheels: {name} = '{element.get(name)}' is not a number")
         try:
-            return Wheels(**{f.name: self._number(element, f.name, "wheels") for f in fields(Wheels)})
+            return Wheels(**{name: float(parts[0]) for name, parts in numbers.items()})
         except ValueError as error:
-            raise error if isinstance(error, UrdfError) else self.error(str(error)) from None
+            raise self.error(str(error)) from None
 
-    def friction(self, link: str) -> float:
-        """The coefficient of a link's <contact>, which Bullet reads too; without one, inf."""
-        element = self._named("link", link).find("contact/lateral_friction")
-        if element is None:
-            return math.inf
-        value = self._number(element, "value", f"lateral_friction of link '{link}'")
-        if value <= 0:
-            raise self.error(f"link '{link}' must have a positive lateral_friction, not {value}")
-        return value
+    def check_alike(self, wanted: ElementTree.Element, rolls: bool) -> None:
+        """Checks that every joint and link of a packaged URDF is here, with the same places, axes, masses and inertias."""
+        free = {("roll", "axis"), ("x", "origin")} | (set() if rolls else {("ball", "inertial/inertia")})
+        for each in wanted:
+            name = each.get("name", "")
+            for place, attribute in _COMPARED.get(each.tag, ()):
+                here = self.element(f"{each.tag}[@name='{name}']")
+                found, right = (_attribute(element, place, attribute) for element in (here, each))
+                if found != right and (name, place) not in free:
+                    what = f"{place} {attribute}".removeprefix(". ")
+                    raise self.error(f"{each.tag} '{name}': {what} is {found}, and must be {right}")
 
-    def set_friction(self, link: str, friction: float) -> None:
-        element = self._named("link", link)
-        contact = element.find("contact")
-        if contact is not None:
-            element.remove(contact)
-        if friction != math.inf:
-            contact = ElementTree.SubElement(element, "contact")
-            ElementTree.SubElement(contact, "lateral_friction").set("value", repr(friction))
 
-    def check_joint(self, name: str, kind: str, axis: tuple[float, ...] | None, parent: str, child: str) -> None:
-        joint = self._named("joint", name)
-        for tag, expected in (("parent", parent), ("child", child)):
-            self._named("link", expected)
-            found = self._child("joint", name, tag).get("link")
-            if found != expected:
-                raise self.error(f"joint '{name}' has {tag} link '{found}'; it must be '{expected}'")
-        kinds = ("continuous", "revolute") if kind == "continuous" else (kind,)
-        if joint.get("type") not in kinds:
-            raise self.error(f"joint '{name}' is of type '{joint.get('type')}'; it must be {kind}")
-        x, y, z = self._vector(joint.find("origin"), "0 0 0", f"origin of joint '{name}'")
-        if (x, y) != (0, 0) or (z != 0 and name != "x"):
-            raise self.error(f"joint '{name}' is displaced by {(x, y, z)} m; only joint 'x' may be, upwards")
-        self._check_unrotated(joint.find("origin"), f"joint '{name}'")
-        found_axis = self._vector(joint.find("axis"), "1 0 0", f"axis of joint '{name}'")
-        if axis is not None and found_axis != axis:
-            raise self.error(f"joint '{name}' has axis {found_axis}; it must be {axis}")
+def _found(root: ElementTree.Element, query: str) -> ElementTree.Element:
+    element = root.find(query)
+    assert element is not None
+    return element
 
-    def check_massless(self, link: str) -> None:
-        if self.mass(link) != 0:
-            raise self.error(f"link '{link}' has mass {self.mass(link)} kg; it must have 0")
-        inertia = self._child("link", link, "inertial/inertia")
-        where = f"inertia of link '{link}'"
-        for name in ("ixx", "iyy", "izz"):
-            if self._number(inertia, name, where) != 0:
-                raise self.error(f"{where}: {name} must be 0, as its mass is")
 
-    def _check_unrotated(self, origin: ElementTree.Element | None, where: str) -> None:
-        text = "0 0 0" if origin is None else origin.get("rpy", "0 0 0")
-        if any(part.strip("+-0.") for part in text.split()):
-            raise self.error(f"{where} is rotated: rpy = '{text}' must be 0 0 0")
+def _attribute(element: ElementTree.Element, place: str, attribute: str) -> str | tuple[float, ...]:
+    """An attribute as it counts, with its default in URDFs."""
+    default = {"link": "", "type": ""}.get(attribute, "0")
+    if attribute in ("xyz", "rpy"):
+        default = "1 0 0" if place == "axis" else "0 0 0"
+    inner = element.find(place)
+    return _parts((default if inner is None else inner.get(attribute, default)).replace("revolute", "continuous"))
 
-    def mass(self, link: str) -> float:
-        mass = self._number(self._child("link", link, "inertial/mass"), "value", f"mass of link '{link}'")
-        if mass < 0:
-            raise self.error(f"link '{link}' has negative mass {mass} kg")
-        return mass
 
-    def positive_mass(self, link: str) -> float:
-        mass = self.mass(link)
-        if mass == 0:
-            raise self.error(f"link '{link}' has mass 0; it must be positive")
-        return mass
-
-    def principal_inertias(self, link: str) -> tuple[float, float, float]:
-        inertia = self._child("link", link, "inertial/inertia")
-        where = f"inertia of link '{link}'"
-        for name in ("ixy", "ixz", "iyz"):
-            if inertia.get(name) is not None and self._number(inertia, name, where) != 0:
-                raise self.error(f"{where}: {name} must be 0")
-        ixx, iyy, izz = (self._number(inertia, name, where) for name in ("ixx", "iyy", "izz"))
-        if min(ixx, iyy, izz) <= 0:
-            raise self.error(f"{where} must be positive, not {(ixx, iyy, izz)} kg·m²")
-        return ixx, iyy, izz
-
-    def com_height(self, link: str) -> float:
-        origin = self._child("link", link, "inertial/origin")
-        self._check_unrotated(origin, f"inertial of link '{link}'")
-        x, y, z = self._vector(origin, "0 0 0", f"centre of mass of link '{link}'")
-        if (x, y) != (0, 0) or z <= 0:
-            raise self.error(f"link '{link}' must have its centre of mass on the axis above the ball, not at {x, y, z}")
-        return z
-
-    def visual(self, link: str, shape: str, attribute: str) -> float:
-        element = self._child("link", link, f"visual/geometry/{shape}")
-        value = self._number(element, attribute, f"{shape} of link '{link}'")
-        if value <= 0:
-            raise self.error(f"{shape} of link '{link}' must have a positive {attribute}, not {value} m")
-        return value
-
-    def force_limit(self) -> float:
-        efforts = [
-            self._number(self._child("joint", name, "limit"), "effort", f"limit of joint '{name}'") for name in "xy"
-        ]
-        if efforts[0] != efforts[1] or efforts[0] <= 0:
-            raise self.error(f"joints 'x' and 'y' must have one positive effort limit, not {efforts} N")
-        return efforts[0]
+def _parts(text: str) -> str | tuple[float, ...]:
+    """Text as finite numbers, if it is that."""
+    try:
+        numbers = tuple(float(part) for part in text.split())
+    except ValueError:
+        return text
+    return numbers if numbers and all(map(math.isfinite, numbers)) else text

@@ -205,7 +205,7 @@ def body(old, new):
 URDFS = [
     (written('<?xml version="1.0" encoding="klingon"?><robot/>', BallbotParams.from_urdf), "not well-formed XML"),
     (written("<robot>" + "<link>" * 100_000 + "</link>" * 100_000 + "</robot>", BallbotParams.from_urdf), "missing"),
-    (written("<robot/>", BallbotParams.from_urdf), "joint 'x' is missing"),
+    (written("<robot/>", BallbotParams.from_urdf), "link 'ball' is missing"),
     (urdf('<link name="body">', '<link name="ball">'), "link 'ball' is there 2 times"),
     (body("mass value=", 'mass value="inf" was='), "value = 'inf' is not a number"),
     (body("ixx=", 'ixx="1e999" was='), "ixx = '1e999' is not a number"),

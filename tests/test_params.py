@@ -81,24 +81,56 @@ BAD_URDFS = {
         "link 'ball' has no <inert",
     ),
     "missing mass": ('<mass value="15"/>', "", "link 'body' has no <inertial><mass>"),
-    "missing attribute": ('<mass value="15"/>', "<mass/>", "mass of link 'body' has no attribute 'value'"),
-    "negative mass": ('<mass value="15"/>', '<mass value="-15"/>', "link 'body' has negative mass -15.0 kg"),
-    "zero mass": ('<mass value="0.5"/>', '<mass value="0"/>', "link 'ball' has mass 0"),
-    "massless link with mass": ('<mass value="0"/>', '<mass value="1"/>', "link 'slide' has mass 1.0 kg"),
-    "zero inertia": ('izz="0.075"', 'izz="0"', "inertia of link 'body' must be positive"),
-    "body not round": ('iyy="1.2875"', 'iyy="1.3"', "link 'body' must be round"),
-    "product of inertia": (BODY_INERTIA, BODY_INERTIA.replace('ixy="0"', 'ixy="1"'), "link 'body': ixy must be 0"),
-    "mass not a number": ('<mass value="15"/>', '<mass value="heavy"/>', "mass of link 'body': value = 'heavy'"),
-    "wrong axis": ('<axis xyz="-1 0 0"/>', '<axis xyz="1 0 0"/>', "joint 'theta' has axis"),
-    "wrong type": ('name="y" type="prismatic"', 'name="y" type="fixed"', "joint 'y' is of type 'fixed'"),
-    "wrong parent": ('<parent link="ball"/>', '<parent link="slide"/>', "joint 'gamma' has parent link 'slide'"),
+    "missing attribute": (
+        '<mass value="15"/>',
+        "<mass/>",
+        "link[@name='body']/inertial/mass: value = '' is not a number",
+    ),
+    "negative mass": ('<mass value="15"/>', '<mass value="-15"/>', "body_mass must be positive and finite, not -15.0"),
+    "zero mass": ('<mass value="0.5"/>', '<mass value="0"/>', "ball_mass must be positive and finite, not 0.0"),
+    "massless link with mass": (
+        '<mass value="0"/>',
+        '<mass value="1"/>',
+        "link 'slide': inertial/mass value is (1.0,), and must be (0.0,)",
+    ),
+    "zero inertia": ('izz="0.075"', 'izz="0"', "axial_inertia must be positive and finite, not 0.0"),
+    "body not round": (
+        'iyy="1.2875"',
+        'iyy="1.3"',
+        "link 'body': inertial/inertia iyy is (1.3,), and must be (1.2875,)",
+    ),
+    "product of inertia": (
+        BODY_INERTIA,
+        BODY_INERTIA.replace('ixy="0"', 'ixy="1"'),
+        "link 'body': inertial/inertia ixy is (1.0,)",
+    ),
+    "mass not a number": (
+        '<mass value="15"/>',
+        '<mass value="heavy"/>',
+        "link[@name='body']/inertial/mass: value = 'heavy' is not a number",
+    ),
+    "wrong axis": ('<axis xyz="-1 0 0"/>', '<axis xyz="1 0 0"/>', "joint 'theta': axis xyz is (1.0, 0.0, 0.0)"),
+    "wrong type": (
+        'name="y" type="prismatic"',
+        'name="y" type="fixed"',
+        "joint 'y': type is fixed, and must be prismatic",
+    ),
+    "wrong parent": (
+        '<parent link="ball"/>',
+        '<parent link="slide"/>',
+        "joint 'gamma': parent link is slide, and must be ball",
+    ),
     "displaced joint": ('<child link="body"/>', '<child link="body"/><origin xyz="0 0 0.2"/>', "joint 'theta'"),
     "centre of mass off axis": (
         '<origin xyz="0 0 0.6"/>',
         '<origin xyz="0.1 0 0.6"/>',
-        "link 'body' must have its cent",
+        "link 'body': inertial/origin xyz is (0.1, 0.0, 0.6)",
     ),
-    "radius not positive": ('<sphere radius="0.1"/>', '<sphere radius="0"/>', "positive radius, not 0.0 m"),
+    "radius not positive": (
+        '<sphere radius="0.1"/>',
+        '<sphere radius="0"/>',
+        "ball_radius must be positive and finite, not 0.0",
+    ),
 }
 
 
@@ -114,5 +146,5 @@ def test_unequal_force_limits_are_refused(tmp_path):
     text = URDF_PATH.read_text().replace('effort="350"', 'effort="300"', 1)
     path = tmp_path / "uneven.urdf"
     path.write_text(text)
-    with pytest.raises(UrdfError, match=r"\[300.0, 350.0\] N"):
+    with pytest.raises(UrdfError, match=r"one effort limit, not 300\.0 and 350\.0 N"):
         BallbotParams.from_urdf(path)

@@ -132,10 +132,10 @@ def test_the_paper_has_no_limits_of_grip(params, rng):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('<child link="ball" />', '<child link="body" />', "joint 'roll' has child link 'body'"),
+        ('<child link="ball" />', '<child link="body" />', "joint 'roll': child link is body, and must be ball"),
         ('name="roll" type="spherical"', 'name="roll" type="fixed"', "must be spherical"),
-        ('iyy="0.002"', 'iyy="0.003"', "must be round"),
-        ('lateral_friction value="0.8"', 'lateral_friction value="0"', "positive lateral_friction"),
+        ('iyy="0.002"', 'iyy="0.003"', "inertial/inertia iyy is"),
+        ('lateral_friction value="0.8"', 'lateral_friction value="0"', "friction must be positive"),
     ],
 )
 def test_a_wrong_rolling_chain_is_named(old, new, message, rolling, tmp_path):
