@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from ballbot_train import jobs
+from ballbot_train.executors import WorkerError
 from ballbot_train.provenance import commit_of
 
 
@@ -151,38 +152,24 @@ def test_two_processes_never_use_a_folder_at_once(tmp_path):
     jobs.release(tmp_path)
 
 
-def deadly(log, victim, deaths, items):
-    """Squares, but the process dies the first times at one item."""
-    for item in items:
-        with open(log, "a") as file:
-            file.write(f"{item}\n")
-        if item == victim and Path(log).read_text().split().count(str(victim)) <= deaths:
+def deadly(log, items):
+    """Squares, but the process dies the first time at item 5."""
+    for entry in squares(log, items):
+        if entry["square"] == 25 and Path(log).read_text().split().count("5") == 1:
             os.kill(os.getpid(), signal.SIGKILL)
-        yield {"square": item**2}
+        yield entry
 
 
-def deadly_jobs(log):
-    ranges = (range(4), range(4, 8), range(8, 12))
-    return [jobs.Job(f"job{i}", deadly, (str(log), 5, 4), tuple(items)) for i, items in enumerate(ranges)]
-
-
-def test_a_job_whose_process_dies_is_tried_again_then_named_and_everything_else_is_kept(tmp_path):
+def test_a_worker_that_dies_ends_the_run_and_what_is_finished_is_kept(tmp_path, monkeypatch):
+    monkeypatch.delenv("BALLBOT_IN_PROCESS")
     log, counted = tmp_path / "log", []
-    with pytest.raises(
-        jobs.WorkerError, match=r"at job1, items 4, 5, 6, 7 .* Everything else is kept: the same command"
-    ):
-        jobs.run(deadly_jobs(log), tmp_path, 2, ignore)
-    assert log.read_text().split().count("5") == 3
-    done = jobs.run(deadly_jobs(log), tmp_path, 2, lambda group, count: counted.append(count))  # it dies a fourth time
+    work = [job(deadly, log, range(i, i + 4), f"job{i}") for i in (0, 4, 8)]
+    with pytest.raises(WorkerError, match=r"died, most likely out of memory .* the same command does what is missing"):
+        jobs.run(work, tmp_path, 1, ignore)
+    done = jobs.run(work, tmp_path, 1, lambda group, count: counted.append(count))
     assert [entry["square"] for entries in done for entry in entries] == [i**2 for i in range(12)]
     assert sum(counted) == 12
-    assert [log.read_text().split().count(str(i)) for i in range(12)] == [1] * 4 + [5, 5, 1, 1] + [1] * 4
-
-
-def test_the_calling_process_outlives_the_last_job(tmp_path, monkeypatch):
-    monkeypatch.delenv("BALLBOT_IN_PROCESS")
-    with pytest.raises(jobs.WorkerError, match="at job1, items 4"):
-        jobs.run(deadly_jobs(tmp_path / "log")[1:2], tmp_path, 1, ignore)
+    assert log.read_text().split() == [*"0123", *"45", *"4567", "8", "9", "10", "11"]
 
 
 @pytest.mark.parametrize("damaged", ["", '[{"square": 0}', "[]", "\x00" * 20])

@@ -3,7 +3,6 @@
 import math
 import os
 import time
-from concurrent.futures import BrokenExecutor
 
 import gymnasium
 import numpy as np
@@ -17,6 +16,7 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
+from ballbot_train.executors import WorkerError
 from ballbot_train.play import background, views
 from ballbot_train.play.background import Background
 from ballbot_train.play.clock import Clock
@@ -347,7 +347,7 @@ def test_another_process_computes_and_is_started_anew_after_it_was_killed():
         assert background.compute(os.getpid) == first != os.getpid()
         with pytest.raises(ValueError, match="math domain"):
             background.compute(math.sqrt, -1.0)
-        with pytest.raises(BrokenExecutor):
+        with pytest.raises(WorkerError):
             background.compute(os._exit, 1)
         assert background.compute(math.sqrt, 4.0) == 2.0
     finally:

@@ -122,7 +122,7 @@ def _again(command: str, options: list[str]) -> str:
 
 def _is_expected(error: RuntimeError) -> bool:
     from ballbot_gym.rollout import PlanError
-    from ballbot_train.jobs import WorkerError
+    from ballbot_train.executors import WorkerError
 
     return isinstance(error, PlanError | WorkerError)
 

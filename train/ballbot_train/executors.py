@@ -11,7 +11,7 @@ import signal
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -29,14 +29,13 @@ from ballbot_train.console import console
 
 NODE_SECONDS = 5.0
 """How often the nodes of a cluster are counted."""
-TRIES = 3
-"""Of a task whose worker or node dies."""
+_RETRIES = 5  # of a task on a cluster whose worker or node dies
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
 _PER_CORE = 2  # tasks in flight for every core of a cluster, so that no core waits for its next one
 
 
 class WorkerError(RuntimeError):
-    """Workers died, and died again when their tasks were tried once more; or there is no cluster."""
+    """A worker died, on a cluster several in turn at one task; or there is no cluster."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,10 @@ def result_of(future: Future) -> Any:
     try:
         value, error, text = future.result()
     except Exception as died:  # a task gives its own errors back
-        raise WorkerError(str(died).strip().partition("\n")[0] or type(died).__name__) from died
+        raise WorkerError(
+            f"a worker process died, most likely out of memory ({died!s:.200}). What is finished is kept: the same command "
+            "does what is missing, with fewer --workers each has more memory"
+        ) from died
     if error is not None:
         raise error from WorkerError(f"in a worker:\n{text}")
     return value
@@ -124,11 +126,12 @@ def open_pool(workers: int | Workers, serial: bool = False) -> Iterator[Pool]:
     if serial:
         yield _Serial()
     elif workers.ray is None:
-        pool = _Processes(workers.here)
+        os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
+        pool = worker_processes(workers.here)
         try:
             yield pool
         finally:
-            pool.close()
+            end_processes(pool)
     else:
         with _cluster(workers) as pool:
             yield pool
@@ -146,41 +149,24 @@ class _Serial:
         return future
 
 
-class _Processes:
-    """Processes of this machine. Each is a pool of its own, so one that dies takes only its own task with it."""
-
-    def __init__(self, count: int):
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
-        self._count = count
-        self._last: dict[ProcessPoolExecutor, Future] = {}
+class Processes(ProcessPoolExecutor):
+    """Processes of this machine, of which one that dies ends the others' work too."""
 
     def most(self) -> int:
-        return self._count
+        return self._max_workers
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
-        for pool in [pool for pool, last in self._last.items() if last.done()]:
-            try:
-                self._last[pool] = pool.submit(_attempt, function, arguments)
-                return self._last[pool]
-            except BrokenExecutor:  # its process has died
-                del self._last[pool]
-        pool = worker_process()
-        self._last[pool] = pool.submit(_attempt, function, arguments)
-        return self._last[pool]
-
-    def close(self) -> None:
-        for pool in self._last:
-            end_process(pool)
+        return super().submit(_attempt, function, arguments)
 
 
-def worker_process() -> ProcessPoolExecutor:
-    """A process that does tasks, with what users registered in this one. It ends with this one."""
+def worker_processes(count: int) -> Processes:
+    """Processes that do tasks, with what users registered in this one. They end with this one."""
     # a forked child would share PyBullet's clients and CasADi's state
-    return ProcessPoolExecutor(1, get_context("spawn"), _prepare, registry.registered())
+    return Processes(count, get_context("spawn"), _prepare, registry.registered())
 
 
-def end_process(pool: ProcessPoolExecutor) -> None:
-    """Ends a `worker_process` at once, whatever it does."""
+def end_processes(pool: Processes) -> None:
+    """Ends processes at once, whatever they do."""
     for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
         process.terminate()
     pool.shutdown(cancel_futures=True)
@@ -268,7 +254,7 @@ class _Ray:
     def __init__(self, ray: Any, workers: int | None):
         self._ray, self._workers = ray, workers
         # a name with a module, so that nodes import the function rather than unpickle it
-        self._task = ray.remote(num_cpus=1, max_retries=0)(_on_node)
+        self._task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_on_node)
         self._running: set[Future] = set()
         self._counted, self._cores, self._said = 0.0, 0, ""
 

@@ -8,7 +8,6 @@ jobs that have no file. A folder belongs to one configuration until it is releas
 import json
 import os
 import shutil
-from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack, contextmanager
@@ -18,7 +17,7 @@ from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
-from ballbot_train.executors import NODE_SECONDS, TRIES, Pool, WorkerError, Workers, open_pool, result_of
+from ballbot_train.executors import NODE_SECONDS, Pool, Workers, open_pool, result_of
 
 try:
     import filelock
@@ -205,9 +204,8 @@ def stream(
 ) -> Iterator[tuple[int, list[Entry]]]:
     """Does what is not done yet, and gives each job when it is done.
 
-    The calling process writes every result when it comes, whoever computed it. A job whose worker or node dies is tried
-    again, three times in all. Then it is left out, all others are done, and a WorkerError says which are missing. A run that
-    ends before its first job is finished leaves no claim of the folder, because there is nothing to continue.
+    The calling process writes every result when it comes, whoever computed it. A run that ends before its first job is
+    finished leaves no claim of the folder, because there is nothing to continue.
 
     Args:
         jobs: what there is to do. They are taken when workers have room for them.
@@ -220,51 +218,37 @@ def stream(
         The number of a job that is done, and its entries in the order of its items.
 
     Raises:
-        WorkerError: processes died, so that jobs are missing.
+        WorkerError: a worker died.
         ValueError: another process is using the folder, or there are no workers.
     """
     workers = Workers.of(workers)
     serial = workers.here == 1 and bool(os.environ.get("BALLBOT_IN_PROCESS"))
-    waiting, again = enumerate(jobs), deque[tuple[int, Job]]()
-    running: dict[Future, tuple[int, Job]] = {}
-    deaths, lost = Counter[int](), list[str]()
+    waiting, running = enumerate(jobs), dict[Future, tuple[int, Job]]()
     with _locked(out), ExitStack() as stack:
         stack.push(lambda error, *_: release(out) if error and out.resolve() in _new else None)
         unfinished(out).mkdir(parents=True, exist_ok=True)
         pool: Pool | None = None  # a cluster takes seconds to start, and there may be nothing to do
         while True:
             while pool is None or len(running) < pool.most():
-                number, job = next(waiting, None) or (again.popleft() if again else (-1, None))
-                if job is None:
+                if (following := next(waiting, None)) is None:
                     break
+                number, job = following
                 if (done := _read(_path_of(out, job.name), len(job.items))) is not None:
                     on_progress(job.group, len(job.items))
                     yield number, done
                     continue
                 pool = pool or stack.enter_context(open_pool(workers, serial))
-                running[pool.submit(_result, job)] = number, job
+                running[pool.submit(_result, job)] = following
             if not running:
-                break
-            for future in wait(running, NODE_SECONDS, FIRST_COMPLETED).done:
+                return
+            ended = wait(running, NODE_SECONDS, FIRST_COMPLETED).done
+            for future in sorted(ended, key=lambda future: future.exception() is not None):
                 number, job = running.pop(future)
-                try:
-                    text = result_of(future)
-                except WorkerError as died:
-                    deaths[number] += 1
-                    if deaths[number] < TRIES:
-                        again.append((number, job))  # last in turn, when other processes may have left memory
-                    else:
-                        lost.append(f"{job.name}, items {', '.join(map(str, job.items))} ({died})")
-                    continue
+                text = result_of(future)
                 files.write(_path_of(out, job.name), text)
                 _new.discard(out.resolve())
                 on_progress(job.group, len(job.items))
                 yield number, json.loads(text)
-    if lost:
-        raise WorkerError(
-            f"worker processes died, most likely out of memory, at {'; '.join(lost)}. Everything else is kept: the "
-            "same command does only what is missing, with fewer --workers each has more memory"
-        )
 
 
 def _result(job: Job) -> str:

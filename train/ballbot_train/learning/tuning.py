@@ -27,7 +27,6 @@ prune, and say what theirs reached.
 import json
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
@@ -42,7 +41,7 @@ from ballbot_gym.lazy import missing
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.executors import NODE_SECONDS, TRIES, Pool, WorkerError, Workers, open_pool, result_of
+from ballbot_train.executors import NODE_SECONDS, Pool, Workers, open_pool, result_of
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
 
@@ -198,30 +197,17 @@ def _search(
 ) -> None:
     """Runs trials on the workers of a pool."""
     running: dict[Future, optuna.Trial] = {}
-    deaths = Counter[int]()
-
-    def start(trial: optuna.Trial) -> None:
-        completed = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
-        running[pool.submit(_attempt, search, settings_of(search, trial.params), completed)] = trial
-
     while True:
         ended = len(_ended(study))
         on_trial(ended)
         while ended + len(running) < trials and len(running) < pool.most():
-            start(study.ask(SPACES[search.learner]))
+            trial = study.ask(SPACES[search.learner])
+            completed = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
+            running[pool.submit(_attempt, search, settings_of(search, trial.params), completed)] = trial
         if not running:
             return
         for future in wait(running, NODE_SECONDS, FIRST_COMPLETED).done:
-            trial = running.pop(future)
-            try:
-                reached = result_of(future)
-            except WorkerError as died:
-                deaths[trial.number] += 1
-                if deaths[trial.number] < TRIES:
-                    start(trial)
-                    continue
-                reached = {"steps": [], "error": f"its worker died: {died}"}
-            _end(study, trial, reached)
+            _end(study, running.pop(future), result_of(future))
             write_tables(study, search, out)
 
 

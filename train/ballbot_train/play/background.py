@@ -12,7 +12,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.controllers import is_expert, make_controller
-from ballbot_train.executors import end_process, worker_process
+from ballbot_train.executors import Processes, end_processes, result_of, worker_processes
 
 _ONE_JOB = threading.Lock()  # solvers are kept for reuse, and none may be used by two threads at once
 _FROM_ELSEWHERE = ("lqr", "trajopt")  # controllers that are data, so that they can come from another process
@@ -27,11 +27,16 @@ class Background:
 
     def __init__(self, other_process: bool = False):
         """Starts the thread. With another process, `compute` calls functions there."""
-        self._other = worker_process() if other_process else None
-        if self._other is not None:
-            self._other.submit(int)  # which starts it
+        self._other: Processes | None = None
+        if other_process:
+            self._start()
         self._thread = ThreadPoolExecutor(1, "ballbot-play")
         self._closed = False
+
+    def _start(self) -> Processes:
+        self._other = worker_processes(1)
+        self._other.submit(int)  # which starts it
+        return self._other
 
     def submit(self, job: Callable[..., Any], *arguments: Any) -> Future:
         """Asks for a job. A future that is cancelled before the job begins saves it."""
@@ -46,7 +51,7 @@ class Background:
         """What a function of a module returns, that may be called in another process; for jobs.
 
         Raises:
-            BrokenExecutor: the other process has ended meanwhile.
+            WorkerError: the other process has ended meanwhile.
             Exception: what the function raises.
         """
         if self._other is None:
@@ -56,9 +61,8 @@ class Background:
         except BrokenExecutor:
             if self._closed:
                 raise
-            self._other = worker_process()
-            future = self._other.submit(function, *arguments)
-        return future.result()
+            future = self._start().submit(function, *arguments)
+        return result_of(future)
 
     def controller(self, name: str, task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray) -> Controller:
         """For jobs: the controller of a name, at the start of an episode in state x (8,) with constants c (nc,)."""
@@ -83,7 +87,7 @@ class Background:
         self._closed = True
         self._thread.shutdown(wait=False, cancel_futures=True)
         if self._other is not None:
-            end_process(self._other)
+            end_processes(self._other)
         self._thread.shutdown()
 
 
