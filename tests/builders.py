@@ -35,6 +35,14 @@ def stress_result(stress, level, **changes):
     return StressResult(**(_FIELDS | {"stress": stress, "level": level} | changes))
 
 
+def measured(cost_ratio, cost, mean_cost, success=1.0):
+    """What `score_and_validate` could give."""
+    certified = {"cost_ratio": cost_ratio, "regret_mean": 0.1, "regret_median": 0.1, "regret_worst": 0.1}
+    validation = {"cost": cost, "success": success, "failures": 0, "mean_cost": mean_cost}
+    figures = {f"certified/{name}": value for name, value in (certified | {"success": success, "failures": 0}).items()}
+    return figures | {f"validation/{name}": value for name, value in validation.items()}
+
+
 @dataclass(frozen=True)
 class FunctionController:
     """A plain function u = f(t, x) as a Controller."""

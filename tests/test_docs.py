@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from builders import measured
 
 from ballbot_gym import BallbotEnv, named_robot
 from ballbot_gym.tasks import TASKS
@@ -28,7 +29,7 @@ SHORTER = {  # a training that a page calls `# minutes` runs with these too
     "shac": "--iterations 1 --num-envs 8 --horizon 4",
 }
 MEASURED = "--evaluations 1 --test-episodes 2 --validation-episodes 2"
-MEASURED_AS = training.Score(1.5, 0.5, 0.5, 0.5, 1.0, 0), training.Validation(30.0, 1.0, 0, 30.0)
+MEASURED_AS = measured(1.5, 30.0, 30.0)
 """What its evaluations say, in place of running hundreds of episodes for each."""
 
 

@@ -167,6 +167,6 @@ def test_what_does_not_act_is_refused():
 
 def test_validation_prices_an_episode_without_success_as_failing_at_once():
     task = TASKS["stabilize"]()
-    _, validation = training.score_and_validate(idle, task)
-    assert validation.success == 0
-    assert validation.cost >= task.survival_pay
+    figures = training.score_and_validate(idle, task)
+    assert figures["validation/success"] == 0
+    assert figures["validation/cost"] >= task.survival_pay

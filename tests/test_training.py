@@ -10,6 +10,7 @@ from dataclasses import asdict, fields, replace
 
 import pytest
 import torch
+from builders import measured
 from resuming import goes_on_as_if_never_stopped, parameters
 
 from ballbot_baselines.optimum import Backoff
@@ -41,11 +42,12 @@ def test_shac_starts_at_lqr_and_lowers_the_cost():
     task, params = TASKS["stabilize"](), default_params()
     config = replace(LEARNERS["shac"].settings("stabilize"), iterations=10, num_envs=32, horizon=20, hidden=(32,))
     learner = shac.Shac(task, params, config)
-    before = training.score_and_validate(learner.network, task)[0]
-    assert before.success > 0.5  # LQR within the limits of tanh
+    before = training.score_and_validate(learner.network, task)
+    assert before["certified/success"] > 0.5  # LQR within the limits of tanh
     for _ in range(config.iterations):
         learner.iterate()
-    assert training.score_and_validate(learner.network, task)[0].cost_ratio < 0.7 * before.cost_ratio
+    after = training.score_and_validate(learner.network, task)
+    assert after["certified/cost_ratio"] < 0.7 * before["certified/cost_ratio"]
 
 
 def test_shac_starts_from_a_policy_and_says_from_what_it_cannot():
@@ -169,10 +171,7 @@ def evaluations(folder):
 def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_test_it(
     short_run, tmp_path, monkeypatch
 ):
-    figures = iter(
-        (training.Score(ratio, 0.1, 0.1, 0.1, 1.0, 0), training.Validation(cost, 1.0, 0, 1.0))
-        for ratio, cost in ((1.5, 30.0), (1.4, 20.0), (1.1, 25.0))
-    )
+    figures = iter(measured(ratio, cost, 1.0) for ratio, cost in ((1.5, 30.0), (1.4, 20.0), (1.1, 25.0)))
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: next(figures))
     short_run()
     rows = evaluations(tmp_path)
@@ -184,10 +183,7 @@ def test_the_validation_set_chooses_the_policy_and_the_certified_episodes_only_t
 
 
 def test_of_policies_that_never_succeed_the_one_with_the_least_mean_cost_is_kept(short_run, tmp_path, monkeypatch):
-    figures = iter(
-        (training.Score(10.0, 0.1, 0.1, 0.1, 0.0, 0), training.Validation(800.0, 0.0, 0, mean))
-        for mean in (700.0, 80.0, 90.0)
-    )
+    figures = iter(measured(10.0, 800.0, mean, success=0.0) for mean in (700.0, 80.0, 90.0))
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: next(figures))
     short_run()
     assert json.loads((tmp_path / "policy.json").read_text())["iteration"] == 1

@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("optuna")
 
+from builders import measured
 from optuna.distributions import CategoricalDistribution as Categorical
 from optuna.distributions import FloatDistribution as Float
 
@@ -15,7 +16,6 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.tune import tune
 from ballbot_train.learning import tuning
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.learning.training import Score, Validation
 from ballbot_train.learning.tuning import SPACES, Search, encoded, settings_of, zoo_yaml
 
 
@@ -61,11 +61,11 @@ def fakes(monkeypatch):
             raise ValueError("not finite")
         return Fake(settings, seed)
 
-    def measured(network, task, robot):
-        return Score(network, 0.1, 0.1, 0.1, 1.0, 0), Validation(network, 1.0, 0, network)
+    def measure(network, task, robot):
+        return measured(network, network, network)
 
     monkeypatch.setattr(type(LEARNERS["ppo"]), "make", make)
-    monkeypatch.setattr(tuning.training, "score_and_validate", measured)
+    monkeypatch.setattr(tuning.training, "score_and_validate", measure)
     space = {"learning_rate": Float(1e-4, 5e-3, log=True), "batch_size": Categorical((512, 3072, 2048))}
     space["hidden"] = Categorical(("[64, 64]", "[128, 128]"))
     monkeypatch.setitem(tuning.SPACES, "ppo", space)

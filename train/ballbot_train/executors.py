@@ -127,7 +127,7 @@ def open_pool(workers: int | Workers, serial: bool = False) -> Iterator[Pool]:
         yield _Serial()
     elif workers.ray is None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
-        pool = worker_processes(workers.here)
+        pool = Processes(workers.here)
         try:
             yield pool
         finally:
@@ -150,19 +150,21 @@ class _Serial:
 
 
 class Processes(ProcessPoolExecutor):
-    """Processes of this machine, of which one that dies ends the others' work too."""
+    """Processes of this machine, with what users registered in this one. They end with this one.
+
+    One that dies ends the others' work too.
+    """
+
+    def __init__(self, count: int):
+        # a forked child would share PyBullet's clients and CasADi's state
+        super().__init__(count, get_context("spawn"), _prepare, registry.registered())
+        self._count = count
 
     def most(self) -> int:
-        return self._max_workers
+        return self._count
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         return super().submit(_attempt, function, arguments)
-
-
-def worker_processes(count: int) -> Processes:
-    """Processes that do tasks, with what users registered in this one. They end with this one."""
-    # a forked child would share PyBullet's clients and CasADi's state
-    return Processes(count, get_context("spawn"), _prepare, registry.registered())
 
 
 def end_processes(pool: Processes) -> None:

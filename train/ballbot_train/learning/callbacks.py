@@ -1,7 +1,6 @@
 """`RegretCallback`: the regret of a Stable-Baselines3 model while it trains."""
 
 import io
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +23,7 @@ class RegretCallback(BaseCallback):
 
     It evaluates as `ballbot train` does, in the batched closed-form model and in about a second: it reports the 200
     certified episodes; the best model is that of the least cost on fresh ones. The mean action acts, and observations are
-    normalized as in training, where that has VecNormalize. SB3's logger gets
-
-    | figure | of |
-    |---|---|
-    | certified/regret_mean, regret_median, regret_worst | the certified episodes that did not fail |
-    | certified/success, failures, cost_ratio | all certified episodes |
-    | validation/cost, success, failures, mean_cost | the fresh ones |
-
+    normalized as in training, where that has VecNormalize. SB3's logger gets the figures of `training.score_and_validate`,
     so TensorBoard shows them, and W&B with `wandb.init(sync_tensorboard=True)`.
     """
 
@@ -75,9 +67,7 @@ class RegretCallback(BaseCallback):
     def evaluate(self) -> dict[str, float]:
         """Measures the present model; returns the figures by name. Raises a PolicyError if it acts in other spaces."""
         policy = as_batch_policy(self.model, self.task, self._robot)
-        score, validation = score_and_validate(policy, self.task, self._robot, self.validation_episodes)
-        figures = {f"certified/{name}": value for name, value in asdict(score).items()}
-        return figures | {f"validation/{name}": value for name, value in asdict(validation).items()}
+        return score_and_validate(policy, self.task, self._robot, self.validation_episodes)
 
     def _on_step(self) -> bool:
         if self.n_calls % self.eval_freq == 0:

@@ -23,10 +23,11 @@ A run is a folder:
 |---|---|
 | iteration, seconds | of training; seconds without evaluations |
 | env_steps, cpu_seconds | control steps of all envs, where the learner counts them; CPU time without evaluations |
-| cost_ratio, regret_mean, _median and _worst, success, failures | on the certified episodes, the test set; see `Score` |
-| validation_cost, validation_success, validation_failures, validation_mean_cost | on the validation set; see `Validation` |
+| cost_ratio, regret_mean, _median and _worst, success, failures | on the certified episodes, the test set |
+| validation_cost, validation_success, validation_failures, validation_mean_cost | on the validation set |
 
-The best policy is that of the least validation_cost, and of the least validation_mean_cost among equals.
+`score_and_validate` says what these are. The best policy is that of the least validation_cost, and of the least
+validation_mean_cost among equals.
 """
 
 import io
@@ -37,7 +38,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -104,43 +105,10 @@ class Learner(Protocol):
         """Goes back to a state."""
 
 
-@dataclass(frozen=True)
-class Score:
-    """What a policy costs on the certified episodes, in the batched closed-form model."""
-
-    cost_ratio: float
-    """Mean of cost / optimum; an episode without success costs at least as much as failing at once."""
-    regret_mean: float
-    """Mean of cost / optimum − 1 over the episodes that did not fail."""
-    regret_median: float
-    """Median of the same."""
-    regret_worst: float
-    """Worst of the same."""
-    success: float
-    """Share of the episodes that ended in success."""
-    failures: int
-    """Number of episodes that failed."""
-
-
-@dataclass(frozen=True)
-class Validation:
-    """What a policy costs on the validation set, in the batched closed-form model."""
-
-    cost: float
-    """Mean cost; an episode without success costs at least as much as failing at once. The best policy has the least."""
-    success: float
-    """Share of the episodes that ended in success."""
-    failures: int
-    """Number of episodes that failed."""
-    mean_cost: float
-    """Mean cost as it is, a failure's price included. Of two policies of the same cost, of which none ever succeeds for
-    example, the better one has less of it."""
-
-
 _COLUMNS = (
     *("iteration", "seconds", "env_steps", "cpu_seconds"),
-    *(field.name for field in fields(Score)),
-    *(f"validation_{field.name}" for field in fields(Validation)),
+    *("cost_ratio", "regret_mean", "regret_median", "regret_worst", "success", "failures"),
+    *("validation_cost", "validation_success", "validation_failures", "validation_mean_cost"),
 )
 """Of evaluations.csv."""
 
@@ -151,10 +119,19 @@ def score_and_validate(
     robot: str = PAPER,
     episodes: int = VALIDATION_EPISODES,
     randomization: Randomization = Randomization(),
-) -> tuple[Score, Validation]:
+) -> dict[str, float]:
     """Measures a policy on the certified episodes and on the validation set, which shares none with others, in one batch.
 
     With a randomization the optima are those of its episodes.
+
+    | figure | is |
+    |---|---|
+    | certified/cost_ratio | mean of cost / optimum; an episode without success costs at least as much as failing at once |
+    | certified/regret_mean, regret_median, regret_worst | of cost / optimum − 1 of the episodes that did not fail |
+    | certified/success, failures | share of the episodes that ended in success, and number of those that failed |
+    | validation/cost | mean cost; an episode without success costs at least as much as failing at once |
+    | validation/mean_cost | mean cost as it is, which tells near misses apart where no episode succeeds |
+    | validation/success, failures | as on the certified episodes |
     """
     known = certified.load(task, robot, randomization=randomization)
     count = len(known)
@@ -172,15 +149,18 @@ def score_and_validate(
     priced = fresh.priced(cost, success, task)
     standing = (cost[:count] / known.costs - 1)[~failure[:count]]
     mean, median, worst = (float(of(standing)) if standing.size else math.nan for of in (np.mean, np.median, np.max))
-    ratio = float((priced[:count] / known.costs).mean())
-    score = Score(ratio, mean, median, worst, float(success[:count].mean()), int(failure[:count].sum()))
-    validation = Validation(
-        cost=float(priced[count:].mean()),
-        success=float(success[count:].mean()),
-        failures=int(failure[count:].sum()),
-        mean_cost=float(cost[count:].mean()),
-    )
-    return score, validation
+    return {
+        "certified/cost_ratio": float((priced[:count] / known.costs).mean()),
+        "certified/regret_mean": mean,
+        "certified/regret_median": median,
+        "certified/regret_worst": worst,
+        "certified/success": float(success[:count].mean()),
+        "certified/failures": int(failure[:count].sum()),
+        "validation/cost": float(priced[count:].mean()),
+        "validation/success": float(success[count:].mean()),
+        "validation/failures": int(failure[count:].sum()),
+        "validation/mean_cost": float(cost[count:].mean()),
+    }
 
 
 @own_defaults()
@@ -308,30 +288,24 @@ class _Run:
             The figures by their name in TensorBoard.
         """
         network = self.learner.network
-        scored, validation = score_and_validate(
-            network, self.task, self.robot, self.validation_episodes, self.randomization
-        )
-        certified_score = asdict(scored)
-        named = {f"validation_{name}": value for name, value in asdict(validation).items()}
-        self.rows.append(
-            {
-                "iteration": self.learner.iteration,
-                "seconds": round(self.seconds, 1),
-                "env_steps": self.env_steps,
-                "cpu_seconds": round(self.cpu_seconds, 1),
-                **certified_score,
-                **named,
-            }
-        )
+        figures = score_and_validate(network, self.task, self.robot, self.validation_episodes, self.randomization)
+        row = {
+            "iteration": self.learner.iteration,
+            "seconds": round(self.seconds, 1),
+            "env_steps": self.env_steps,
+            "cpu_seconds": round(self.cpu_seconds, 1),
+        }
+        named = {name.removeprefix("certified/").replace("/", "_"): value for name, value in figures.items()}
+        self.rows.append(row | named)
         self._write_rows()
         before = [row["iteration"] for row in self.rows[:-1]]
         if self._preparation and max(before, default=0) <= self._preparation < self.learner.iteration:
             self.best = _WORST
-        if (validation.cost, validation.mean_cost) < self.best:
-            self.best = validation.cost, validation.mean_cost
+        cost = figures["validation/cost"], figures["validation/mean_cost"]
+        if cost < self.best:
+            self.best = cost
             self._save_policy(network)
-        certified_figures = {f"certified/{name}": value for name, value in certified_score.items()}
-        return certified_figures | {f"validation/{name}": value for name, value in asdict(validation).items()}
+        return figures
 
     @property
     def _preparation(self) -> int:

@@ -264,13 +264,13 @@ def outcome_of(search: Search, settings: Any) -> Iterator[float | dict[str, Any]
             while learner.iteration < learner.iterations * k // search.evaluations:
                 learner.iterate()
         measured = [training.score_and_validate(learner.network, task, search.robot) for learner in learners]
-        costs = [(validation.cost + validation.mean_cost) / 2 for _, validation in measured]
+        costs = [(each["validation/cost"] + each["validation/mean_cost"]) / 2 for each in measured]
         best = [min(pair) for pair in zip(best, costs, strict=True)]
         yield float(np.mean(best))
     yield {
         "costs": best,
-        "success": [validation.success for _, validation in measured],
-        "certified_regret": [score.cost_ratio - 1 for score, _ in measured],
+        "success": [each["validation/success"] for each in measured],
+        "certified_regret": [each["certified/cost_ratio"] - 1 for each in measured],
     }
 
 

@@ -12,7 +12,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 from ballbot_train.evaluation.controllers import is_expert, make_controller
-from ballbot_train.executors import Processes, end_processes, result_of, worker_processes
+from ballbot_train.executors import Processes, end_processes, result_of
 
 _ONE_JOB = threading.Lock()  # solvers are kept for reuse, and none may be used by two threads at once
 _FROM_ELSEWHERE = ("lqr", "trajopt")  # controllers that are data, so that they can come from another process
@@ -34,7 +34,7 @@ class Background:
         self._closed = False
 
     def _start(self) -> Processes:
-        self._other = worker_processes(1)
+        self._other = Processes(1)
         self._other.submit(int)  # which starts it
         return self._other
 

@@ -335,7 +335,7 @@ class Playground:
         self._first_push_at = -1 if not at_rest else round(_FIRST_PUSH_AFTER / self.world.task.control_dt)
         seed = int(self._rng.integers(2**32))  # the same for all, so that they meet the same robot, noise and pushes
         for runner in self.runners:
-            runner.begin(*(tuple(map(float, part)) for part in start), hidden, seed)
+            runner.begin(tuple(start[0].tolist()), tuple(start[1].tolist()), hidden, seed)
             runner.take_controller(None, self.steps)
             runner.name = runner.wanted
             self._order(runner)
