@@ -6,7 +6,6 @@ import numpy as np
 
 from ballbot_gym.robots import ROBOTS
 from ballbot_train.evaluation.results import Result
-from ballbot_train.evaluation.robustness import StressResult
 
 _FIELDS = {
     "task": "stabilize",
@@ -32,7 +31,7 @@ def result(**changes):
 
 def stress_result(stress, level, **changes):
     """The same under a disturbance."""
-    return StressResult(**(_FIELDS | {"stress": stress, "level": level} | changes))
+    return result(told={"stress": stress, "level": level}, **changes)
 
 
 def measured(cost_ratio, cost, mean_cost, success=1.0):

@@ -11,7 +11,7 @@ import pytest
 from ballbot_gym.engines import installed_physics
 from ballbot_train.commands.transfer import transfer
 from ballbot_train.evaluation.agreement import disagreements, drifts
-from ballbot_train.evaluation.transfer import TransferResult
+from ballbot_train.evaluation.results import Result
 from ballbot_train.report.film import write_film
 
 OTHERS = [name for name in installed_physics() if name != "rk4"]
@@ -19,8 +19,8 @@ OTHERS = [name for name in installed_physics() if name != "rk4"]
 
 def result(episode, physics, cost=110.0, success=True, failure=False):
     measured = dict.fromkeys(("peak_tilt", "settle_time", "duration", "plan_seconds", "step_seconds"), 1.0)
-    kept = {"made_for": "paper", "robot": "paper", "friction": math.inf, "optimum": 100.0}
-    return TransferResult("turn", "lqr", episode, physics, cost, success=success, failure=failure, **kept, **measured)
+    told = {"made_for": "paper", "robot": "paper", "friction": math.inf}
+    return Result("turn", "lqr", episode, physics, cost, 100.0, success, failure, told=told, **measured)
 
 
 def test_episodes_that_end_otherwise_are_named_and_regret_is_of_those_that_end_well_in_both():

@@ -8,7 +8,7 @@ from builders import stress_result as result
 
 from ballbot_gym.randomization import Randomization
 from ballbot_train.evaluation import benchmark, robustness
-from ballbot_train.evaluation.results import rows_of, summarize, write_results
+from ballbot_train.evaluation.results import leaderboard, summarize, write_results
 from ballbot_train.evaluation.robustness import NONE, STRESSES
 from ballbot_train.report import figures
 
@@ -24,14 +24,14 @@ def test_severity_0_is_no_disturbance_and_every_level_is_one(name):
 
 def run(stress, episodes, out, seed=0):
     groups = robustness.groups_of({"stabilize": ["lqr"]}, robustness.conditions([stress]), "rk4")
-    return benchmark.run_groups(groups, episodes, out, 1, robustness.StressResult, seed)
+    return benchmark.run_groups(groups, episodes, out, 1, seed)
 
 
 def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
     results = run("delay", 3, tmp_path)
     plain = benchmark.benchmark({"stabilize": ["lqr"]}, 3, "rk4", tmp_path / "plain", 1)
-    rows = rows_of(results, robustness.StressRow, "stress", "level")
-    assert [(row.stress, row.level) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
+    rows = leaderboard(results, "stress", "level")
+    assert [tuple(row.told.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == summarize(plain).cost_mean
     costs = [row.cost_mean for row in rows]
     assert costs[0] == min(costs)
@@ -50,15 +50,15 @@ def test_the_same_seed_draws_the_same_pushes(tmp_path):
 def test_files_hold_the_rows_and_the_figure_is_drawn(tmp_path):
     failed = {"failure": True, "success": False}
     results = [result(NONE, 0.0), result("mass", -20.0), result("mass", 20.0, **failed), result("lag", 20.0)]
-    rows = rows_of(results, robustness.StressRow, "stress", "level")
+    rows = leaderboard(results, "stress", "level")
     write_results("robustness", rows, results, {"commit": "none"}, tmp_path)
     document = json.loads((tmp_path / "robustness.json").read_text())
-    assert [(row["stress"], row["level"]) for row in document["rows"]] == [(r.stress, r.level) for r in results]
+    assert [(row["stress"], row["level"]) for row in document["rows"]] == [tuple(r.told.values()) for r in results]
     assert document["rows"][2]["regret_mean"] is None
     with (tmp_path / "robustness.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 4
     curve = robustness.curve_of(rows, "stabilize", "lqr", "mass")
-    np.testing.assert_array_equal([row.level for row in curve], [-20, 0, 20])
+    np.testing.assert_array_equal([row.told["level"] for row in curve], [-20, 0, 20])
     figure = figures.robustness_figure(rows, "stabilize")
     assert figures.save(figure, tmp_path / "curves.png").exists()
     ticks = [tick.get_text() for axis in figure.axes for tick in (*axis.get_xticklabels(), *axis.get_yticklabels())]

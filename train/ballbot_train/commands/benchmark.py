@@ -62,7 +62,7 @@ def benchmark(
         return
     facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
     done = run_benchmark(chosen, episodes, physics, out, workers, seed, robot)
-    rows = leaderboard(done, seed)
+    rows = leaderboard(done, seed=seed)
     write_leaderboard(rows, done, facts, out)
     regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
@@ -98,7 +98,7 @@ def _benchmark_tracks(
         for condition in wanted:
             optima.known(task, robot, range(episodes), workers, condition.randomization)
     groups = robustness.groups_of(chosen, wanted, physics, robot)
-    results = run_groups(groups, episodes, out, workers, robustness.StressResult, seed)
+    results = run_groups(groups, episodes, out, workers, seed)
     rows = tracks.rows_of(results, robot, seed)
     write_results("tracks", rows, results, facts, out)
     title = f"{episodes} certified episodes per task and track, physics={physics}"

@@ -16,7 +16,7 @@ from ballbot_train.evaluation.benchmark import (
     run_groups,
 )
 from ballbot_train.evaluation.evaluate import checked_episodes
-from ballbot_train.evaluation.results import rows_of, write_results
+from ballbot_train.evaluation.results import Row, leaderboard, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 
@@ -53,8 +53,8 @@ def robustness(
     settings = {"physics": physics, "episodes": checked_episodes(episodes)}
     facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
     groups = stressed.groups_of(chosen, stressed.conditions(stresses), physics, robot)
-    results = run_groups(groups, episodes, out, workers, stressed.StressResult, seed)
-    rows = rows_of(results, stressed.StressRow, "stress", "level", seed=seed)
+    results = run_groups(groups, episodes, out, workers, seed)
+    rows = leaderboard(results, "stress", "level", seed=seed)
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
     write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:
@@ -70,7 +70,7 @@ def robustness(
     console.print(f"curves: {out / 'figures'}")
 
 
-def _cells(curve: list[stressed.StressRow], stress: str) -> list[str]:
+def _cells(curve: list[Row], stress: str) -> list[str]:
     def joined(values: list[float]) -> str:
         return " · ".join(f"{value:.0f}" if math.isfinite(value) else "–" for value in values)
 
@@ -78,7 +78,7 @@ def _cells(curve: list[stressed.StressRow], stress: str) -> list[str]:
         curve[0].task,
         stress,
         curve[0].controller,
-        " · ".join(f"{row.level:g}" for row in curve),
+        " · ".join(f"{row.told['level']:g}" for row in curve),
         joined([100 * row.success for row in curve]),
         joined([100 * row.falls / row.episodes for row in curve]),
         joined([100 * row.regret_mean for row in curve]),

@@ -13,7 +13,7 @@ from ballbot_train.evaluation import agreement
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish, run_groups
 from ballbot_train.evaluation.evaluate import checked_episodes
-from ballbot_train.evaluation.results import rows_of, write_results
+from ballbot_train.evaluation.results import Result, leaderboard, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report.film import write_film
 from ballbot_train.report.replay import engines_replay
@@ -60,8 +60,8 @@ def transfer(
     settings = {"controllers": chosen, "frictions": frictions, "physics": engines, "episodes": episodes}
     facts = open_run(out, tasks, workers, digests, seed, robot, **settings)
     groups = matrix.groups_of(chosen, robot, floors, engines)
-    results = run_groups(groups, episodes, out, workers, matrix.TransferResult, seed)
-    rows = rows_of(results, matrix.TransferRow, "made_for", "robot", "friction", "physics", seed=seed)
+    results = run_groups(groups, episodes, out, workers, seed)
+    rows = leaderboard(results, "made_for", "robot", "friction", "physics", seed=seed)
     write_results("transfer", rows, results, facts, out, matrix.COLUMNS, regret=matrix.REGRET)
     if len(engines) > 1:
         _compare(results, chosen, robot, episodes, engines, out)
@@ -71,7 +71,7 @@ def transfer(
 
 
 def _compare(
-    results: Sequence[matrix.TransferResult],
+    results: Sequence[Result],
     chosen: Mapping[str, Mapping[str, Sequence[str]]],
     robot: str,
     episodes: int,

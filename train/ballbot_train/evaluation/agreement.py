@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.evaluation.transfer import TransferResult
+from ballbot_train.evaluation.results import Result
 
 TIMES = (0.1, 0.25, 0.5, 1.0, 2.0)
 """s, at which distances are measured."""
@@ -28,8 +29,8 @@ class Disagreement:
     """
 
     task: str
-    made_for: str
     controller: str
+    made_for: str
     robot: str
     friction: float
     first: str
@@ -59,11 +60,12 @@ class Drift:
     worst: float
 
 
-def disagreements(results: Sequence[TransferResult]) -> list[Disagreement]:
+def disagreements(results: Sequence[Result]) -> list[Disagreement]:
     """Every controller on every floor, in the first physics of the results and in each other one."""
-    runs: dict[tuple[str, str, str, str, float], dict[str, dict[int, TransferResult]]] = {}
+    runs: dict[tuple[Any, ...], dict[str, dict[int, Result]]] = {}
     for result in results:
-        key = (result.task, result.made_for, result.controller, result.robot, result.friction)
+        told = (result.told[name] for name in ("made_for", "robot", "friction"))
+        key = (result.task, result.controller, *told)
         runs.setdefault(key, {}).setdefault(result.physics, {})[result.episode] = result
     found = []
     for key, by_physics in runs.items():

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -153,12 +153,9 @@ class Group:
     own_optima: bool = False
     """Whether regret is over the optimum of each episode's own robot."""
     told: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of the results beside those of `Result`."""
+    """What the results are told by."""
     counts_for: str = ""
     """What its progress counts for; default, the task."""
-
-
-ResultKind = TypeVar("ResultKind", bound=Result)
 
 
 def run_groups(
@@ -166,10 +163,9 @@ def run_groups(
     episodes: int,
     out: Path,
     workers: int | Workers,
-    kind: type[ResultKind] = Result,
     seed: int = 0,
     record: bool = False,
-) -> list[ResultKind]:
+) -> list[Result]:
     """Runs groups in parallel processes, with progress bars. What an interrupted run finished is not run again.
 
     Args:
@@ -177,7 +173,6 @@ def run_groups(
         episodes: of each group, from the first.
         out: folder of the results.
         workers: a number of processes, or `Workers`.
-        kind: of the results.
         seed: of whatever is drawn: episode i draws the same in every group.
         record: whether to write what the controllers do, for `ballbot submit`.
     """
@@ -193,7 +188,7 @@ def run_groups(
         entries = [entry for _ in parts for entry in next(done)]
         if record:
             _write_recording(group, [recordings.from_text(entry.pop("motion")) for entry in entries], out)
-        results += [kind(**entry, **group.told) for entry in entries]
+        results += [Result(**entry | {"told": group.told}) for entry in entries]
     return results
 
 
@@ -211,7 +206,7 @@ def benchmark(
     Nothing is recorded of a robot with wheels, because `ballbot submit` knows none.
     """
     groups = [Group(task, name, physics, robot) for task, names in controllers.items() for name in names]
-    return run_groups(groups, episodes, out, workers, seed=seed, record=named_robot(robot).wheels is None)
+    return run_groups(groups, episodes, out, workers, seed, record=named_robot(robot).wheels is None)
 
 
 def _write_recording(group: Group, motions: Sequence[recordings.Motion], out: Path) -> None:

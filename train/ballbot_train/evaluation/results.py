@@ -3,9 +3,9 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -35,6 +35,8 @@ class Result:
     """Mean of |F| over the episode, N."""
     note: str = ""
     """Why there is no trajectory: the message of the controller that found no plan."""
+    told: Mapping[str, Any] = field(default_factory=dict)
+    """What else tells the episode from others, such as a disturbance; columns of their own in files."""
 
     @property
     def regret(self) -> float:
@@ -68,6 +70,8 @@ class Row(Displayed):
     """Mean of |F|, N."""
     plan_ms_median: float
     step_us_median: float
+    told: Mapping[str, Any] = field(default_factory=dict)
+    """What else tells the row from others; columns of their own in files."""
 
     def facts(self) -> dict[str, str]:
         return {
@@ -123,30 +127,29 @@ def summarize(results: Sequence[Result], seed: int = 0) -> Row:
     )
 
 
-RowKind = TypeVar("RowKind", bound=Row)
+def columns(entry: Any) -> dict[str, Any]:
+    """The fields of a dataclass instance by name, with what a result or a row is told by beside them."""
+    named = asdict(entry)
+    told = named.pop("told", {})
+    return named | told
 
 
-def rows_of(results: Sequence[Result], kind: type[RowKind], *keys: str, seed: int = 0) -> list[RowKind]:
-    """One row for each task, controller and values of other fields, in the order of the results.
+def leaderboard(results: Sequence[Result], *keys: str, seed: int = 0) -> list[Row]:
+    """One row for each task, controller and values of other columns, in the order of the results.
 
     Args:
         results: episodes.
-        kind: of the rows, which have the same fields.
-        keys: names of those fields.
+        keys: names of those columns, by which the rows are told apart too.
         seed: of the bootstrap.
     """
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in results:
-        groups.setdefault(tuple(getattr(result, key) for key in ("task", "controller", *keys)), []).append(result)
+        named = columns(result)
+        groups.setdefault(tuple(named[key] for key in ("task", "controller", *keys)), []).append(result)
     return [
-        kind(**asdict(summarize(group, seed)), **dict(zip(keys, values, strict=True)))
+        replace(summarize(group, seed), told=dict(zip(keys, values, strict=True)))
         for (_, _, *values), group in groups.items()
     ]
-
-
-def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
-    """One row per task and controller, in the order of the results; seed is of the bootstrap."""
-    return rows_of(results, Row, seed=seed)
 
 
 def write_results(
@@ -155,7 +158,7 @@ def write_results(
     results: Sequence[Result],
     facts: Mapping[str, Any],
     out: Path,
-    columns: Mapping[str, str] = {},
+    renamed: Mapping[str, str] = {},
     **more: Any,
 ) -> None:
     """Writes NAME.csv with the rows, episodes.csv, and NAME.json, which holds the facts as "about", the rows, and more.
@@ -163,7 +166,7 @@ def write_results(
     Some columns of the CSV files may have other names than the fields.
     """
     for table, entries in ((name, rows), ("episodes", results)):
-        named = [{columns.get(key, key): value for key, value in asdict(entry).items()} for entry in entries]
+        named = [{renamed.get(key, key): value for key, value in columns(entry).items()} for entry in entries]
         files.write_csv(out / f"{table}.csv", named)
     files.write(out / f"{name}.json", to_json({"about": facts, **more, "rows": rows}))
 
@@ -205,12 +208,12 @@ def _checked(result: Result) -> Result:
 
 def _from_json(entry: Mapping[str, Any]) -> Result:
     values: dict[str, Any] = {key: math.nan if value is None else value for key, value in entry.items()}
-    for field in fields(Result):
-        value, kind = values.get(field.name, field.default), cast(Any, field.type)
+    for each in fields(Result)[:-1]:  # all but what results of a leaderboard are not told by
+        value, kind = values.get(each.name, each.default), cast(Any, each.type)
         fits = isinstance(value, (int, float) if kind is float else kind)
         if not fits or (isinstance(value, bool) and kind is not bool):
-            raise TypeError(f"{field.name} of an episode is {value!r:.200}")
-        values[field.name] = kind(value)  # a whole number that no float holds is an OverflowError
+            raise TypeError(f"{each.name} of an episode is {value!r:.200}")
+        values[each.name] = kind(value)  # a whole number that no float holds is an OverflowError
     return Result(**values)
 
 
@@ -218,7 +221,7 @@ def to_json(document: Mapping[str, Any]) -> str:
     """A document as JSON; its lists of dataclass instances become lists of objects, one a line, with null for NaN."""
 
     def line(entry: Any) -> str:
-        return json.dumps({key: _or_null(value) for key, value in asdict(entry).items()}, ensure_ascii=False)
+        return json.dumps({key: _or_null(value) for key, value in columns(entry).items()}, ensure_ascii=False)
 
     def text(value: Any) -> str:
         if isinstance(value, list | tuple) and value and hasattr(value[0], "__dataclass_fields__"):

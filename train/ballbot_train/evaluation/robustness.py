@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation.benchmark import Group
-from ballbot_train.evaluation.results import Result, Row
+from ballbot_train.evaluation.results import Row
 from ballbot_train.policy_files import track_in
 
 
@@ -74,22 +74,6 @@ NONE = "none"
 
 
 @dataclass(frozen=True)
-class StressResult(Result):
-    """An episode under a disturbance."""
-
-    stress: str = NONE
-    level: float = 0.0
-
-
-@dataclass(frozen=True)
-class StressRow(Row):
-    """A leaderboard row under a disturbance."""
-
-    stress: str = NONE
-    level: float = 0.0
-
-
-@dataclass(frozen=True)
 class Condition:
     """What controllers meet: a stress of some severity, or a track, whose level is 0."""
 
@@ -122,7 +106,7 @@ def conditions(stresses: Sequence[str]) -> list[Condition]:
 def groups_of(
     controllers: Mapping[str, Sequence[str]], wanted: Sequence[Condition], physics: str, robot: str = PAPER
 ) -> list[Group]:
-    """Controllers by task under conditions, for `run_groups`, whose results are StressResults."""
+    """Controllers by task under conditions, for `run_groups`, whose results are told by "stress" and "level"."""
     return [
         Group(
             task,
@@ -140,7 +124,8 @@ def groups_of(
     ]
 
 
-def curve_of(rows: Sequence[StressRow], task: str, controller: str, stress: str) -> list[StressRow]:
+def curve_of(rows: Sequence[Row], task: str, controller: str, stress: str) -> list[Row]:
     """The rows of one curve, by severity, the undisturbed among them."""
-    chosen = [row for row in rows if (row.task, row.controller) == (task, controller) and row.stress in (stress, NONE)]
-    return sorted(chosen, key=lambda row: row.level)
+    chosen = [row for row in rows if (row.task, row.controller) == (task, controller)]
+    chosen = [row for row in chosen if row.told["stress"] in (stress, NONE)]
+    return sorted(chosen, key=lambda row: row.told["level"])

@@ -11,7 +11,7 @@ What delay costs is told beside them, because no controller could avoid it: J le
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,24 +19,8 @@ from ballbot_gym.env import make_task
 from ballbot_gym.randomization import TRACKS, checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.results import Row, shown, summarize
-from ballbot_train.evaluation.robustness import Condition, StressResult
-
-
-@dataclass(frozen=True)
-class TrackRow(Row):
-    """A leaderboard row on a track. Shares are of the mean, in units of the episode's optimum; NaN without an episode."""
-
-    track: str = ""
-    delay_costs: float = math.nan
-    """What delay adds to the optimum."""
-    not_knowing_costs: float = math.nan
-    """The best controller's regret in the episodes in which neither fails."""
-    controller_loses: float = math.nan
-    """The regret beyond that in the same episodes."""
-    best: str = ""
-    """The best controller: of those that succeed most often, the one of least mean regret."""
-
+from ballbot_train.evaluation.results import Result, Row, shown, summarize
+from ballbot_train.evaluation.robustness import Condition
 
 EXPERTS = {
     "unknown": ("cautious", "nmpc-adaptive"),
@@ -66,11 +50,17 @@ def with_experts(
     return chosen, [replace(condition, left_out=others[condition.name]) for condition in wanted]
 
 
-def rows_of(results: Sequence[StressResult], robot: str = PAPER, seed: int = 0) -> list[TrackRow]:
-    """One row per track, task and controller; seed is of the bootstrap."""
-    groups: dict[tuple[str, str], dict[str, list[StressResult]]] = {}
+def rows_of(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> list[Row]:
+    """One row per track, task and controller; seed is of the bootstrap.
+
+    A row is told by its "track" and by shares of the mean, in units of the episode's optimum, NaN without an episode:
+    "delay_costs", what delay adds to the optimum; "not_knowing_costs", the regret of the "best" controller in the episodes in
+    which neither fails; "controller_loses", the regret beyond that in the same episodes. The best controller is, of those
+    that succeed most often, the one of least mean regret.
+    """
+    groups: dict[tuple[str, str], dict[str, list[Result]]] = {}
     for result in results:
-        groups.setdefault((result.stress, result.task), {}).setdefault(result.controller, []).append(result)
+        groups.setdefault((result.told["stress"], result.task), {}).setdefault(result.controller, []).append(result)
     rows = []
     for (track, task), group in groups.items():
         plain = {name: summarize(done, seed) for name, done in group.items()}
@@ -82,11 +72,9 @@ def rows_of(results: Sequence[StressResult], robot: str = PAPER, seed: int = 0) 
         for name, done in group.items():
             pairs = np.array([(of_best[result.episode], result.regret) for result in done])
             pairs = pairs[np.isfinite(pairs).all(axis=1)]
-            row = TrackRow(**asdict(plain[name]), track=track, delay_costs=delay, best=best)
-            if len(pairs):
-                unknown, loses = float(pairs[:, 0].mean()), float((pairs[:, 1] - pairs[:, 0]).mean())
-                row = replace(row, not_knowing_costs=unknown, controller_loses=loses)
-            rows.append(row)
+            unknown, own = pairs.mean(axis=0).tolist() if len(pairs) else (math.nan, math.nan)
+            costs = {"delay_costs": delay, "not_knowing_costs": unknown, "controller_loses": own - unknown}
+            rows.append(replace(plain[name], told={"track": track, **costs, "best": best}))
     return rows
 
 
@@ -98,21 +86,21 @@ def _percent(*values: float) -> str:
     return " to ".join(shown(100 * value, ".2f") for value in values)
 
 
-_COLUMNS: dict[str, Callable[[TrackRow], str]] = {
-    "track": lambda row: row.track,
+_COLUMNS: dict[str, Callable[[Row], str]] = {
+    "track": lambda row: row.told["track"],
     "task": lambda row: row.task,
     "controller": lambda row: row.controller,
     "success, %": lambda row: f"{100 * row.success:.4g}",
     "failures": lambda row: f"{row.falls} of {row.episodes}",
     "mean regret, %": lambda row: _percent(row.regret_mean),
     "95 % interval": lambda row: _percent(row.regret_low, row.regret_high),
-    "delay costs, %": lambda row: _percent(row.delay_costs),
-    "not knowing costs, %": lambda row: _percent(row.not_knowing_costs),
-    "controller loses, %": lambda row: _percent(row.controller_loses),
+    "delay costs, %": lambda row: _percent(row.told["delay_costs"]),
+    "not knowing costs, %": lambda row: _percent(row.told["not_knowing_costs"]),
+    "controller loses, %": lambda row: _percent(row.told["controller_loses"]),
 }
 HEADER = list(_COLUMNS)
 
 
-def cells(row: TrackRow) -> list[str]:
+def cells(row: Row) -> list[str]:
     """A line of the table."""
     return [text(row) for text in _COLUMNS.values()]

@@ -5,34 +5,13 @@ cost is compared with that robot's optimum on its own floor, on other floors too
 robot's contact, and its friction may differ from what the controller was made for.
 """
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import named_robot
 from ballbot_train.evaluation import benchmark
-from ballbot_train.evaluation.results import Result, Row, shown
-
-
-@dataclass(frozen=True)
-class TransferResult(Result):
-    """An episode of a controller on a robot that it may not have been made for."""
-
-    made_for: str = ""
-    robot: str = ""
-    friction: float = math.nan
-
-
-@dataclass(frozen=True)
-class TransferRow(Row):
-    """A row of the matrix."""
-
-    made_for: str = ""
-    robot: str = ""
-    friction: float = math.nan
-    """Of the floor that it ran on; infinite for the paper's."""
-    physics: str = ""
+from ballbot_train.evaluation.results import Row, shown
 
 
 def floor(robot: str, friction: float | None) -> BallbotParams:
@@ -78,7 +57,7 @@ def groups_of(
     frictions: Sequence[float | None],
     physics: Sequence[str],
 ) -> list[benchmark.Group]:
-    """What to run, for `run_groups`, whose results are TransferResults.
+    """What to run, for `run_groups`, whose results are told by "made_for", "robot" and "friction".
 
     Args:
         controllers: names by task, by the robot that they were made for.
@@ -113,15 +92,15 @@ COLUMNS = {
 HEADER = ["task", "made for", "controller", "runs on", "friction", "physics", "success", "falls", REGRET, "peak tilt"]
 
 
-def cells(row: TransferRow) -> list[str]:
-    """A row as text, under `HEADER`; what does not exist is a dash."""
+def cells(row: Row) -> list[str]:
+    """A row that is told by the same and "physics" as text, under `HEADER`; what does not exist is a dash."""
     return [
         row.task,
-        row.made_for,
+        row.told["made_for"],
         row.controller,
-        row.robot,
-        shown(row.friction, "g"),
-        row.physics,
+        row.told["robot"],
+        shown(row.told["friction"], "g"),
+        row.told["physics"],
         f"{100 * row.success:.1f} %",
         f"{row.falls}/{row.episodes}",
         shown(row.regret_mean, ".2%"),

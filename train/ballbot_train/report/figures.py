@@ -20,8 +20,8 @@ from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.basins import AXES, BasinMap
-from ballbot_train.evaluation.results import Result
-from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, StressRow, curve_of
+from ballbot_train.evaluation.results import Result, Row
+from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
 from ballbot_train.report.labels import COLORS as COLORS
 from ballbot_train.report.labels import LABELS, color, label
 
@@ -113,12 +113,12 @@ def regret_figure(results: Sequence[Result]) -> Figure:
     return figure
 
 
-def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
+def robustness_figure(rows: Sequence[Row], task: str) -> Figure:
     """Success and regret of every controller on a task against the severity of every disturbance.
 
     Regret, with its 95 % interval, is drawn where at least half of the episodes did not fail.
     """
-    stresses = list(dict.fromkeys(row.stress for row in rows if row.stress != NONE))
+    stresses = list(dict.fromkeys(row.told["stress"] for row in rows if row.told["stress"] != NONE))
     controllers = list(dict.fromkeys(row.controller for row in rows if row.task == task))
     figure = Figure(figsize=(2.9 * len(stresses), 5.6), layout="constrained")
     axes = figure.subplots(2, len(stresses), squeeze=False, sharey="row", sharex="col")
@@ -127,11 +127,11 @@ def robustness_figure(rows: Sequence[StressRow], task: str) -> Figure:
         above, below = axes[:, i]
         for k, controller in enumerate(controllers):
             points = curve_of(rows, task, controller, stress)
-            levels, shade, width = [row.level for row in points], color(controller, k), max(1.5, 3.5 - k)
+            levels, shade, width = [row.told["level"] for row in points], color(controller, k), max(1.5, 3.5 - k)
             success = [100 * row.success for row in points]
             above.plot(levels, success, "o-", ms=4, lw=width, color=shade, label=label(controller))
             standing = [row for row in points if 2 * row.falls <= row.episodes and math.isfinite(row.regret_mean)]
-            levels = [row.level for row in standing]
+            levels = [row.told["level"] for row in standing]
             below.plot(levels, [100 * row.regret_mean for row in standing], "o-", ms=4, lw=width, color=shade)
             low, high = ([100 * getattr(row, f"regret_{end}") for row in standing] for end in ("low", "high"))
             below.fill_between(levels, low, high, color=shade, alpha=0.15, lw=0)
