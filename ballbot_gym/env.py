@@ -35,6 +35,7 @@ from ballbot_gym.viewer import PageScene
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
+_LARGEST_OBSERVATION = 1e6  # far beyond what any episode shows
 
 
 class EnvState(NamedTuple):
@@ -551,11 +552,9 @@ GRIP = "grip"
 
 def observation_space(task: Task, params: BallbotParams, history: int = 0) -> spaces.Box:
     """What a robot can observe in a task, with so many earlier observations and actions."""
-    own = task.observation_bounds(params)
-    if params.wheels is not None:  # as `Task.seen` adds
-        own = (*own, 1.0, 1.0, 1e6, 1e6)
-    bounds = np.array((*own, *(history * (*own, *(1.0,) * params.action_size))), np.float32)
-    return spaces.Box(-bounds, bounds, dtype=np.float32)
+    own = task.observation_size(params)
+    size = own + history * (own + params.action_size)
+    return spaces.Box(-_LARGEST_OBSERVATION, _LARGEST_OBSERVATION, (size,), np.float32)
 
 
 def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:

@@ -57,8 +57,6 @@ class Played(NamedTuple):
     failures: np.ndarray
     violated: np.ndarray
     """(B,) index of the limit that ended the episode, or −1."""
-    observed: np.ndarray
-    """(B,) greatest observation, as a share of its bound."""
     rewards: np.ndarray
     """(2, B) least and greatest reward of a step."""
 
@@ -70,7 +68,6 @@ def play(task):
     chosen, rng = policies(task, params), np.random.default_rng(0)
     batch = BallbotBatch(task, ENVS * len(chosen), dtype=torch.float64, compile=False)
     parts = [slice(i * ENVS, (i + 1) * ENVS) for i in range(len(chosen))]
-    bounds = torch.tensor(task.observation_bounds(params))
     observation = batch.reset(seed=0)
     running, steps = torch.ones(batch.num_envs, dtype=torch.bool), []
     with torch.no_grad():
@@ -83,13 +80,12 @@ def play(task):
             result = batch.step(torch.cat(actions))
             rate = task.cost(before.x.unbind(0), result.force.unbind(0), before.c.unbind(0))
             gain = (task.survival_reward - rate) * task.control_dt
-            observed = (result.final_observation.abs() / bounds).amax(1)
-            figures = torch.stack([gain, result.reward, result.cost, result.failure, result.violated, observed])
+            figures = torch.stack([gain, result.reward, result.cost, result.failure, result.violated])
             steps.append(torch.where(running, figures, math.nan))
             running = running & ~(result.terminated | result.truncated)
             observation = result.observation
     assert not running.any()
-    gains, rewards, costs, failures, violated, observed = torch.stack(steps, 1).numpy()
+    gains, rewards, costs, failures, violated = torch.stack(steps, 1).numpy()
     return {
         name: Played(
             gains[:, part],
@@ -97,7 +93,6 @@ def play(task):
             np.nansum(costs[:, part], axis=0),
             np.nanmax(failures[:, part], axis=0) > 0,
             np.nanmax(violated[:, part], axis=0),
-            np.nanmax(observed[:, part], axis=0),
             np.stack([np.nanmin(rewards[:, part], axis=0), np.nanmax(rewards[:, part], axis=0)]),
         )
         for name, part in zip(chosen, parts, strict=True)
@@ -147,11 +142,6 @@ def test_standing_scores_far_better_than_falling(task):
     played = play(task)
     assert played["random"].failures.all()
     assert played["upright"].returns.mean() > played["random"].returns.mean() + 200
-
-
-def test_policies_that_play_anything_stay_in_the_spaces(task):
-    for name, played in play(task).items():
-        assert played.observed.max() <= 1, name
 
 
 def test_driving_away_ends_at_the_arena(task):

@@ -121,19 +121,18 @@ WRAPPERS = {
     "NormalizeObservation": (NormalizeObservation, "trained on observations (8,) float32 from -inf to inf"),
     "stacked": (stacked, "24"),
     "discrete": (lambda env: DiscretizeAction(env, 5), "2"),
-    "another robot": (lambda env: make("rolling", 8.0), "from -5441.96 to 5441.96"),
 }
 
 
-def make(robot, duration):
-    return gymnasium.make("BallbotStabilize-v0", physics="rk4", robot=robot, duration=duration)
+def make():
+    return gymnasium.make("BallbotStabilize-v0", physics="rk4")
 
 
 @pytest.mark.filterwarnings("ignore")  # Gymnasium's of dtypes
 @pytest.mark.parametrize("name", WRAPPERS)
 def test_a_model_of_other_spaces_is_not_scored_without_what_made_them(name, tmp_path):
     wrap, said = WRAPPERS[name]
-    venv = DummyVecEnv([lambda: wrap(make("paper", 8.0))])
+    venv = DummyVecEnv([lambda: wrap(make())])
     model = PPO("MlpPolicy", venv, policy_kwargs={"net_arch": [4]}, device="cpu")
     model.save(tmp_path / "model.zip")
     for evaluated in (evaluate, evaluate_fresh):
@@ -146,10 +145,10 @@ def test_a_model_of_other_spaces_is_not_scored_without_what_made_them(name, tmp_
 
 
 def test_a_function_that_does_what_the_wrapper_did_is_scored_as_the_model_in_it():
-    venv = DummyVecEnv([lambda: RescaleAction(make("paper", 8.0), np.float32(-350), np.float32(350))])
+    venv = DummyVecEnv([lambda: RescaleAction(make(), np.float32(-350), np.float32(350))])
     model = louder(PPO("MlpPolicy", venv, policy_kwargs={"net_arch": [4]}, device="cpu"))
     cost = evaluate(lambda observation: model.predict(observation, deterministic=True)[0] / 350, "stabilize", 1, "rk4")
-    env = RescaleAction(make("paper", 8.0), np.float32(-350), np.float32(350))
+    env = RescaleAction(make(), np.float32(-350), np.float32(350))
     observation, _ = env.reset(options=certified.load("stabilize", "paper").options(0))
     expected, done = 0.0, False
     while not done:

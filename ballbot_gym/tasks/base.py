@@ -92,9 +92,6 @@ class Task(ABC):
     clock: ClassVar[bool] = False
     """Whether cost, goal, margins, arena and observation depend on the episode's time."""
 
-    LARGEST_CONSTANT: ClassVar[float] = 100.0
-    """Bounds of observations hold while no constant of the episode exceeds this, m or m/s."""
-
     def __post_init__(self) -> None:
         for each in fields(self):
             if not isinstance(each.default, float):
@@ -275,42 +272,6 @@ class Task(ABC):
         """The name of the first limit that one state violates, or "". A state that is not finite violates one."""
         names = zip(self.limit_names, self.limits(x, c), strict=True)
         return next((name for name, limit in names if not limit >= 0), "")
-
-    def state_bounds(self, params: BallbotParams) -> tuple[float, float, float, float]:
-        """Bounds of what an episode can show: distance from the arena's centre, |γ| and |θ|, speed, lean rate; SI units.
-
-        They follow from energy. Let F be the largest force, µ = m_total − h²/J the least mass that the ball can feel, with
-        h = ml and J the body's inertia about the ball. The kinetic energy T is at least ½µ|v|² and gains F|v| per second at
-        most, so √(2T/µ) grows by F/µ per second at most. It is also at least ½κ(γ̇² + θ̇²) with κ = min(J − h²/m_total,
-        axial inertia). The start may bring 100 m/s. The step that leaves the arena or the tilt limit goes on for one
-        control step. Everything is doubled, for randomized robots, for sensor noise and for the integrator's error. The
-        torque that drives a rolling ball adds F r |ω| to the power, and |ω| is at most √(µ/κ) times √(2T/µ). Wheels pull
-        with three forces, and turn the ball too.
-        """
-        h, inertia = params.first_moment, params.pivot_inertia
-        felt = params.moving_mass - h * h / inertia
-        least_inertia = min(inertia - h * h / params.moving_mass, params.axial_inertia)
-        force = (math.sqrt(2) if params.wheels is None else 3) * params.force_limit
-        if params.wheels is not None:
-            least_inertia = min(least_inertia, params.ball_inertia)
-        if params.rolls:
-            force *= 1 + params.ball_radius * math.sqrt(felt / least_inertia)
-        speed = 2 * (100.0 + force * self.duration / felt)
-        rate = speed * math.sqrt(felt / least_inertia)
-        *_, radius = self.arena(self._always((self.LARGEST_CONSTANT,) * len(self.constant_names)))
-        radius = float(np.max(radius))
-        return radius + speed * self.control_dt, self.max_tilt + rate * self.control_dt, speed, rate
-
-    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
-        """(no) bounds of the absolute values of the observation, scaled as it is; they hold as `state_bounds` do.
-
-        A task that knows what it observes overrides these wide ones.
-        """
-        return (1e6,) * len(self.observation_scale)
-
-    def _always(self, c: tuple[float, ...]) -> tuple[Any, ...]:
-        """Constants at all times of an episode."""
-        return self.at(c, self.control_dt * np.arange(self.steps + 1))
 
     def observation_signs(self, mirror: Mirror) -> tuple[int, ...]:
         """The sign that each observed quantity takes in the mirror, found by observing a state and its mirror image."""

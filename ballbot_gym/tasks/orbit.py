@@ -157,33 +157,6 @@ class Orbit(Task):
         radius, _ = ops.components(c)
         return 0.0, 0.0, self.arena_factor * radius
 
-    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
-        distance, lean, speed, rate = self.state_bounds(params)
-        constant = self.LARGEST_CONSTANT
-        bounds = (
-            distance,
-            distance,
-            lean,
-            lean,
-            speed,
-            speed,
-            rate,
-            rate,
-            *self._error_bounds(params),
-            constant,
-            constant,
-        )
-        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
-
-    def _error_bounds(self, params: BallbotParams) -> tuple[float, float, float]:
-        """Of the radius error, m, and of both velocity errors, m/s, for every radius that `check_constants` allows."""
-        _, _, speed, _ = self.state_bounds(params)
-        travel = speed * self.control_dt
-        smallest, largest = params.pivot_inertia / params.first_moment, self.LARGEST_CONSTANT
-        radius_error = max((self.arena_factor * r + travel) ** 2 / (2 * r) + r / 2 for r in (smallest, largest))
-        velocity_error = speed + self.LARGEST_CONSTANT * (self.arena_factor + travel / smallest)
-        return radius_error, velocity_error, velocity_error
-
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         radius_error, vx_error, vy_error = self._errors(x, c)
         _, speed = ops.components(c)

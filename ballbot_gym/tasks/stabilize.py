@@ -114,10 +114,6 @@ class Stabilize(Task):
     def arena(self, c: Vector) -> tuple[Any, Any, Any]:
         return 0.0, 0.0, self.arena_radius
 
-    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
-        bounds = (part for part in self.state_bounds(params) for _ in range(2))
-        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
-
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         return at_rest(x)
 

@@ -131,12 +131,6 @@ class Turn(Task):
     def arena(self, c: Vector) -> tuple[Any, Any, Any]:
         return float(_GATE[0]), float(_GATE[1]), self.arena_radius
 
-    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
-        distance, lean, speed, rate = self.state_bounds(params)
-        off = speed + self.LARGEST_CONSTANT
-        bounds = (distance, distance, lean, lean, off, off, rate, rate, self.LARGEST_CONSTANT)
-        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
-
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         px, py, _, _, vx, vy, gamma_dot, theta_dot = ops.components(x)[:8]
         (speed,) = ops.components(c)

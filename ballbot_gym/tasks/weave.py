@@ -194,16 +194,6 @@ class Weave(Task):
         x_goal, y_goal, *_ = ops.components(c)
         return x_goal, y_goal, self.arena_radius
 
-    def observation_bounds(self, params: BallbotParams) -> tuple[float, ...]:
-        distance, lean, speed, rate = self.state_bounds(params)
-        constant = self.LARGEST_CONSTANT
-        to_obstacle = (
-            distance + 2 * constant
-        )  # over the goal, which is within `constant` of the origin, as the obstacle is
-        obstacles = (to_obstacle, to_obstacle, constant) * MAX_OBSTACLES
-        bounds = (distance, distance, lean, lean, speed, speed, rate, rate, *obstacles)
-        return tuple(bound / scale for bound, scale in zip(bounds, self.observation_scale, strict=True))
-
     def goal(self, x: Vector, c: Vector) -> tuple[Any, ...]:
         x_goal, y_goal, *_ = ops.components(c)
         return at_rest(x, x_goal, y_goal)

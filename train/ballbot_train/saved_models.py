@@ -87,8 +87,7 @@ def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> No
             raise PolicyError(
                 f"{name} was trained on {kind}s {_in_words(found)}, and those of {task.id} are {_in_words(wanted)}. Where a "
                 "wrapper changed them, give ballbot_train.evaluate a function that does what the wrapper did, for "
-                "RescaleAction to ±350: lambda observation: model.predict(observation, deterministic=True)[0] / 350. Give a "
-                "function too, or train anew, where the training had another robot, duration or arena"
+                "RescaleAction to ±350: lambda observation: model.predict(observation, deterministic=True)[0] / 350"
             )
 
 

@@ -64,8 +64,7 @@ def disagreements(results: Sequence[Result]) -> list[Disagreement]:
     """Every controller on every floor, in the first physics of the results and in each other one."""
     runs: dict[tuple[Any, ...], dict[str, dict[int, Result]]] = {}
     for result in results:
-        told = (result.told[name] for name in ("made_for", "robot", "friction"))
-        key = (result.task, result.controller, *told)
+        key = result.task, result.controller, *result.told.values()
         runs.setdefault(key, {}).setdefault(result.physics, {})[result.episode] = result
     found = []
     for key, by_physics in runs.items():
@@ -75,7 +74,8 @@ def disagreements(results: Sequence[Result]) -> list[Disagreement]:
             differ = tuple(a.episode for a, b in pairs if (a.success, a.failure) != (b.success, b.failure))
             apart = [b.regret - a.regret for a, b in pairs if not (a.failure or b.failure)]
             mean = float(np.mean(apart)) if apart else math.nan
-            found.append(Disagreement(*key, first, second, differ, len(pairs), len(apart), mean))
+            measured: tuple[Any, ...] = first, second, differ, len(pairs), len(apart), mean
+            found.append(Disagreement(*key, *measured))
     return found
 
 

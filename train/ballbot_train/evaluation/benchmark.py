@@ -3,7 +3,7 @@
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from ballbot_train.console import check_least, check_names, check_some, markdown
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import iterate_episodes
-from ballbot_train.evaluation.results import Result
+from ballbot_train.evaluation.results import Result, columns
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import paths_of
 from ballbot_train.provenance import provenance
@@ -188,7 +188,7 @@ def run_groups(
         entries = [entry for _ in parts for entry in next(done)]
         if record:
             _write_recording(group, [recordings.from_text(entry.pop("motion")) for entry in entries], out)
-        results += [Result(**entry | {"told": group.told}) for entry in entries]
+        results += [Result(**entry, told=group.told) for entry in entries]
     return results
 
 
@@ -252,5 +252,5 @@ def _episode_entries(
     motions: list[recordings.Motion] = []
     keep = motions.append if record else None
     for result in iterate_episodes(env, made, group.controller, group.task, episodes, seed, known, keep):
-        yield asdict(result) | ({"motion": recordings.to_text(motions.pop())} if record else {})
+        yield columns(result) | ({"motion": recordings.to_text(motions.pop())} if record else {})
     env.close()
