@@ -131,6 +131,9 @@ class BallbotParams:
             # batches of robots hold tensors, whose values are not looked at
             if is_number(value) and not is_positive(value):
                 raise ValueError(f"BallbotParams: {field.name} must be positive and finite, not {value}")
+        if is_number(self.inertia) and is_number(self.axial_inertia) and self.axial_inertia > 2 * self.inertia:
+            # Bullet would take 0 for both, without a word
+            raise ValueError(f"BallbotParams: axial_inertia must be at most twice inertia, not {self.axial_inertia}")
 
     def __repr__(self) -> str:
         """All fields, but wheels only where there are some: records of robots without name them by this."""

@@ -40,10 +40,10 @@ def test_episodes_that_end_otherwise_are_named_and_regret_is_of_those_that_end_w
 def test_the_same_forces_lead_farther_apart_the_longer_they_last():
     for other in OTHERS:
         found = drifts("stabilize", "paper", "lqr", ["rk4", other], 2)
-        assert [drift.seconds for drift in found] == [0.1, 0.25, 0.5, 1.0, 2.0]
-        assert found[0].median < found[-1].median
+        assert [drift["seconds"] for drift in found] == [0.1, 0.25, 0.5, 1.0, 2.0]
+        assert found[0]["median"] < found[-1]["median"]
         # derived from the engines' orders: Bullet's error after half a second is millimetres, MuJoCo's nanometres
-        assert found[2].worst < {"bullet": 0.05, "mujoco": 1e-5}[other]
+        assert found[2]["worst"] < {"bullet": 0.05, "mujoco": 1e-5}[other]
 
 
 @pytest.mark.skipif(not OTHERS, reason="the closed form is the only physics here")

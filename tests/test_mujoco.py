@@ -1,7 +1,5 @@
 """What MuJoCo's simulators do beyond what holds for every physics."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -88,8 +86,3 @@ def test_a_ball_that_is_thrown_up_flies_and_comes_down_with_its_energy_but_what_
     assert max(heights) > 0.5
     assert {n for n, h in zip(normals, heights, strict=True) if h > 0.01} == {0.0}
     assert min(heights) > -1e-3  # it lands on the floor
-
-
-def test_a_robot_that_no_body_can_be_is_refused():
-    with pytest.raises(RuntimeError, match="MuJoCo refuses this robot"):
-        make_simulator("mujoco", replace(named_robot("paper"), axial_inertia=3.0), 0.02)

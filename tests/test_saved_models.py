@@ -56,9 +56,7 @@ def louder(model):
 MODELS = {
     "ppo": lambda: PPO("MlpPolicy", envs(), device="cpu"),
     "relu": lambda: PPO("MlpPolicy", envs(), policy_kwargs={"net_arch": [7, 5], "activation_fn": torch.nn.ReLU}),
-    "gsde": lambda: PPO("MlpPolicy", envs(), use_sde=True, policy_kwargs={"squash_output": True}, device="cpu"),
     "sac": lambda: SAC("MlpPolicy", envs(), buffer_size=10, device="cpu"),
-    "sac_gsde": lambda: SAC("MlpPolicy", envs(), buffer_size=10, use_sde=True, policy_kwargs={"clip_mean": 1.0}),
     "td3": lambda: TD3("MlpPolicy", envs(), buffer_size=10, policy_kwargs={"net_arch": [6]}, device="cpu"),
 }
 
@@ -225,6 +223,7 @@ def with_weights(**changes):
         (with_data(policy_kwargs={"activation_fn": "a" * 500_000}), "has the activation a{100}; known: elu"),
         (lambda members: members.pop("data"), "it holds no data"),
         (lambda members: members.update(data=b"{}"), "is no saved model that can be read"),
+        (with_data(use_sde=True), "explores by its state"),
         (with_data(policy_class={"__module__": "mine"}), "has a policy of mine, which is not read; give a model with"),
         (with_data(policy_kwargs={"features_extractor_class": "x"}), "extracts features"),
         (with_data(policy_kwargs={"activation_fn": "<class 'Mish'>"}), "has the activation <class 'Mish'>; known: elu"),

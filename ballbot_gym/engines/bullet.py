@@ -24,7 +24,7 @@ class BulletSimulator(Simulator):
 
         Raises:
             ImportError: PyBullet is missing or was built without NumPy.
-            RuntimeError: PyBullet has no client left, or holds another robot than that of params.
+            RuntimeError: PyBullet has no client left.
         """
         substeps = whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
         bullet = import_pybullet()

@@ -76,11 +76,7 @@ def connect(bullet: ModuleType, mode: int) -> int:
 
 
 def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[int, tuple[int, ...]]:
-    """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order.
-
-    Raises:
-        RuntimeError: Bullet holds another robot.
-    """
+    """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "ballbot.urdf"
         path.write_text(params.to_urdf(), encoding="utf-8")
@@ -88,7 +84,6 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
         robot = load_urdf(bullet, client, path, bullet.URDF_USE_INERTIA_FROM_FILE)
     bullet.setGravity(0, 0, -params.gravity, physicsClientId=client)
     index = joint_indices(bullet, client, robot)
-    _check_loaded(bullet, client, robot, index, params)
     joints = tuple(index[name] for name in _JOINTS)
     for joint in range(-1, len(index)):
         bullet.changeDynamics(
@@ -120,32 +115,6 @@ def load_urdf(bullet: ModuleType, client: int, path: Path, flags: int = 0) -> in
             return bullet.loadURDF(str(path), useFixedBase=True, flags=flags, physicsClientId=client)
         finally:
             locale.setlocale(locale.LC_NUMERIC, found)
-
-
-def _check_loaded(bullet: ModuleType, client: int, robot: int, index: dict[str, int], params: BallbotParams) -> None:
-    """Raises a RuntimeError if Bullet holds another robot than that of params."""
-    ball_mass, _, ball_inertias, *_ = bullet.getDynamicsInfo(robot, index["roll" if params.rolls else "y"], client)
-    body_mass, _, inertias, centre, *_ = bullet.getDynamicsInfo(robot, index["theta"], client)
-    held = {
-        "ball_mass": ball_mass,
-        "ball_radius": bullet.getJointInfo(robot, index["x"], client)[14][2],  # where the chain begins
-        "body_mass": body_mass,
-        "com_height": centre[2],
-        "inertia": inertias[0],
-        "axial_inertia": inertias[2],
-    }
-    if params.rolls:
-        held["ball_inertia"] = ball_inertias[0]
-    wrong = [
-        f"{name} {value:g} in place of {getattr(params, name):g}"
-        for name, value in held.items()
-        if not math.isclose(value, getattr(params, name), rel_tol=1e-9)
-    ]
-    if wrong:
-        raise RuntimeError(
-            f"PyBullet took another robot than the one given: {', '.join(wrong)}. It refuses inertias that no body can have, "
-            "as axial_inertia of more than twice inertia; and no other thread may set LC_NUMERIC while an environment is made"
-        )
 
 
 def joint_indices(bullet: ModuleType, client: int, robot: int) -> dict[str, int]:

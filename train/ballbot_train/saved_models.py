@@ -56,19 +56,17 @@ class Spaces(NamedTuple):
 class SavedActor(torch.nn.Module):
     """Normalizes observations, runs the network, and brings its output into [−1, 1]."""
 
-    def __init__(self, network: torch.nn.Module, output: Mapping[str, float], statistics: Mapping[str, Any] | None):
-        """Args: output: "limit", by which it is clipped, and "tanh", if it is squashed; statistics: as of `_read`."""
+    def __init__(self, network: torch.nn.Module, squashed: bool, statistics: Mapping[str, Any] | None):
+        """Args: squashed: whether the output is, by tanh; statistics: as of `_read`."""
         super().__init__()
-        self.network, self._output, self._statistics = network, output, statistics
+        self.network, self._squashed, self._statistics = network, squashed, statistics
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         if self._statistics is not None:
             mean, scale, limit = (self._statistics[name] for name in ("mean", "scale", "limit"))
             observation = ((observation.double() - mean) / scale).clamp(-limit, limit).float()
         action = self.network(observation)
-        if "limit" in self._output:
-            action = action.clamp(-self._output["limit"], self._output["limit"])
-        return torch.tanh(action) if "tanh" in self._output else action.clamp(-1.0, 1.0)
+        return torch.tanh(action) if self._squashed else action.clamp(-1.0, 1.0)
 
 
 def check_spaces(name: str, model: Any, task: Task, params: BallbotParams) -> None:
@@ -189,7 +187,7 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
             env's.
     """
-    layers, activation, output, normalization, trained = _read(path)
+    layers, activation, squashed, normalization, trained = _read(path)
     size = layers[0][0].shape[1]
     if size != len(task.observation_scale):
         raise PolicyError(f"{path} takes {size} observations, {task.id} has {len(task.observation_scale)}")
@@ -201,11 +199,11 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         linear = torch.nn.Linear(weight.shape[1], weight.shape[0], device="cpu", dtype=torch.float32)
         linear.load_state_dict({"weight": weight, "bias": bias})
         parts += [linear, getattr(torch.nn, _ACTIVATIONS[activation])()]
-    return SavedActor(torch.nn.Sequential(*parts[:-1]), output, normalization).eval()
+    return SavedActor(torch.nn.Sequential(*parts[:-1]), squashed, normalization).eval()
 
 
-def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces]:
-    """Layers (weight, bias), activation, what happens to the output, statistics of observations, or None, and the spaces."""
+def _read(path: str | Path) -> tuple[list[Any], str, bool, dict[str, Any] | None, Spaces]:
+    """Layers (weight, bias), activation, whether tanh squashes, statistics of observations, or None, and the spaces."""
     try:
         return _read_zip(Path(path))
     except PolicyError:
@@ -215,7 +213,7 @@ def _read(path: str | Path) -> tuple[list[Any], str, dict[str, float], dict[str,
         raise PolicyError(f"{path} is no saved model that can be read, or a damaged one: {reason}") from error
 
 
-def _read_zip(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, Any] | None, Spaces]:
+def _read_zip(path: Path) -> tuple[list[Any], str, bool, dict[str, Any] | None, Spaces]:
     members = files.unzipped(files.read(path), path)
     for name in ("data", "policy.pth"):
         if name not in members:
@@ -233,19 +231,14 @@ def _read_zip(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, A
         raise PolicyError(
             f"{path} extracts features ({(unknown or ['features_extractor_class'])[0]:.100}); {_SUPPORTED}"
         )
-    output: dict[str, float] = {}
+    if data.get("use_sde"):
+        raise PolicyError(f"{path} explores by its state (use_sde), which is not read; {_SUPPORTED}")
     if "action_net.weight" in weights:
         layers, usual = _layers(path, weights, "mlp_extractor.policy_net.", "action_net."), "tanh"
-        if options.get("squash_output"):
-            output["tanh"] = 1.0
     elif any(name.startswith("actor.latent_pi.") for name in weights):
-        deep = "actor.mu.0.weight" in weights  # with state-dependent exploration the mean is clipped
-        layers, usual = _layers(path, weights, "actor.latent_pi.", "actor.mu.0." if deep else "actor.mu."), "relu"
-        output["tanh"] = 1.0
-        if deep:
-            output["limit"] = float(files.numbers(options.get("clip_mean", 2.0), "clip_mean", ()))
+        layers, usual = _layers(path, weights, "actor.latent_pi.", "actor.mu."), "relu"
     elif "actor.mu.0.weight" in weights:
-        layers, usual, output["tanh"] = _layers(path, weights, "actor.mu."), "relu", 1.0
+        layers, usual = _layers(path, weights, "actor.mu."), "relu"
     else:
         raise PolicyError(f"{path} has no actor that is read, but {', '.join(list(weights)[:4]):.200}, …; {_SUPPORTED}")
     named = str(options.get("activation_fn", usual))
@@ -253,7 +246,7 @@ def _read_zip(path: Path) -> tuple[list[Any], str, dict[str, float], dict[str, A
     if activation not in _ACTIVATIONS:
         raise PolicyError(f"{path} has the activation {named:.100}; known: {', '.join(_ACTIVATIONS)}")
     found = Spaces(_space(data["observation_space"]), _space(data["action_space"]))
-    return layers, activation, output, _statistics(path, data), found
+    return layers, activation, usual == "relu", _statistics(path, data), found
 
 
 def _space(described: Mapping[str, Any]) -> spaces.Box | str:

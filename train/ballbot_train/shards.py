@@ -202,7 +202,6 @@ def make(
     shards.begin(about)
     kept = set(shards.numbers)
     parts: dict[int, dict[int, Arrays]] = {}  # by shard and first episode
-    where: dict[int, tuple[int, int]] = {}  # the shard and first episode of a job that is not done
 
     def ranges(shard: int) -> list[range]:
         last = min((shard + 1) * per_shard, episodes)
@@ -212,19 +211,17 @@ def make(
         return shard in kept and shards.episodes_of(shard) == sum(map(len, ranges(shard)))
 
     def work() -> Iterator[jobs.Job]:
-        number = 0
         for shard in range(-(-episodes // per_shard)):
             if is_kept(shard):
                 on_progress(sum(map(len, ranges(shard))))
                 continue
             for part in ranges(shard):
-                where[number] = shard, part.start
-                number += 1
                 item = part.start, part.stop
                 yield jobs.Job(_job_name(part.start), _made, (function, arguments, arrays_of), (item,))
 
-    for number, (entry,) in jobs.stream(work(), out, workers, lambda group, count: None):
-        shard, start = where.pop(number)
+    for _, (entry,) in jobs.stream(work(), out, workers, lambda group, count: None):
+        start = entry["start"]
+        shard = start // per_shard
         parts.setdefault(shard, {})[start] = files.arrays_of(base64.b64decode(entry[_ARRAYS]), "what a worker sent")
         wanted = ranges(shard)
         on_progress(next(len(part) for part in wanted if part.start == start))
@@ -249,7 +246,7 @@ def _made(
     """The arrays of some ranges of episodes, on a worker."""
     for start, stop in items:
         arrays = arrays_of(list(function(*arguments, range(start, stop))))
-        yield {_ARRAYS: base64.b64encode(files.npz(arrays, compressed=False)).decode()}
+        yield {"start": start, _ARRAYS: base64.b64encode(files.npz(arrays, compressed=False)).decode()}
 
 
 def _job_name(start: int) -> str:

@@ -82,8 +82,10 @@ def _compare(
     found = agreement.disagreements(results)
     own = chosen.get(robot, {})
     far = [d for task, names in own.items() for d in agreement.drifts(task, robot, names[0], engines, episodes)]
-    for name, entries in [("engines", found)] + [("drift", far)] * bool(far):
-        files.write_csv(out / f"{name}.csv", [asdict(entry) for entry in entries])
+    files.write_csv(out / "engines.csv", [asdict(entry) for entry in found])
+    if far:
+        files.write_csv(out / "drift.csv", far)
+        console.print(f"distance of the same forces, which nothing corrects: {out / 'drift.csv'}")
     print_rows(
         "where engines disagree",
         [
@@ -99,8 +101,6 @@ def _compare(
             for d in found
         ],
     )
-    if far:
-        console.print(f"distance of the same forces, which nothing corrects: {out / 'drift.csv'}")
     usual = named_robot(robot).friction
     for one in found:
         if one.episodes and one.made_for == robot and one.friction == usual:

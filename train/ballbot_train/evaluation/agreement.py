@@ -41,25 +41,6 @@ class Disagreement:
     regret: float
 
 
-@dataclass(frozen=True)
-class Drift:
-    """How far the ball is from where the same forces bring it in the first physics, at a time, m.
-
-    Over the episodes that last so long in the first one. Nothing corrects it, and the robot is unstable: what differs grows
-    a thousandfold in a second.
-    """
-
-    task: str
-    robot: str
-    controller: str
-    first: str
-    second: str
-    seconds: float
-    episodes: int
-    median: float
-    worst: float
-
-
 def disagreements(results: Sequence[Result]) -> list[Disagreement]:
     """Every controller on every floor, in the first physics of the results and in each other one."""
     runs: dict[tuple[Any, ...], dict[str, dict[int, Result]]] = {}
@@ -79,8 +60,11 @@ def disagreements(results: Sequence[Result]) -> list[Disagreement]:
     return found
 
 
-def drifts(task: str, robot: str, controller: str, physics: Sequence[str], episodes: int) -> list[Drift]:
-    """Plays a controller's forces of its first certified episodes in every physics.
+def drifts(task: str, robot: str, controller: str, physics: Sequence[str], episodes: int) -> list[dict[str, Any]]:
+    """How far the ball is from where the same forces bring it in the first physics, m: rows of a table for `TIMES`.
+
+    A row is over the episodes that last so long in the first physics. Nothing corrects the drift, and the robot is unstable:
+    what differs grows a thousandfold in a second.
 
     Args:
         task: by name.
@@ -91,7 +75,7 @@ def drifts(task: str, robot: str, controller: str, physics: Sequence[str], episo
     """
     first, *others = physics
     runs = list(_runs(task, robot, controller, first, min(episodes, _EPISODES)))
-    found = []
+    rows = []
     for second in others:
         distances = [_distances(robot, second, states, forces, dt) for states, forces, dt in runs]
         for seconds in TIMES:
@@ -99,9 +83,10 @@ def drifts(task: str, robot: str, controller: str, physics: Sequence[str], episo
                 float(d[k]) for d, (*_, dt) in zip(distances, runs, strict=True) if (k := round(seconds / dt)) < len(d)
             ]
             if far:
-                measured = len(far), float(np.median(far)), max(far)
-                found.append(Drift(task, robot, controller, first, second, seconds, *measured))
-    return found
+                about = {"task": task, "robot": robot, "controller": controller, "first": first, "second": second}
+                measured = {"episodes": len(far), "median": float(np.median(far)), "worst": max(far)}
+                rows.append(about | {"seconds": seconds} | measured)
+    return rows
 
 
 def _runs(
