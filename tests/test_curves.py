@@ -39,11 +39,11 @@ def test_a_curve_is_of_all_seeds_and_ends_where_the_first_of_them_ends(tmp_path)
     a_run(tmp_path / "seed-0", 0, [4.0, 2.0, 0.0])
     a_run(tmp_path / "seed-1", 1, [4.0, 4.0])
     (curve,) = report.grouped(report.read_runs([tmp_path]))
-    x, middle, low, high = curve.against("env_steps", "regret")
+    x, middle, low, high = curve.against("env_steps")
     assert (x[0], x[-1]) == (0.0, 1000.0)
     assert (middle[0], middle[-1]) == pytest.approx((4.0, 3.0))
     assert (low[-1], high[-1]) == pytest.approx((2.0, 4.0))
-    assert curve.against("minutes", "regret")[0][-1] == pytest.approx(1.0)
+    assert curve.against("minutes")[0][-1] == pytest.approx(1.0)
 
 
 def test_settings_of_one_learner_are_curves_of_their_own(tmp_path):
@@ -69,8 +69,6 @@ def test_the_command_writes_figure_points_and_table(tmp_path, capsys):
 def test_folders_without_trainings_are_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no training"):
         curves((tmp_path,))
-    with pytest.raises(ValueError, match="unknown metric speed; known: regret"):
-        curves((tmp_path,), metric="speed")
     a_run(tmp_path, 0, [1.0])
     (tmp_path / "evaluations.csv").write_text("iteration\n1\n")
     with pytest.raises(ValueError, match="or a damaged one"):

@@ -1,14 +1,13 @@
 """`ballbot optimize`: the optimum of one episode."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ballbot_baselines.optimum import find_optimum
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import RobotName, check_least, check_names, console, print_table
 from ballbot_train.report import figures
@@ -23,11 +22,8 @@ def optimize(
     constants: dict[str, float] = {},  # noqa: B006 (tyro's default; never changed)
     seed: int = 0,
     duration: float | None = None,
-    max_tilt: float | None = None,
-    force_limit: float | None = None,
     out: Path = Path("runs/optimize"),
     robot: RobotName = PAPER,
-    friction: float | None = None,
 ) -> None:
     """Finds the optimum of one episode, and writes its trajectory and figure.
 
@@ -37,29 +33,20 @@ def optimize(
         constants: constants of the episode by name, e.g. --constants speed 3; others are drawn with the seed.
         seed: of what is drawn.
         duration: longest episode, s.
-        max_tilt: degrees.
-        force_limit: N.
         out: folder of trajectory.npz and figure.png.
         robot: by name.
-        friction: coefficient of friction between ball and floor; default the robot's.
     """
     check_names("task", [task], TASKS)
-    fields = {"duration": duration, "max_tilt": None if max_tilt is None else math.radians(max_tilt)}
-    params = named_robot(robot)
     check_least(0, seed=seed)
-    if force_limit is not None:
-        params = replace(params, force_limit=force_limit)
-    if friction is not None:
-        params = replace(params, friction=friction)
-    problem = make_task(task, robot, **{key: value for key, value in fields.items() if value is not None})
+    problem = make_task(task, robot, **({} if duration is None else {"duration": duration}))
     if problem.steps > _MOST_STEPS:
         raise ValueError(
             f"duration {duration:g} s is too long to optimize; give at most {_MOST_STEPS * problem.control_dt:g} s"
         )
-    env = BallbotEnv(problem, physics="rk4", params=params)
+    env = BallbotEnv(problem, physics="rk4", robot=robot)
     options = {"constants": constants} | ({} if state is None else {"state": state})
     _, info = env.reset(seed=seed, options=options)
-    optimum = find_optimum(env.task, params, info["state"], info["constants"], twice=True)
+    optimum = find_optimum(env.task, env.params, info["state"], info["constants"], twice=True)
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
     circles = figures.marker_circles(env.task.markers(info["constants"]))

@@ -21,23 +21,10 @@ from ballbot_gym import files
 from ballbot_train.console import markdown
 from ballbot_train.report.labels import color, label
 
-METRICS = {
-    "regret": "mean regret, no success as failing at once",
-    "regret_mean": "mean regret of what did not fail",
-    "regret_median": "median regret of what did not fail",
-    "regret_worst": "worst regret of what did not fail",
-    "success": "success",
-    "failures": "failures of 200",
-    "validation_cost": "validation cost",
-    "validation_mean_cost": "validation cost, near misses as they are",
-}
-"""What can be drawn, and its name on the axis. All but the last two are of the certified episodes."""
-
 AXES = {"env_steps": "env steps", "minutes": "minutes of one core"}
-"""What it is drawn against."""
+"""What the regret is drawn against."""
 
-_HIGHER_IS_BETTER = {"success"}
-_LOGARITHMIC = {"regret", "regret_mean", "regret_median", "regret_worst"}
+_REGRET = "mean regret, no success as failing at once"  # on the certified episodes
 _POINTS = 100  # of a curve
 _RESAMPLES = 2000
 
@@ -65,9 +52,9 @@ class LearningCurve:
     task: str
     runs: tuple[TrainingRun, ...]
 
-    def against(self, axis: str, metric: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def against(self, axis: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """x, interquartile mean, low and high of its band, (m) each; empty where the runs do not know x."""
-        known = [(run.columns[axis], run.columns[metric]) for run in self.runs]
+        known = [(run.columns[axis], run.columns["regret"]) for run in self.runs]
         known = [(x[keep], y[keep]) for x, y in known if (keep := np.isfinite(x) & np.isfinite(y)).sum() > 1]
         if len(known) < len(self.runs):
             none = np.zeros(0)
@@ -76,9 +63,9 @@ class LearningCurve:
         values = np.array([np.interp(grid, x, y) for x, y in known])
         return grid, interquartile_mean(values), *bootstrap_band(values)
 
-    def final(self, metric: str) -> np.ndarray:
+    def final(self, name: str) -> np.ndarray:
         """(n,) the last value of each seed."""
-        return np.array([run.columns[metric][-1] for run in self.runs])
+        return np.array([run.columns[name][-1] for run in self.runs])
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
@@ -146,7 +133,7 @@ def grouped(runs: Sequence[TrainingRun]) -> list[LearningCurve]:
     return curves
 
 
-def figure(curves: Sequence[LearningCurve], metric: str) -> Figure:
+def figure(curves: Sequence[LearningCurve]) -> Figure:
     """A row of two axes per task: against env steps and against minutes. Learners that count no env steps have none."""
     tasks = list(dict.fromkeys(curve.task for curve in curves))
     drawn = Figure(figsize=(11, 0.6 + 3.6 * len(tasks)), layout="constrained")
@@ -154,41 +141,38 @@ def figure(curves: Sequence[LearningCurve], metric: str) -> Figure:
     for row, task in zip(grid, tasks, strict=True):
         for axis, name in zip(row, AXES, strict=True):
             for i, curve in enumerate(curve for curve in curves if curve.task == task):
-                x, middle, low, high = curve.against(name, metric)
+                x, middle, low, high = curve.against(name)
                 if not len(x):
                     continue
                 shade = color(curve.learner, i) if curve.label == label(curve.learner) else f"C{i}"
                 axis.plot(x, middle, color=shade, label=f"{curve.label} ({len(curve.runs)} seeds)")
                 axis.fill_between(x, low, high, color=shade, alpha=0.2, linewidth=0)
-            axis.set(xlabel=AXES[name], ylabel=METRICS[metric], title=task)
-            if metric in _LOGARITHMIC:
-                axis.set_yscale("log")
+            axis.set(xlabel=AXES[name], ylabel=_REGRET, title=task, yscale="log")
             axis.grid(alpha=0.3)
             if axis.get_legend_handles_labels()[0]:
                 axis.legend(fontsize=8)
     return drawn
 
 
-def points(curves: Sequence[LearningCurve], metric: str) -> list[dict[str, Any]]:
+def points(curves: Sequence[LearningCurve]) -> list[dict[str, Any]]:
     """Every point of the figure, as rows of a table."""
     rows = []
     for curve in curves:
         for axis in AXES:
-            for x, middle, low, high in zip(*curve.against(axis, metric), strict=True):
+            for x, middle, low, high in zip(*curve.against(axis), strict=True):
                 place = {"task": curve.task, "curve": curve.label, "axis": axis, "x": float(x)}
                 rows.append(place | {"iqm": float(middle), "low": float(low), "high": float(high)})
     return rows
 
 
-def summary(curves: Sequence[LearningCurve], metric: str) -> tuple[list[str], list[list[str]]]:
+def summary(curves: Sequence[LearningCurve]) -> tuple[list[str], list[list[str]]]:
     """Header and rows of a table: where each curve ends."""
-    header = ["task", "curve", "seeds", "env steps", "minutes", f"{metric}: IQM [95 %]", "median", "worst"]
+    header = ["task", "curve", "seeds", "env steps", "minutes", "regret: IQM [95 %]", "median", "worst"]
     header += ["success", "failures"]
     rows = []
     for curve in curves:
-        final = curve.final(metric)
+        final = curve.final("regret")
         low, high = bootstrap_band(final[:, None])
-        worst = final.min() if metric in _HIGHER_IS_BETTER else final.max()
         rows.append(
             [
                 curve.task,
@@ -198,7 +182,7 @@ def summary(curves: Sequence[LearningCurve], metric: str) -> tuple[list[str], li
                 f"{np.median(curve.final('minutes')):.1f}",
                 f"{interquartile_mean(final[:, None])[0]:.4g} [{low[0]:.4g}, {high[0]:.4g}]",
                 f"{np.median(final):.4g}",
-                f"{worst:.4g}",
+                f"{final.max():.4g}",
                 f"{np.median(curve.final('success')):.1%}",
                 f"{np.median(curve.final('failures')):.0f}",
             ]
@@ -210,10 +194,10 @@ def _number(value: Any) -> str:
     return "–" if math.isnan(value) else f"{value:,.0f}"
 
 
-def write(curves: Sequence[LearningCurve], metric: str, out: Path) -> Path:
+def write(curves: Sequence[LearningCurve], out: Path) -> Path:
     """Writes curves.png, curves.csv with every point, and curves.md with where each curve ends; returns the figure's path."""
     from ballbot_train.report.figures import save
 
-    files.write_csv(out / "curves.csv", points(curves, metric), ("task", "curve", "axis", "x", "iqm", "low", "high"))
-    files.write(out / "curves.md", markdown(*summary(curves, metric)))
-    return save(figure(curves, metric), out / "curves.png")
+    files.write_csv(out / "curves.csv", points(curves), ("task", "curve", "axis", "x", "iqm", "low", "high"))
+    files.write(out / "curves.md", markdown(*summary(curves)))
+    return save(figure(curves), out / "curves.png")
