@@ -8,7 +8,6 @@ import io
 import itertools
 import json
 import math
-import os
 import shlex
 import struct
 import zipfile
@@ -136,6 +135,7 @@ def test_single_and_vector_envs_clip_the_same_actions(huge):
     single.reset(seed=0, options={"state": np.zeros(8)})
     expected = single.step([huge, -huge])[-1]
     assert expected["clipped"]
+    np.testing.assert_array_equal(expected["force"], [350.0, -350.0])
     for dtype in (torch.float32, torch.float64):
         for engine in ("native", "torch"):
             envs = BallbotVectorEnv(1, engine=engine, dtype=dtype, compile=False)
@@ -188,27 +188,13 @@ def written(content, reader, name="file"):
     return read
 
 
-def body(old, new):
-    """The URDF with a number of the body's inertial replaced."""
-
-    def read(folder):
-        text = URDF_PATH.read_text()
-        head, tail = text.split('<link name="body">')
-        assert old in tail
-        path = folder / "mine.urdf"
-        path.write_text(head + '<link name="body">' + tail.replace(old, new, 1))
-        return BallbotParams.from_urdf(path)
-
-    return read
-
-
 URDFS = [
     (written('<?xml version="1.0" encoding="klingon"?><robot/>', BallbotParams.from_urdf), "not well-formed XML"),
     (written("<robot>" + "<link>" * 100_000 + "</link>" * 100_000 + "</robot>", BallbotParams.from_urdf), "missing"),
     (written("<robot/>", BallbotParams.from_urdf), "link 'ball' is missing"),
     (urdf('<link name="body">', '<link name="ball">'), "link 'ball' is there 2 times"),
-    (body("mass value=", 'mass value="inf" was='), "value = 'inf' is not a number"),
-    (body("ixx=", 'ixx="1e999" was='), "ixx = '1e999' is not a number"),
+    (urdf('"15"', '"inf"'), "value = 'inf' is not a number"),
+    (urdf('"1.2875"', '"1e999"'), "ixx = '1e999' is not a number"),
 ]
 
 RANDOMIZATIONS = [
@@ -486,22 +472,16 @@ BATCHES = [
     (lambda f: BallbotVectorEnv(2, max_episode_steps=0), "max_episode_steps must be a positive whole number"),
     (vector(num_envs=2, reset_mask=np.ma.masked_array([True, False], [True, False])), "must be a NumPy array of bool"),
     (lambda f: BallbotVectorEnv(2, dtype="float16"), "dtype must be torch.float32 or torch.float64, not float16"),
-    *(
-        case
-        for envs in (3, 80)
-        for case in (
-            (vector(num_envs=envs, state=[1e200] + [0.0] * 7), "state must be numbers within ±1e+06, not [1e+200"),
-            (vector(num_envs=envs, state=[math.nan] * 8), "state must be finite numbers that broadcast to"),
-            (vector(num_envs=envs, state=np.zeros((2, 8))), "state must be finite numbers that broadcast to"),
-            (vector(num_envs=envs, constants={"speed": 1e200}), "constant 'speed' must be numbers within ±1e+06"),
-            (vector(num_envs=envs, constants=[[3.0]] * 2), "constants must be finite numbers that broadcast to"),
-            (vector(num_envs=envs, reset_mask=[True]), "must be a NumPy array of bool"),
-            (vector(num_envs=envs, reset_mask=np.ones(envs, int)), "must be a NumPy array of bool"),
-            (vector(num_envs=envs, reset_mask=np.zeros(envs, bool)), "True somewhere"),
-            (vector("abc", envs), "seed must be a whole number"),
-            (vector(-1, envs), "seeds must be in [0, 2^63), not -1"),
-        )
-    ),
+    (vector(state=[1e200] + [0.0] * 7), "state must be numbers within ±1e+06, not [1e+200"),
+    (vector(state=[math.nan] * 8), "state must be finite numbers that broadcast to"),
+    (vector(state=np.zeros((2, 8))), "state must be finite numbers that broadcast to"),
+    (vector(constants={"speed": 1e200}), "constant 'speed' must be numbers within ±1e+06"),
+    (vector(constants=[[3.0]] * 2), "constants must be finite numbers that broadcast to"),
+    (vector(reset_mask=[True]), "must be a NumPy array of bool"),
+    (vector(reset_mask=np.ones(3, int)), "must be a NumPy array of bool"),
+    (vector(reset_mask=np.zeros(3, bool)), "True somewhere"),
+    (vector("abc"), "seed must be a whole number"),
+    (vector(-1), "seeds must be in [0, 2^63), not -1"),
 ]
 
 LEARNING = [
@@ -525,15 +505,11 @@ EVALUATION = [
     (lambda f: evaluate(nothing, episodes=0), "episodes must be 1 to 200, not 0"),
     (lambda f: evaluate(nothing, episodes=[0]), "episodes must be a number of episodes, not"),
     (lambda f: training.score_and_validate(None, make_task("turn", control_dt=0.01)), "was computed for Turn("),
-    (lambda f: evaluate(nothing, randomization=3), "randomization must be a Randomization"),
     (lambda f: evaluate(None), "None is no policy: give a Controller"),
     (lambda f: evaluate("pid"), "unknown controller 'pid'"),
     (lambda f: evaluate("mine.zip"), "mine.zip: no such file"),
-    (lambda f: evaluate(lambda o: np.zeros(3), episodes=1, physics="rk4"), "action must have shape (2,)"),
-    (lambda f: evaluate(lambda o: [math.nan, 0], episodes=1, physics="rk4"), "action must be finite"),
     (lambda f: controllers_of([]), "give at least one task"),
     (lambda f: controllers_of(["turn"], ["lqr", "lqr"]), "controller lqr is given more than once"),
-    (lambda f: jobs.run([], f, 0, print), "workers must be at least 1"),
     (written("{", lambda path: jobs.claim(path.parent, {}), jobs.MARKER), "is damaged"),
 ]
 
@@ -570,19 +546,15 @@ def test_wrong_input_is_refused_with_a_message_that_names_it(call, message, tmp_
 
 TYPED = [
     ("benchmark --tasks dance", "unknown task dance; known: stabilize"),
-    ("benchmark --controllers pid", "unknown controller pid; known: lqr"),
-    ("benchmark --episodes 0", "episodes must be 1 to 200, not 0"),
     ("certify --install --shards set", "give --install without --shards"),
     ("certify --episodes 1 --shards nowhere://set", "nowhere://set/stabilize cannot be read"),
     ("train dagger --demos nowhere://set", "nowhere://set cannot be read"),
-    ("demos --backoff.margin nan", "margin must be at least 0 and below inf, not nan"),
     ("demos --pushes 1e9", "pushes must be at most 50 per second, one in every control step"),
     ("certify --episodes 3 --install", "the package needs sets of 200 episodes"),
     ("paper --only fig9", "unknown problem fig9"),
     ("optimize stabilize --duration 1000", "is too long to optimize; give at most 100 s"),
     ("compare a b", "no such file"),
     ("replay stabilize --controllers lqr --physics rk4 --format gif --speed 1e-9", "frames; give another speed or fps"),
-    ("demos --out mine", "is named NAME-vNUMBER"),
     ("train dance", "unknown learner dance; known: dagger, ppo"),
     ("train shac --demos x", "shac uses no demonstrations"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),
@@ -591,8 +563,6 @@ TYPED = [
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),
-    ("evaluate nothere", "unknown controller nothere"),
-    ("benchmark --tasks turn --controllers lqr --physics rk4 --out /dev/null", "/dev/null cannot be a folder"),
     ("train ppo --task stabilize --symmetry frame", "has no frame"),
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("benchmark --controllers mine.json", "mine.json is not a policy"),
@@ -624,9 +594,3 @@ def test_what_is_typed_wrong_ends_with_a_message_and_a_status_and_writes_nothing
 def test_the_settings_tuned_for_every_task_make_sense(learner):
     for name in TASK_NAMES:
         check_settings(LEARNERS[learner].settings(name))
-
-
-def test_a_pipe_is_not_read(tmp_path):
-    os.mkfifo(tmp_path / "pipe.npz")
-    with pytest.raises(ValueError, match="is no regular file"):
-        Trajectory.load(tmp_path / "pipe.npz")

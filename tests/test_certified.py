@@ -1,4 +1,3 @@
-import json
 import math
 from dataclasses import replace
 
@@ -114,19 +113,6 @@ def test_solving_again_from_another_guess_finds_nothing_cheaper(task, evaluation
         assert again.cost >= (1 - 1e-4) * evaluation.costs[i]
         if not (task.id.startswith("BallbotWeave") and params.grips):
             assert again.cost == pytest.approx(evaluation.costs[i], rel=1e-4)
-
-
-def test_entries_survive_json_bit_for_bit():
-    params = default_params()
-    certification = pytest.importorskip("ballbot_baselines.certification")
-    from ballbot_baselines.optimum import find_optimum
-
-    task = make_task("stabilize")
-    for i, entry in enumerate(json.loads(json.dumps(list(certification.entries("stabilize", range(2)))))):
-        optimum = find_optimum(task, params, *certification.episode(task, params, i))
-        assert (entry["cost"], entry["violation"]) == (optimum.cost, optimum.violation)
-        for name in ("t", "x", "u"):
-            np.testing.assert_array_equal(entry[name], getattr(optimum.trajectory, name))
 
 
 def test_set_survives_saving(task, robot, evaluation, tmp_path):

@@ -14,7 +14,6 @@ import pytest
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import load
-from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.commands import COMMANDS, RESUMABLE, help_of
 from ballbot_train.commands.certify import certify
@@ -223,15 +222,3 @@ def test_certify_installs_only_when_it_is_told_to_and_keeps_optima_that_are_chea
     now = certified.load(task, "paper").costs / first.costs
     assert now[:2].tolist() == [1, 1]
     assert now[2] == pytest.approx(1 / 1.1, rel=1e-6)
-
-
-def test_certify_says_which_episode_has_no_optimum_and_writes_no_set(tmp_path, monkeypatch):
-    certification = importlib.import_module("ballbot_baselines.certification")
-
-    def fail(*arguments, **options):
-        raise PlanError("no plan")
-
-    monkeypatch.setattr(certification, "find_optimum", fail)
-    with pytest.raises(PlanError, match="no optimum of BallbotTurn-v0 for\nepisode 0: no plan\nepisode 1: no plan"):
-        certify(("turn",), 2, out=tmp_path / "out", workers=1)
-    assert not any((tmp_path / "out").iterdir())

@@ -62,21 +62,6 @@ def test_copies_go_on_bit_identically_from_the_middle_of_an_episode(physics, ran
 
 
 @pytest.mark.parametrize("make", COPIES.values(), ids=COPIES)
-def test_env_and_copy_do_not_disturb_each_other(physics, make):
-    env, alone = BallbotEnv(physics=physics), BallbotEnv(physics=physics)
-    for each in (env, alone):
-        each.reset(options={"state": np.zeros(8)})
-    other = make(env)
-    for _ in range(20):
-        other.step([0.03, -0.03])
-        assert env.step([0.01, 0.0])[0].tobytes() == alone.step([0.01, 0.0])[0].tobytes()
-    other.close()
-    env.step([0.0, 0.0])
-    env.close()
-    alone.close()
-
-
-@pytest.mark.parametrize("make", COPIES.values(), ids=COPIES)
 def test_copy_of_a_closed_env_is_closed_and_of_one_never_reset_draws_the_same_episodes(physics, make):
     env = BallbotEnv(physics=physics)
     other = make(env)  # never seeded either

@@ -5,7 +5,6 @@ pytest.importorskip("casadi")
 
 import casadi
 
-from ballbot_baselines import compiled
 from ballbot_baselines import optimum as optimum_module
 from ballbot_baselines.lqr import LqrController
 from ballbot_baselines.ocp import FEASIBLE, Bounds, Ocp, OcpSolver
@@ -226,15 +225,6 @@ def test_infeasible_bounds_are_reported_not_hidden(solver):
     assert not solution.success
     assert solution.violation > 1e-3
     assert solution.status
-
-
-@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
-def test_compiled_and_interpreted_functions_lead_to_the_same_solution(monkeypatch, solver):
-    fast = solve_toy(solver)
-    monkeypatch.setattr(compiled, "loaded", lambda *_: None)
-    slow = solve_toy(solver)
-    assert slow.cost == pytest.approx(fast.cost, rel=1e-12)
-    np.testing.assert_allclose(slow.states, fast.states, atol=1e-9)
 
 
 def test_a_plan_to_track_leaves_no_force_in_reserve_where_that_is_all_there_is(params, monkeypatch):

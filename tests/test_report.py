@@ -65,15 +65,6 @@ def test_what_has_no_data_has_no_section(page, tmp_path):
     assert 'srcdoc="&lt;p&gt;"' in empty
 
 
-def test_words_are_text_and_not_markup(tmp_path):
-    replays = [Replay("</script>", (Take("<q>", leaning(0.1, 0.1), "red"),))]
-    path = write_report(tmp_path / "r.html", "<h9>", ["<i>"], [["<u>"]], replays, "<s>", {}, {"<p9>": "<p8>"})
-    text = path.read_text()
-    text = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)  # less the page's own scripts
-    assert not re.search("<(b|i|u|s|q|h8|h9|p9|p8)>", text)
-    assert '"title":"\\u003c/script\\u003e"' in text
-
-
 def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
     name = """<script>alert('"a" & b')</script>"""
     picture = figures.save(

@@ -141,20 +141,6 @@ def test_the_spec_of_vector_envs_makes_the_same_ones_again_also_from_json(keywor
     vec.close()
 
 
-def test_only_ended_envs_have_final_observations(make_vec):
-    vec = make_vec(2)
-    _, infos = vec.reset(seed=0, options={"state": np.array([np.zeros(8), [0, 0, 1.39, 0, 0, 0, 2, 0]])})
-    *_, infos = vec.step(np.zeros((2, 2)))
-    assert infos["final_obs"].shape == (2, 8)
-    assert np.isnan(infos["final_obs"]).all(1).tolist() == [True, False]
-    for key in ("_final_obs", "_final_info"):
-        assert infos[key].tolist() == [False, True]
-    assert infos["final_info"]["_state"].tolist() == [False, True]
-    assert infos["cost"][1] == 0
-    *_, infos = vec.step(np.zeros((2, 2)))
-    assert "final_obs" not in infos
-
-
 def test_only_masked_envs_are_reset(make_vec):
     vec = make_vec(3)
     vec.reset(seed=0)
