@@ -546,11 +546,9 @@ def test_wrong_input_is_refused_with_a_message_that_names_it(call, message, tmp_
 
 TYPED = [
     ("benchmark --tasks dance", "unknown task dance; known: stabilize"),
-    ("certify --install --shards set", "give --install without --shards"),
     ("certify --episodes 1 --shards nowhere://set", "nowhere://set/stabilize cannot be read"),
     ("train dagger --demos nowhere://set", "nowhere://set cannot be read"),
     ("demos --pushes 1e9", "pushes must be at most 50 per second, one in every control step"),
-    ("certify --episodes 3 --install", "the package needs sets of 200 episodes"),
     ("paper --only fig9", "unknown problem fig9"),
     ("optimize stabilize --duration 1000", "is too long to optimize; give at most 100 s"),
     ("compare a b", "no such file"),

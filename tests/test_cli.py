@@ -6,7 +6,6 @@ import json
 import shlex
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -205,20 +204,3 @@ def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch
     np.testing.assert_allclose(made.costs, known.costs[:3], rtol=1e-9)
     assert len(made.trajectories) == 3
     assert certified.path_of(make_task("turn")).read_bytes() == packaged
-
-
-def test_certify_installs_only_when_it_is_told_to_and_keeps_optima_that_are_cheaper(tmp_path, monkeypatch, capsys):
-    task, path = make_task("turn"), tmp_path / "package" / "set.npz"
-    full = certified.load(task, "paper")
-    first = replace(full, **{name: getattr(full, name)[:3] for name in certified._PER_EPISODE})
-    first = replace(first, costs=first.costs * [1.0, 0.9, 1.1], trajectories=first.trajectories[:1])
-    before = first.save(task, path, "paper").read_bytes()
-    monkeypatch.setattr(certified, "EPISODES", 3)
-    monkeypatch.setattr(certified, "path_of", lambda *_: path)
-    certify(("turn",), 3, out=tmp_path / "out", workers=1)
-    assert path.read_bytes() == before
-    certify(("turn",), 3, install=True, out=tmp_path / "out", workers=1)
-    assert "turn: 1 of 3 optima are cheaper than those installed" in capsys.readouterr().out
-    now = certified.load(task, "paper").costs / first.costs
-    assert now[:2].tolist() == [1, 1]
-    assert now[2] == pytest.approx(1 / 1.1, rel=1e-6)

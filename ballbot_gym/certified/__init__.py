@@ -30,7 +30,6 @@ EPISODES = 200
 TRAJECTORIES = 20
 _FEW = 5  # trajectories in the file of a track, of which there are many, and of a robot with wheels, whose states are larger
 
-_CHEAPER = 1e-7  # relative: optima that differ by less are the same
 _ENDS = (slice(None, -1), slice(1, None))  # of control steps
 _SAME = 1e-6  # of states and, relative, of costs: what rounding differs by between machines is far less
 
@@ -81,18 +80,6 @@ class EvaluationSet:
         """A set of the first episodes alone."""
         chosen = {name: getattr(self, name)[:episodes] for name in _PER_EPISODE}
         return EvaluationSet(**chosen, trajectories=self.trajectories[:episodes])
-
-    def improved_by(self, other: "EvaluationSet") -> "EvaluationSet":
-        """A set with the cheaper optimum of each episode of two sets; the other's where the episodes differ."""
-        better = other.costs < self.costs * (1 - _CHEAPER)
-        for name in ("states", "constants", "drawn"):
-            better |= (getattr(other, name) != getattr(self, name)).any(1)
-        chosen = {}
-        for name in _PER_EPISODE:
-            old, new = getattr(self, name), getattr(other, name)
-            chosen[name] = np.where(better[:, None] if old.ndim > 1 else better, new, old)
-        pairs = zip(better.tolist(), self.trajectories, other.trajectories, strict=False)
-        return EvaluationSet(**chosen, trajectories=tuple(new if take else old for take, old, new in pairs))
 
     def save(
         self, task: Task, path: Path, robot: str | BallbotParams, randomization: Randomization = Randomization()

@@ -24,7 +24,6 @@ _MOST_IN_SHARDS = 100_000_000
 def certify(
     tasks: tuple[str, ...] = tuple(TASKS),
     episodes: int = certified.EPISODES,
-    install: bool = False,
     shards: str | None = None,
     out: Path = Path("runs/certify"),
     workers: WorkersOption = Workers(),
@@ -38,8 +37,6 @@ def certify(
     Args:
         tasks: names of tasks.
         episodes: how many, from the first.
-        install: puts the finished sets into the package, for robots and tasks that come with it. Where an episode's optimum
-            there is cheaper, it stays.
         shards: URL or folder for a set of shards, SHARDS/TASK, in place of the .npz files; for more episodes than fit into
             memory. See `ballbot_train.shards`.
         out: folder of the .npz files.
@@ -58,15 +55,11 @@ def certify(
     varied = checked_randomization(randomization)
     if randomization and not varied.moves_optima:
         raise ValueError(f"{randomization} moves no optimum: its episodes have the optima without --randomization")
-    if install and episodes < certified.EPISODES:
-        raise ValueError(f"the package needs sets of {certified.EPISODES} episodes; give --install without --episodes")
     if shards is not None:
-        if install:
-            raise ValueError("the package holds no shards; give --install without --shards")
         _certify_shards(tasks, episodes, shards, out, workers, robot)
         return
     jobs.make_folder(out)
-    params, failures, sets = named_robot(robot), [], {}
+    params, failures = named_robot(robot), []
     for name in tasks:
         task = make_task(name, robot)
         try:
@@ -76,24 +69,11 @@ def certify(
             continue
         found = certified.from_cache(task, params, range(episodes), varied)
         assert found is not None
-        sets[name] = found.first(episodes)
-        path = sets[name].save(task, out / certified.path_of(task, robot, randomization or "").name, robot, varied)
+        name = certified.path_of(task, robot, randomization or "").name
+        path = found.first(episodes).save(task, out / name, robot, varied)
         console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     if failures:
         raise PlanError("\n".join(failures))
-    if install:
-        for name, evaluation_set in sets.items():
-            task = make_task(name, robot)
-            path = certified.path_of(task, robot, randomization or "")
-            try:
-                old = certified.load(task, robot, path, randomization=varied)
-            except certified.CertificateError:  # none, or of another problem
-                kept = evaluation_set
-            else:
-                kept = old.improved_by(evaluation_set)
-                same = int((kept.costs == old.costs).sum())
-                console.print(f"{name}: {len(kept) - same} of {len(kept)} optima are cheaper than those installed")
-            console.print(f"installed: {kept.save(task, path, robot, varied)}")
 
 
 def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers, robot: str) -> None:
