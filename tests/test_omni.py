@@ -18,7 +18,9 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
 from ballbot_gym.two_forces import TwoForces
+from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.play.world import World
+from ballbot_train.policy import PolicyController, PolicyNetwork
 from ballbot_train.policy_files import PolicySpec
 
 SPREAD = np.array([1, 1, 0.8, 0.8, 2, 2, 2, 2, 3, 3, 5.0])
@@ -262,6 +264,30 @@ def test_a_tracked_plan_comes_to_rest_at_the_cost_that_it_said():
     assert np.min(limits) >= 0
 
 
+@pytest.mark.parametrize(
+    ("learner", "settings"),
+    [
+        ("shac", {"horizon": 0, "num_envs": 16, "episode_seconds": 0.3}),
+        ("shac", {"horizon": 2, "num_envs": 3}),
+        ("dagger", {"batch_episodes": 0, "episodes_per_iteration": 1, "candidate_episodes": 0, "gradient_steps": 2}),
+    ],
+)
+def test_learners_command_three_motors(robot, learner, settings):
+    task = make_task("stabilize", "omni", duration=3.0)
+    algorithm = LEARNERS[learner]
+    settings = dataclasses.replace(algorithm.settings("stabilize"), iterations=1, hidden=(8,), **settings)
+    made = algorithm.make(task, robot, settings, seed=0)
+    episode = rollout(BallbotEnv(task, robot=robot, physics="rk4"), PolicyController(task, robot, made.network), seed=0)
+    assert episode.success  # it starts as LQR
+    before = {name: part.clone() for name, part in made.network.state_dict().items()}
+    made.iterate()
+    assert made.network.spec == PolicySpec.of(task, "omni", hidden=(8,))
+    assert all(part.isfinite().all() for part in made.network.state_dict().values())
+    assert any((part != before[name]).any() for name, part in made.network.state_dict().items())
+    with pytest.raises(ValueError, match="cannot start one of"):
+        algorithm.make(task, robot, settings, 0, start=PolicyNetwork(PolicySpec.of(task, hidden=(8,))))
+
+
 def test_a_free_heading_costs_nothing(robot):
     x, held = np.zeros(11), make_task("turn", "omni")
     x[8] = 0.5
@@ -285,7 +311,9 @@ def test_what_knows_no_wheels_says_so(robot):
         batched.find_optima(task, robot, np.zeros((1, 8)), np.zeros((1, 0)))
     with pytest.raises(ValueError, match="pushes are forces Fx, Fy, which a robot with wheels does not have"):
         BallbotEnv(robot="omni", physics="rk4", randomization=Randomization(push_impulse=(1.0, 2.0)))
-    with pytest.raises(ValueError, match="omni has three wheels"):
-        PolicySpec.of(task, robot="omni")
+    with pytest.raises(ValueError, match="omni has three wheels, and neither a frame nor mirror images"):
+        PolicySpec.of(task, robot="omni", frame="orbit")
+    with pytest.raises(ValueError, match="sac here knows no robot with wheels"):
+        LEARNERS["sac"].make(task, robot, LEARNERS["sac"].settings("stabilize"), 0)
     with pytest.raises(ValueError, match="the playground knows no robot with wheels"):
         World("stabilize", "omni")

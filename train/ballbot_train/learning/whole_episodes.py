@@ -20,6 +20,7 @@ import torch
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import robot_name
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -83,7 +84,7 @@ class WholeEpisodes:
         world: dict[str, Any] = {"randomization": randomization, "history": history}
         self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params, **world)
         self._batch.reset(seed=spawned(seed))
-        network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
+        network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
         start_as_lqr(network, task, params)
         self._make(network)
 

@@ -22,6 +22,7 @@ from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import robot_name
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -138,7 +139,7 @@ class Critic(torch.nn.Module):
         past: int = 0,
     ):
         super().__init__()
-        own = len(task.observation_scale)
+        own = task.observation_size(params)
         self._inputs = CriticInputs(own, products=False, frame=frame, routes=routes, past=past)
         layers: list[torch.nn.Module] = []
         size = self._inputs.size
@@ -156,7 +157,7 @@ class Critic(torch.nn.Module):
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         scale = 10.0
         if self.p is not None:
-            error = observation[..., :8]
+            error = observation[..., : len(self.p)]
             scale = ((error @ self.p) * error).sum(-1) + 1e-3
         return torch.nn.functional.softplus(self.mlp(self._inputs(observation))[..., 0] + _SOFTPLUS_ONE) * scale
 
@@ -180,9 +181,9 @@ class Shac:
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._own = task
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
-        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
+        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
         start_as_lqr(self._network, task, params)
-        past = history * (len(task.observation_scale) + 2)
+        past = history * (task.observation_size(params) + params.action_size)
         seen = self._network.spec.frame, self._network.routes, past
         self.critic = Critic(task, params, config.hidden, *seen)
         self.target = Critic(task, params, config.hidden, *seen)
