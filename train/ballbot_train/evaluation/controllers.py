@@ -14,6 +14,7 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
 from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
 
+_FILTERED = "-ekf"  # behind the name of a controller: it gets sensors
 _BESIDE = (".json", ".safetensors", ".vecnormalize.npz")  # endings of files that belong to a policy or a saved model
 
 
@@ -164,6 +165,10 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
     """
     if is_expert(name):
         return (CONTROLLERS | VARIANTS)[name](task, params)
+    if name.endswith(_FILTERED) and params.wheels is not None:
+        from ballbot_baselines.kalman import FilteredController
+
+        return FilteredController(task, params, make_controller(name.removesuffix(_FILTERED), task, params))
     robot = robot_name(params)
     shipped = shipped_policies(task, robot, None)
     if name not in shipped and not is_file(name):
