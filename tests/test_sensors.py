@@ -11,7 +11,9 @@ from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import TRACKS
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
+from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.controllers import make_controller
+from ballbot_train.evaluation.evaluate import evaluate
 
 DT = 0.02
 
@@ -134,6 +136,13 @@ def test_lqr_behind_the_filter_comes_to_rest_from_sensors_alone():
         assert off[:2].max() < 0.02  # m
     with pytest.raises(ValueError, match="wants states"):
         rollout(env, make_controller("lqr", env.task, env.params))
+
+
+def test_evaluation_shows_sensors_to_a_filtered_controller():
+    rows = [evaluate(name, "stabilize", episodes=2, physics="rk4", robot="omni_strong") for name in ("lqr", "lqr-ekf")]
+    assert [row.success for row in rows] == [1, 1]
+    assert 0 < rows[1].regret_mean - rows[0].regret_mean < 0.1
+    assert controllers_of(["stabilize"], ["lqr-ekf"], "omni") == {"stabilize": ["lqr-ekf"]}
 
 
 def test_the_wrapper_shows_a_policy_the_state():

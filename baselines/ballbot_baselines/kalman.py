@@ -52,6 +52,10 @@ class TrackFilter:
     """
 
     def __init__(self, task: Task, params: BallbotParams, track: Randomization):
+        if params.wheels is not None:
+            raise ValueError(
+                "what a track does not tell is not estimated of a robot with wheels; give lqr, trajopt or nmpc"
+            )
         self._params, self._track = params, track
         low, high = track.delay_steps(task.control_dt)
         self._delays = range(low, high + 1)
