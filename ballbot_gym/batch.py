@@ -185,7 +185,8 @@ class BallbotBatch:
             device, dtype: of all tensors; torch.float32 or torch.float64, or its name.
             compile: True compiles `transition` at the first step, for half a minute or so, and raises if that fails.
                 "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
-                warning and runs eagerly. False never compiles.
+                warning and runs eagerly. False never compiles. Of robots with wheels the equations of motion alone are
+                compiled: all of their `transition` would take many minutes.
             params: the nominal robot as a BallbotParams; the same as robot.
             randomization: what varies, or a name in `TRACKS`; default, nothing.
             robot: a name in `ROBOTS`, or a BallbotParams.
@@ -216,7 +217,9 @@ class BallbotBatch:
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._compile = compile
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
-        self._run = _compiled(self._compilable) if wanted else self.transition
+        wheels = self.params.wheels is not None
+        self._run = _compiled(self._compilable) if wanted and not wheels else self.transition
+        self._slope = self._compiled_slope() if wanted and wheels and not self.randomization.varies_robot else None
         self._proven = not wanted
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -226,11 +229,12 @@ class BallbotBatch:
         super().__setattr__(name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_run": self.compiled}
+        return {**self.__dict__, "_run": self.compiled, "_slope": self._slope is not None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._run = _compiled(self._compilable) if state["_run"] else self.transition
+        self._slope = self._compiled_slope() if state["_slope"] else None
 
     @property
     def compiled(self) -> bool:
@@ -340,7 +344,7 @@ class BallbotBatch:
                 raise
             reason = str(error).strip().splitlines()[:1]
             _log.warning("torch.compile failed, the batch runs eagerly: %s %s", type(error).__name__, reason)
-            self._run = self.transition
+            self._run, self._slope = self.transition, None
             self.state, result = self._run(state, actions)
         self._proven = True
         if self.compiled:
@@ -382,7 +386,7 @@ class BallbotBatch:
         if noise.varies_robot:
             robot = ModelNumbers.of(noise.robot(self.params, now.drawn))
 
-        end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
+        end = self._moved(robot, x, total)
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
         if self.params.grips:
             floor = dynamics.held_contact(robot, x, total, task.control_dt)
@@ -430,6 +434,26 @@ class BallbotBatch:
             grip=grip,
         )
         return self._stacked(new), result
+
+    def _moved(
+        self, robot: Any, x: tuple[torch.Tensor, ...], force: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, ...]:
+        """The states after a control step."""
+        dt, slope = self.task.control_dt, self._slope
+        if slope is None:
+            return dynamics.step(robot, x, force, dt, self._substeps)
+        rows = (torch.stack(x),), (torch.stack(force),)
+        (end,) = dynamics.step(robot, *rows, dt, self._substeps, lambda _, x, u: (slope(*x, *u),))
+        return end.unbind(0)
+
+    def _compiled_slope(self) -> Any:
+        """`dynamics.derivative` of states (n, B) and forces (m, B), compiled."""
+        params = self.params
+
+        def slope(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+            return torch.stack(dynamics.derivative(params, x.unbind(0), u.unbind(0)))
+
+        return torch.compile(slope, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     def _compilable(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
         """`transition` with its flags as numbers 0 and 1: torch's CPU code generator stores bools one by one."""

@@ -82,7 +82,8 @@ class WholeEpisodes:
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self.task = replace(task, duration=config.episode_seconds)
         world: dict[str, Any] = {"randomization": randomization, "history": history}
-        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params, **world)
+        self._wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=self._wheels and long, params=params, **world)
         self._batch.reset(seed=spawned(seed))
         network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
         start_as_lqr(network, task, params)
@@ -95,7 +96,7 @@ class WholeEpisodes:
         self._average = average_of(network, _AVERAGED_ITERATIONS)
         self._optimizer = torch.optim.Adam(network.parameters(), config.learning_rate, betas=(0.9, 0.99))
         self._step = self._one_step
-        if config.iterations >= _COMPILE_FROM:
+        if config.iterations >= _COMPILE_FROM and not self._wheels:  # else the batch compiles its part
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     def start_from(self, network: PolicyNetwork) -> None:

@@ -191,14 +191,15 @@ class Shac:
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         rate = config.critic_learning_rate
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), rate, betas=(0.7, 0.95))
-        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, **world)
+        wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=wheels and long, **world)
         self._start = self._batch.reset(seed=spawned(seed))  # (B, no) first observations of the running episodes
         hard = round(config.hard_fraction * config.reset_fraction * config.num_envs)  # new episodes of an iteration
         self._drawn = BallbotBatch(self.task, _HARD_AMONG * hard, compile=False, **world) if hard else None
         if self._drawn is not None:
             self._drawn.reset(seed=spawned(seed) + config.num_envs)
         self._step = self._one_step
-        if config.iterations >= _COMPILE_FROM:
+        if long and not wheels:  # else the batch compiles its part
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     @property
