@@ -1,5 +1,6 @@
 """A robot with three omni-wheels: its equations, its contact, and its engines."""
 
+import copy
 import dataclasses
 import math
 
@@ -10,6 +11,7 @@ import pytest
 from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import dynamics, omni
+from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.omni import Wheels
@@ -237,6 +239,21 @@ def test_batches_move_as_single_envs_do(engine, rng):
     np.testing.assert_allclose(
         alone[8:], [*np.cos(info["state"][8:9]), *np.sin(info["state"][8:9]), *info["state"][9:] / 5], rtol=1e-6
     )
+
+
+@pytest.mark.slow  # compiling takes a quarter of a minute
+def test_a_batch_whose_equations_are_compiled_agrees_with_an_eager_one():
+    torch = pytest.importorskip("torch")
+    batches = [
+        BallbotBatch("stabilize", 4, compile=compile, robot="omni", observation="sensors") for compile in (True, False)
+    ]
+    for batch in batches:
+        batch.reset(seed=0)
+    actions = 0.1 * torch.ones(4, 3)
+    batches[0].step(actions), batches[1].step(actions)
+    results = [batch.step(actions) for batch in (*batches, copy.deepcopy(batches[0]))]
+    for result in results[1:]:
+        torch.testing.assert_close(result.final_x, results[0].final_x, rtol=1e-4, atol=1e-5)
 
 
 def test_two_forces_balance_it_and_hold_its_heading():
