@@ -18,7 +18,6 @@ from typing import Any, NamedTuple, cast
 import torch
 
 from ballbot_baselines.lqr import equilibrium_gain
-from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -31,7 +30,7 @@ from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.learning.whole_episodes import WholeEpisodes
+from ballbot_train.learning.whole_episodes import WholeEpisodes, grip_penalty
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.routes import Routes
 
@@ -98,7 +97,6 @@ _TAU = 0.2  # share by which the target critic moves to the critic after each it
 _MAX_GRAD_NORM = 1.0  # of the policy
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training, whenever it comes
-_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 3000.0  # as of the margins, for `dynamics.limits` of robots that can slip
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
 _SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
 _DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
@@ -302,9 +300,7 @@ class Shac:
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * task.control_dt * squared
-        for limit in dynamics.limits(self._batch.params, before, force, hold=task.control_dt):
-            shortfall = (_GRIP_CLEARANCE - limit).clamp(min=0)
-            shaped = shaped + _GRIP_PENALTY * task.control_dt * shortfall**2
+        shaped = shaped + grip_penalty(self._batch.params, before, force, task.control_dt)
         loss = loss + discount * alive * shaped
         if config.exit_softness:
             alive = alive * torch.sigmoid(torch.stack(task.goal(x, c)).amax(0) / config.exit_softness)
