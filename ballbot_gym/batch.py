@@ -25,7 +25,7 @@ try:
 except ImportError as error:
     raise ImportError(f"batches of environments need torch: {install('train')}") from error
 
-from ballbot_gym import counter_rng, dynamics
+from ballbot_gym import counter_rng, dynamics, sensors
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
 from ballbot_gym.env import limit_names, make_task
 from ballbot_gym.params import BallbotParams, ModelNumbers
@@ -54,7 +54,7 @@ _FLAGS = ("terminated", "truncated", "success", "failure", "clipped")
 """The fields of `BatchStep` that are bools."""
 
 
-_FIXED = ("task", "params", "randomization", "history", "num_envs", "device", "dtype", "limit_names")
+_FIXED = ("task", "params", "randomization", "history", "observation", "num_envs", "device", "dtype", "limit_names")
 """Attributes of a batch that cannot be set once it is made: more is computed from them."""
 
 
@@ -78,6 +78,8 @@ class BatchState(NamedTuple):
     past: torch.Tensor
     """(history (no + 2), B) the last observations, each with the action that followed, the latest first; before the
     episode began the first one, with no force."""
+    sensors: torch.Tensor
+    """(17, B) what sensors remember; (0, B) where the state is observed."""
 
 
 class _Rows(NamedTuple):
@@ -91,6 +93,7 @@ class _Rows(NamedTuple):
     drawn: tuple[torch.Tensor, ...]
     actuator: tuple[torch.Tensor, ...]
     past: tuple[torch.Tensor, ...]
+    sensors: tuple[torch.Tensor, ...]
 
 
 class BatchStep(NamedTuple):
@@ -171,6 +174,7 @@ class BallbotBatch:
         randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
         history: int = 0,
+        observation: str = "state",
         **task_fields: Any,
     ):
         """Makes the batch; call `reset` first.
@@ -181,11 +185,12 @@ class BallbotBatch:
             device, dtype: of all tensors; torch.float32 or torch.float64, or its name.
             compile: True compiles `transition` at the first step, for half a minute or so, and raises if that fails.
                 "auto" compiles batches of at least `COMPILE_FROM` envs if there is a compiler; if that fails, it logs a
-                warning and runs eagerly. False never compiles.
+                warning and runs eagerly. False never compiles. Of robots with wheels the equations of motion alone are
+                compiled: all of their `transition` would take many minutes.
             params: the nominal robot as a BallbotParams; the same as robot.
             randomization: what varies, or a name in `TRACKS`; default, nothing.
             robot: a name in `ROBOTS`, or a BallbotParams.
-            history: as of `BallbotEnv`.
+            history, observation: as of `BallbotEnv`.
             **task_fields: fields of the task that replace its defaults.
 
         Raises:
@@ -202,6 +207,7 @@ class BallbotBatch:
         self.task = make_task(task, self.params, **task_fields)
         self.limit_names = limit_names(self.task, self.params)
         self.randomization, self.history = checked_randomization(randomization, self.params), check_history(history)
+        self.observation = sensors.check_observation(observation, self.params, self.randomization)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
         for name in ModelNumbers._fields:
@@ -211,7 +217,9 @@ class BallbotBatch:
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._compile = compile
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
-        self._run = _compiled(self._compilable) if wanted else self.transition
+        wheels = self.params.wheels is not None
+        self._run = _compiled(self._compilable) if wanted and not wheels else self.transition
+        self._slope = self._compiled_slope() if wanted and wheels and not self.randomization.varies_robot else None
         self._proven = not wanted
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -221,11 +229,12 @@ class BallbotBatch:
         super().__setattr__(name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_run": self.compiled}
+        return {**self.__dict__, "_run": self.compiled, "_slope": self._slope is not None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._run = _compiled(self._compilable) if state["_run"] else self.transition
+        self._slope = self._compiled_slope() if state["_slope"] else None
 
     @property
     def compiled(self) -> bool:
@@ -335,7 +344,7 @@ class BallbotBatch:
                 raise
             reason = str(error).strip().splitlines()[:1]
             _log.warning("torch.compile failed, the batch runs eagerly: %s %s", type(error).__name__, reason)
-            self._run = self.transition
+            self._run, self._slope = self.transition, None
             self.state, result = self._run(state, actions)
         self._proven = True
         if self.compiled:
@@ -377,7 +386,7 @@ class BallbotBatch:
         if noise.varies_robot:
             robot = ModelNumbers.of(noise.robot(self.params, now.drawn))
 
-        end = dynamics.step(robot, x, total, task.control_dt, self._substeps)
+        end = self._moved(robot, x, total)
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
         if self.params.grips:
             floor = dynamics.held_contact(robot, x, total, task.control_dt)
@@ -396,7 +405,11 @@ class BallbotBatch:
         if past:
             tried = (part.clamp(-1.0, 1.0) for part in asked)
             past = (*self._seen(now), *tried, *past)[: len(past)]
-        after = now._replace(x=end, steps=steps, actuator=actuator, past=past)
+        read = now.sensors
+        if read:
+            z = counter_rng.uniforms(counter_rng.key(state.seed, state.episode, steps), sensors.DRAWS, self.dtype)
+            read = sensors.following(robot, read, x, total, end, z, task.control_dt)
+        after = now._replace(x=end, steps=steps, actuator=actuator, past=past, sensors=read)
         new, observed = after, self._observe(after)
         observation = observed
         # Drawing the next episodes takes as long as the dynamics. Compiled code has no branches that depend on numbers.
@@ -422,6 +435,26 @@ class BallbotBatch:
         )
         return self._stacked(new), result
 
+    def _moved(
+        self, robot: Any, x: tuple[torch.Tensor, ...], force: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, ...]:
+        """The states after a control step."""
+        dt, slope = self.task.control_dt, self._slope
+        if slope is None:
+            return dynamics.step(robot, x, force, dt, self._substeps)
+        rows = (torch.stack(x),), (torch.stack(force),)
+        (end,) = dynamics.step(robot, *rows, dt, self._substeps, lambda _, x, u: (slope(*x, *u),))
+        return end.unbind(0)
+
+    def _compiled_slope(self) -> Any:
+        """`dynamics.derivative` of states (n, B) and forces (m, B), compiled."""
+        params = self.params
+
+        def slope(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+            return torch.stack(dynamics.derivative(params, x.unbind(0), u.unbind(0)))
+
+        return torch.compile(slope, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
+
     def _compilable(self, state: BatchState, actions: torch.Tensor) -> tuple[BatchState, BatchStep]:
         """`transition` with its flags as numbers 0 and 1: torch's CPU code generator stores bools one by one."""
         state, result = self._transition(state, actions)
@@ -443,17 +476,20 @@ class BallbotBatch:
         task, noise = self.task, self.randomization
         key = counter_rng.key(seed, episode, 0 * episode)
         varied = noise.varies_episodes
-        count = task.constant_draws + task.state_draws + noise.episode_draws * varied
+        senses = self.observation == "sensors"
+        count = task.constant_draws + task.state_draws + noise.episode_draws * varied + sensors.FIRST_DRAWS * senses
         z = counter_rng.uniforms(key, count, self.dtype)
         z_constants, z = z[: task.constant_draws], z[task.constant_draws :]
         constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
         state = task.start(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
         zero = torch.zeros_like(episode)
-        drawn = noise.draw(z[task.state_draws :], task.control_dt) if varied else ()
+        drawn = noise.draw(z[task.state_draws :][: noise.episode_draws], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
         forces = self.params.action_size
         actuator = (still,) * (forces + forces * self._past_steps) if noise.varies_actuator else ()
-        begun = _Rows(state, constants, zero, episode, seed, drawn, actuator, ())
+        robot: Any = ModelNumbers.of(noise.robot(self.params, drawn)) if noise.varies_robot else self.params
+        read = sensors.first(robot, state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
+        begun = _Rows(state, constants, zero, episode, seed, drawn, actuator, (), read)
         return begun._replace(past=self.history * (*self._seen(begun), *(still,) * forces)) if self.history else begun
 
     def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
@@ -474,13 +510,16 @@ class BallbotBatch:
 
     def _seen(self, now: _Rows) -> tuple[torch.Tensor, ...]:
         """The present observation with the sensors' noise, which depends on the number of steps taken in the episode."""
-        x = now.x
+        x, c = now.x, now.c
+        if self.task.clock:
+            c = self.task.at(c, now.steps.to(self.dtype) * self.task.control_dt)
+        if now.sensors:
+            return sensors.seen(now.sensors, c)
         if self.randomization.is_noisy:
             key = counter_rng.key(now.seed, now.episode, now.steps + 1)
             z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
             time = now.steps.to(self.dtype) * self.task.control_dt
             x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
-        c = self.task.at(now.c, now.steps.to(self.dtype) * self.task.control_dt) if self.task.clock else now.c
         return tuple(self.task.seen(x, c))
 
     def _stacked(self, rows: _Rows) -> BatchState:
@@ -518,7 +557,7 @@ def run_episodes(
         rows = torch.as_tensor(drawn.T, dtype=batch.dtype, device=batch.device).contiguous()
         batch.state = batch.state._replace(drawn=rows)
         if batch.history:  # the past before the episode has the drawn errors of sensors too
-            seen = batch.observe(batch.state).T[: batch.task.observation_size(batch.params)]
+            seen = batch.observe(batch.state).T[: sensors.observation_size(batch.task, batch.params, batch.observation)]
             begun = torch.cat([seen, torch.zeros_like(seen[: batch.params.action_size])])
             batch.state = batch.state._replace(past=begun.repeat(batch.history, 1))
         observation = batch.observe(batch.state)

@@ -26,7 +26,7 @@ forces of its wheels on the ball, N.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from ballbot_gym import omni, ops
@@ -222,7 +222,14 @@ def derivative(params: BallbotParams, x: Vector, u: Vector) -> Vector:
     return ops.stack(parts[4:8] + found[:4] + parts[9:10] + found[4:], like=x)
 
 
-def step(params: BallbotParams, x: Vector, u: Vector, dt: Any, substeps: int = 2) -> Vector:
+def step(
+    params: BallbotParams,
+    x: Vector,
+    u: Vector,
+    dt: Any,
+    substeps: int = 2,
+    slope: Callable[[BallbotParams, Any, Any], Any] = derivative,
+) -> Vector:
     """The state after dt seconds with the force held, by RK4.
 
     Args:
@@ -231,13 +238,14 @@ def step(params: BallbotParams, x: Vector, u: Vector, dt: Any, substeps: int = 2
         u: (..., 2) force, N, held over the step.
         dt: s.
         substeps: RK4 steps taken; `substeps_for(dt)` keeps each within RK4_STEP.
+        slope: what gives `derivative`, compiled perhaps.
 
     Returns:
         (..., 8) state, of the same kind as x.
     """
     parts, force = ops.components(x), ops.components(u)
     for _ in range(substeps):
-        parts = _rk4(params, parts, force, dt / substeps)
+        parts = _rk4(slope, params, parts, force, dt / substeps)
     return ops.stack(parts, like=x)
 
 
@@ -273,12 +281,12 @@ def substeps_for(dt: float) -> int:
     return max(1, math.ceil(dt / RK4_STEP - 1e-9))
 
 
-def _rk4(params: BallbotParams, x: tuple, u: tuple, dt: Any) -> tuple:
+def _rk4(slope: Callable[..., Any], params: BallbotParams, x: tuple, u: tuple, dt: Any) -> tuple:
     half, sixth = dt / 2, dt / 6
-    k1 = derivative(params, x, u)
-    k2 = derivative(params, _advance(x, half, k1), u)
-    k3 = derivative(params, _advance(x, half, k2), u)
-    k4 = derivative(params, _advance(x, dt, k3), u)
+    k1 = slope(params, x, u)
+    k2 = slope(params, _advance(x, half, k1), u)
+    k3 = slope(params, _advance(x, half, k2), u)
+    k4 = slope(params, _advance(x, dt, k3), u)
     return tuple([a + sixth * (b + 2 * (c + d) + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True)])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, sensors
 from ballbot_gym.checks import (
     check_constant_names,
     check_history,
@@ -56,9 +56,12 @@ class EnvState(NamedTuple):
     """What the simulator remembers besides the state; see `Simulator.memory`."""
     past: tuple[float, ...] = ()
     """What is observed of the present, and of the past behind it, where the env has a history."""
+    sensors: tuple[float, ...] = ()
+    """What sensors remember, where they are what is observed; see `sensors.MEMORY`."""
 
 
-@fixed("task", "params", "randomization", "history", "physics", "render_mode", "action_space", "observation_space")
+@fixed("task", "params", "randomization", "history", "observation", "physics", "render_mode")
+@fixed("action_space", "observation_space")
 class BallbotEnv(gymnasium.Env):
     """A ballbot that does one task. The task's docstring lists observation, action, cost and ends of episodes.
 
@@ -111,6 +114,7 @@ class BallbotEnv(gymnasium.Env):
         randomization: Randomization | str | None = None,
         robot: str | BallbotParams = PAPER,
         history: int = 0,
+        observation: str = "state",
         **task_fields: Any,
     ):
         """Makes the environment; usually through `gymnasium.make("BallbotStabilize-v0", ...)`.
@@ -130,6 +134,7 @@ class BallbotEnv(gymnasium.Env):
                 episodes for some.
             history: so many earlier observations follow the present one in each observation, the latest first, each with the
                 action (2) that was taken on it. Before the episode began they are the first one, with the action 0.
+            observation: "state"; or "sensors" of a robot with wheels, as `ballbot_gym.sensors` says.
             **task_fields: fields of the task that replace its defaults, as `duration=4.0`.
 
         Raises:
@@ -158,11 +163,13 @@ class BallbotEnv(gymnasium.Env):
         self._disturbance = (
             Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
         )
-        self._noisy = self.randomization.is_noisy
+        self.observation = sensors.check_observation(observation, self.params, self.randomization)
+        self._sensors: tuple[float, ...] = ()
+        self._noisy = self.randomization.is_noisy or self.observation == "sensors"
         self.history = check_history(history)
-        self.observation_space = observation_space(self.task, self.params, self.history)
-        own, forces = self.task.observation_size(self.params), self.params.action_size
-        self._past = np.zeros(own + self.history * (own + forces), np.float32) if self.history else None
+        self.observation_space = observation_space(self.task, self.params, self.history, self.observation)
+        self._own_size = sensors.observation_size(self.task, self.params, self.observation)
+        self._past = np.zeros(self.observation_space.shape, np.float32) if self.history else None
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: Judge | None = None  # in machine code
@@ -207,6 +214,9 @@ class BallbotEnv(gymnasium.Env):
             if self.randomization.varies_robot:
                 self._simulator.set_params(self._disturbance.params)
         self._simulator.reset(self._state)
+        if self.observation == "sensors":
+            z = tuple(self.np_random.random(sensors.FIRST_DRAWS).tolist())
+            self._sensors = sensors.first(self.episode_params, x, z, self.task.control_dt)
         self._steps_left, self._taken = self._steps, 0
         if self._human:
             self.render()
@@ -238,6 +248,11 @@ class BallbotEnv(gymnasium.Env):
             self._note(action)
         before = self._state
         self._state = x = self._simulator.step(total)
+        if self._sensors:
+            z = tuple(self.np_random.random(sensors.DRAWS).tolist())
+            self._sensors = sensors.following(
+                self.episode_params, self._sensors, before, total, x, z, self.task.control_dt
+            )
         self._steps_left -= 1
         grip, kept = _NO_GRIP, 0.0
         if self._grips:
@@ -271,13 +286,13 @@ class BallbotEnv(gymnasium.Env):
 
     def _forget(self) -> None:
         """Makes the past what it is when an episode begins."""
-        past, own = self._past, self.task.observation_size(self.params)
+        past, own = self._past, self._own_size
         assert past is not None
         past[own:] = np.tile(np.append(past[:own], (0.0,) * self.params.action_size), self.history)
 
     def _note(self, action: Any) -> None:
         """Moves what was observed, and the action on it, into the past."""
-        past, own, forces = self._past, self.task.observation_size(self.params), self.params.action_size
+        past, own, forces = self._past, self._own_size, self.params.action_size
         assert past is not None
         past[2 * own + forces :] = past[own : -(own + forces)].copy()
         past[own : 2 * own] = past[:own]
@@ -339,7 +354,8 @@ class BallbotEnv(gymnasium.Env):
         rng = dict(self.np_random.bit_generator.state)
         memory = self._simulator.memory()
         past = () if self._past is None else tuple(self._past.tolist())
-        return EnvState(self.task, self._state, self._constants, self._steps_left, rng, disturbance, memory, past)
+        held = self._state, self._constants, self._steps_left, rng, disturbance, memory, past, self._sensors
+        return EnvState(self.task, *held)
 
     def set_state(self, state: EnvState) -> None:
         """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
@@ -359,6 +375,9 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError("the state is of an env with other randomization")
         if len(state.past) != (0 if self._past is None else len(self._past)):
             raise ValueError("the state is of an env with another history")
+        if bool(state.sensors) != (self.observation == "sensors"):
+            raise ValueError("the state is of an env with another observation")
+        self._sensors = state.sensors
         if self._past is not None:
             self._past[:] = state.past
         self._set_constants(state.constants)
@@ -493,10 +512,12 @@ class BallbotEnv(gymnasium.Env):
 
     def _observed(self) -> tuple[float, ...]:
         """(no) observation of the present state, with the sensors' noise."""
-        x = self._state
+        x, c = self._state, self.task.at(self._constants, self._taken * self.task.control_dt)
+        if self._sensors:
+            return sensors.seen(self._sensors, c)
         if self._disturbance is not None:
             x = self._disturbance.sensed(x, self.np_random, self._taken * self.task.control_dt)
-        return self.task.seen(x, self.task.at(self._constants, self._taken * self.task.control_dt))
+        return self.task.seen(x, c)
 
     def _shown(
         self,
@@ -550,9 +571,9 @@ GRIP = "grip"
 """The limit that a robot violates that loses its grip."""
 
 
-def observation_space(task: Task, params: BallbotParams, history: int = 0) -> spaces.Box:
+def observation_space(task: Task, params: BallbotParams, history: int = 0, observation: str = "state") -> spaces.Box:
     """What a robot can observe in a task, with so many earlier observations and actions."""
-    own = task.observation_size(params)
+    own = sensors.observation_size(task, params, observation)
     size = own + history * (own + params.action_size)
     return spaces.Box(-_LARGEST_OBSERVATION, _LARGEST_OBSERVATION, (size,), np.float32)
 

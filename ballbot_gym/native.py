@@ -83,6 +83,7 @@ class BallbotNative:
         """
         self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
         self.randomization, self.history, self.threads = Randomization(), 0, threads
+        self.observation = "state"
         self._state: State = None
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
@@ -241,7 +242,7 @@ class BallbotNative:
             np.zeros((rows, size), self.dtype) for rows in (self.params.state_size, len(self.task.constant_names), 0)
         )
         seeds = np.array(seeds_of(self._entropy, size))
-        fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none, none)
+        fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none, none, none)
         return BatchState(*fields)
 
     def _start(self, which: np.ndarray, state: State, given: bool = False) -> None:

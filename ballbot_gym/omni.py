@@ -162,6 +162,13 @@ def relative_turning(params: Any, x: Vector) -> tuple[tuple[Any, Any, Any], tupl
     return tuple(_dot(row, speeds) for row in zip(*columns, strict=True)), columns
 
 
+def wheel_speeds(params: Any, w: tuple[Any, Any, Any]) -> tuple[Any, ...]:
+    """The wheels' speeds (3), rad/s, against the body, over which the ball turns at w, rad/s, in the body's own frame."""
+    w1, w2, w3 = w
+    ratio = params.ball_radius / params.wheels.radius
+    return tuple([ratio * (_SIN * w3 - _COS * (math.cos(a) * w1 + math.sin(a) * w2)) for a in _AZIMUTHS])
+
+
 def mass_matrix(params: Any, x: Vector, columns: tuple[tuple[Any, ...], ...]) -> list[list[Any]]:
     """M (6, 6) at state x (..., 11), with J by columns."""
     _, _, gamma, theta, *_ = ops.components(x)

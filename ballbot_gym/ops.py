@@ -58,6 +58,11 @@ def arctan(a: Any) -> Any:
     return math.atan(a) if isinstance(a, float | int) else _library(a).arctan(a)
 
 
+def floor(a: Any) -> Any:
+    """The greatest whole number that is not above a, elementwise."""
+    return float(math.floor(a)) if isinstance(a, float) else _library(a).floor(a)
+
+
 def clip(a: Any, low: Any, high: Any) -> Any:
     """The nearest number in [low, high], elementwise; NaN stays NaN, but not with CasADi."""
     if isinstance(a, float | int):

@@ -136,11 +136,14 @@ def robot_setting(robot: str) -> dict[str, str]:
 def robot_name(params: BallbotParams) -> str:
     """The name in `ROBOTS` of a robot, or of the one that it is a variant of.
 
-    With another friction it is the same robot. Any other is taken for the paper's, or for "rolling" if its ball rolls.
+    With another friction it is the same robot. Any other is taken for the paper's, or for "rolling" if its ball rolls, or for
+    "omni" if it has wheels.
     """
     for name in ROBOTS:
         if replace(named_robot(name), friction=params.friction) == params:
             return name
+    if params.wheels is not None:
+        return "omni"
     return "rolling" if params.rolls else PAPER
 
 

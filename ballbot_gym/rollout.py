@@ -109,18 +109,23 @@ def rollout(
 
     Args:
         env: a BallbotEnv, wrapped or not; its wrappers are bypassed.
-        controller: gets the state as the env's sensors report it. Without sensor noise this is the true state.
+        controller: gets the state as the env's sensors report it. Without sensor noise this is the true state. In an env
+            with observation="sensors" it gets what they show, and must have an attribute `senses` that is true.
         seed: as for `env.reset`.
         options: as for `env.reset`.
 
     Raises:
+        ValueError: the env shows sensors, and the controller wants states.
         Exception: what the controller's `reset` raises, for instance a PlanError where it found no plan.
     """
     ballbot = cast(BallbotEnv, env.unwrapped)
     task, dt, limit = ballbot.task, ballbot.task.control_dt, ballbot.params.force_limit
-    _, info = ballbot.reset(seed=seed, options=options)
+    senses = ballbot.observation == "sensors"
+    if senses and not getattr(controller, "senses", False):
+        raise ValueError(f'{type(controller).__name__} wants states; behind a filter, as "lqr-ekf", it takes sensors')
+    observation, info = ballbot.reset(seed=seed, options=options)
     x, c = info["state"], info["constants"]
-    seen = sensed(ballbot, x, 0.0)
+    seen = observation if senses else sensed(ballbot, x, 0.0)
     start = time.perf_counter()
     controller.reset(0.0, seen, c)
     reset_seconds = time.perf_counter() - start
@@ -130,9 +135,9 @@ def rollout(
         start = time.perf_counter()
         u = controller.act(len(forces) * dt, seen)
         act_seconds.append(time.perf_counter() - start)
-        _, _, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
+        observation, _, terminated, truncated, info = ballbot.step(np.asarray(u) / limit)
         x, done = info["state"], terminated or truncated
-        seen = sensed(ballbot, x, (len(forces) + 1) * dt)
+        seen = observation if senses else sensed(ballbot, x, (len(forces) + 1) * dt)
         cost += info["cost"]
         states.append(x)
         forces.append(info["force"])

@@ -81,7 +81,7 @@ class VectorState(NamedTuple):
     """(B,) bool: the episode has ended, and the next one has not begun."""
 
 
-@fixed("task", "params", "randomization", "history", "num_envs", "render_mode", "autoreset_mode")
+@fixed("task", "params", "randomization", "history", "observation", "num_envs", "render_mode", "autoreset_mode")
 @fixed("action_space", "observation_space", "single_action_space", "single_observation_space")
 class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     """Many ballbots in one Gymnasium `VectorEnv`: `gymnasium.make_vec("BallbotStabilize-v0", num_envs=1024)`.
@@ -121,6 +121,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         engine: str = "auto",
         robot: str | BallbotParams = PAPER,
         history: int = 0,
+        observation: str = "state",
         **task_fields: Any,
     ):
         """Makes the environments. Arguments that are not listed are those of `BallbotBatch`.
@@ -132,10 +133,10 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             max_episode_steps: control steps after which an episode is truncated that the task has not ended, as by
                 Gymnasium's `TimeLimit` in `gymnasium.make`. It changes neither pay nor goal, as the task's `duration` does.
             engine: "native" computes all envs at once in machine code, which a C compiler makes within a second or two,
-                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization` and no history.
-                "torch" computes them in torch, and `compile` says whether that is compiled. "auto" takes "native" where it
-                can on a CPU, unless compile is True or False; else "torch". Both run the same episodes, to rounding. `batch`
-                is a `BallbotNative` or a `BallbotBatch`.
+                once per task and machine; it needs CasADi and no gradients, and knows no `Randomization`, no history and no
+                sensors. "torch" computes them in torch, and `compile` says whether that is compiled. "auto" takes "native"
+                where it can on a CPU, unless compile is True or False; else "torch". Both run the same episodes, to
+                rounding. `batch` is a `BallbotNative` or a `BallbotBatch`.
 
         Raises:
             ValueError: a render mode, autoreset mode, physics, number of steps or engine that is not listed, or as
@@ -155,15 +156,16 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         real: torch.dtype = dtype_named(dtype)
         self._dtype = np.float32 if real == torch.float32 else np.float64
-        self.batch = _batch(task, num_envs, device, real, compile, params, randomization, engine, history)
+        seen = {"randomization": randomization, "history": history, "observation": observation}
+        self.batch = _batch(task, num_envs, device, real, compile, params, engine, seen)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
-        self.history = self.batch.history
+        self.history, self.observation = self.batch.history, self.batch.observation
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
         fps = round(1 / self.task.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._ended = np.zeros(self.num_envs, np.bool_)  # whose episodes have ended and not begun anew
         self.single_action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
-        self.single_observation_space = observation_space(self.task, self.params, self.history)
+        self.single_observation_space = observation_space(self.task, self.params, self.history, self.observation)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._most_steps = _most_steps(max_episode_steps, self.task)
@@ -507,26 +509,25 @@ def _batch(
     dtype: torch.dtype,
     compile: bool | str,
     params: BallbotParams,
-    randomization: Randomization | str | None,
     engine: str,
-    history: int,
+    seen: dict[str, Any],
 ) -> "BallbotBatch | BallbotNative":
     """The envs of an engine; see `BallbotVectorEnv`."""
     numbers = np.float32 if dtype == torch.float32 else np.float64
     if engine == "native" or (engine == "auto" and torch.device(device).type == "cpu" and compile == "auto"):
         # made in any case, because it checks the arguments; it allocates nothing
-        checked = BallbotBatch(task, num_envs, device, dtype, False, params, randomization, history=history)
+        checked = BallbotBatch(task, num_envs, device, dtype, False, params, **seen)
         native = _native(checked, numbers, must=engine == "native")
         if native is not None:
             return native
-    return BallbotBatch(task, num_envs, device, dtype, compile, params, randomization, history=history)
+    return BallbotBatch(task, num_envs, device, dtype, compile, params, **seen)
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
     """The envs of a batch in machine code. Where that is not possible: None, or an error if it must be."""
-    if batch.randomization != Randomization() or batch.history:
+    if batch.randomization != Randomization() or batch.history or batch.observation != "state":
         if must:
-            raise ValueError('engine="native" knows no Randomization and no history; take engine="torch"')
+            raise ValueError('engine="native" knows no Randomization, no history and no sensors; take engine="torch"')
         return None
     try:
         from ballbot_gym.native import BallbotNative, NativeUnavailableError

@@ -91,6 +91,12 @@ def test_every_shipped_policy_passes_the_test_in_its_file(name, tmp_path):
     assert told.stdout.startswith(b"PASS")
 
 
+def test_lqr_of_a_robot_with_wheels_passes_the_test_in_its_file(tmp_path):
+    export(LQR, format="c", out=tmp_path / "lqr.c", robot="omni")
+    told = subprocess.run([built(tmp_path / "lqr.c", tmp_path / "lqr", "-DBALLBOT_TEST")], capture_output=True)
+    assert told.stdout.startswith(b"PASS")
+
+
 @pytest.mark.parametrize(
     ("task", "fields"),
     [

@@ -1,5 +1,6 @@
 """A robot with three omni-wheels: its equations, its contact, and its engines."""
 
+import copy
 import dataclasses
 import math
 
@@ -10,6 +11,7 @@ import pytest
 from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.trajopt import TrajoptController
 from ballbot_gym import dynamics, omni
+from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.omni import Wheels
@@ -18,7 +20,9 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
 from ballbot_gym.two_forces import TwoForces
+from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.play.world import World
+from ballbot_train.policy import PolicyController, PolicyNetwork
 from ballbot_train.policy_files import PolicySpec
 
 SPREAD = np.array([1, 1, 0.8, 0.8, 2, 2, 2, 2, 3, 3, 5.0])
@@ -237,6 +241,21 @@ def test_batches_move_as_single_envs_do(engine, rng):
     )
 
 
+@pytest.mark.slow  # compiling takes a quarter of a minute
+def test_a_batch_whose_equations_are_compiled_agrees_with_an_eager_one():
+    torch = pytest.importorskip("torch")
+    batches = [
+        BallbotBatch("stabilize", 4, compile=compile, robot="omni", observation="sensors") for compile in (True, False)
+    ]
+    for batch in batches:
+        batch.reset(seed=0)
+    actions = 0.1 * torch.ones(4, 3)
+    batches[0].step(actions), batches[1].step(actions)
+    results = [batch.step(actions) for batch in (*batches, copy.deepcopy(batches[0]))]
+    for result in results[1:]:
+        torch.testing.assert_close(result.final_x, results[0].final_x, rtol=1e-4, atol=1e-5)
+
+
 def test_two_forces_balance_it_and_hold_its_heading():
     env = TwoForces(BallbotEnv(robot="omni", physics="rk4"))
     gain = two_force_gain(env.unwrapped.params) / (omni.LEAST_FORCE * env.unwrapped.params.force_limit)
@@ -262,6 +281,30 @@ def test_a_tracked_plan_comes_to_rest_at_the_cost_that_it_said():
     assert np.min(limits) >= 0
 
 
+@pytest.mark.parametrize(
+    ("learner", "settings"),
+    [
+        ("shac", {"horizon": 0, "num_envs": 16, "episode_seconds": 0.3}),
+        ("shac", {"horizon": 2, "num_envs": 3}),
+        ("dagger", {"batch_episodes": 0, "episodes_per_iteration": 1, "candidate_episodes": 0, "gradient_steps": 2}),
+    ],
+)
+def test_learners_command_three_motors(robot, learner, settings):
+    task = make_task("stabilize", "omni", duration=3.0)
+    algorithm = LEARNERS[learner]
+    settings = dataclasses.replace(algorithm.settings("stabilize"), iterations=1, hidden=(8,), **settings)
+    made = algorithm.make(task, robot, settings, seed=0)
+    episode = rollout(BallbotEnv(task, robot=robot, physics="rk4"), PolicyController(task, robot, made.network), seed=0)
+    assert episode.success  # it starts as LQR
+    before = {name: part.clone() for name, part in made.network.state_dict().items()}
+    made.iterate()
+    assert made.network.spec == PolicySpec.of(task, "omni", hidden=(8,))
+    assert all(part.isfinite().all() for part in made.network.state_dict().values())
+    assert any((part != before[name]).any() for name, part in made.network.state_dict().items())
+    with pytest.raises(ValueError, match="cannot start one of"):
+        algorithm.make(task, robot, settings, 0, start=PolicyNetwork(PolicySpec.of(task, hidden=(8,))))
+
+
 def test_a_free_heading_costs_nothing(robot):
     x, held = np.zeros(11), make_task("turn", "omni")
     x[8] = 0.5
@@ -285,7 +328,9 @@ def test_what_knows_no_wheels_says_so(robot):
         batched.find_optima(task, robot, np.zeros((1, 8)), np.zeros((1, 0)))
     with pytest.raises(ValueError, match="pushes are forces Fx, Fy, which a robot with wheels does not have"):
         BallbotEnv(robot="omni", physics="rk4", randomization=Randomization(push_impulse=(1.0, 2.0)))
-    with pytest.raises(ValueError, match="omni has three wheels"):
-        PolicySpec.of(task, robot="omni")
+    with pytest.raises(ValueError, match="omni has three wheels, and neither a frame nor mirror images"):
+        PolicySpec.of(task, robot="omni", frame="orbit")
+    with pytest.raises(ValueError, match="sac here knows no robot with wheels"):
+        LEARNERS["sac"].make(task, robot, LEARNERS["sac"].settings("stabilize"), 0)
     with pytest.raises(ValueError, match="the playground knows no robot with wheels"):
         World("stabilize", "omni")

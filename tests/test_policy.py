@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.engines import default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.robots import ROBOTS, named_robot
@@ -132,7 +133,7 @@ def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robo
     described = read_description(shipped_policies(make_task(name, robot), robot)[learner])
     assert described["training"]["command"].startswith("ballbot ")
     measured = described["measured"]
-    assert measured["physics"] == "bullet"
+    assert measured["physics"] == default_physics(named_robot(robot))
     assert measured["episodes"] == 200
     row = evaluate(learner, name, episodes=2, robot=robot)
     assert row.success >= measured["success"] - 0.2

@@ -1,22 +1,30 @@
-"""An extended Kalman filter for the state, the robot, its delay and the errors of its sensors, on a track that varies them.
+"""Extended Kalman filters: for what a track does not tell, and for the state of a robot with wheels from its sensors.
 
-The filter estimates z = (x, factors of body mass, height of the centre of mass and force, odometry's drift, biases of leans
-and of lean rates), which is 17 numbers. Its model is the env's control step, and its Jacobian is CasADi's. What sensors
-report is linear in z. How far each number may be from what is expected, and how noisy sensors are, is the track's: a number
-that the track does not vary stays what it is.
+`TrackFilter` estimates z = (x, factors of body mass, height of the centre of mass and force, odometry's drift, biases of
+leans and of lean rates), which is 17 numbers, on a track that varies them. Its model is the env's control step, and its
+Jacobian is CasADi's. What sensors report is linear in z. How far each number may be from what is expected, and how noisy
+sensors are, is the track's: a number that the track does not vary stays what it is.
 
 A delay is whole control steps, so there is one filter for each delay that the track may draw. The one whose predictions were
 likeliest is believed.
+
+`SensorFilter` estimates the state and the gyroscope's biases, which is 14 numbers, from what `ballbot_gym.sensors` shows.
+Readings are of a control step as a whole, so they correct the state in which the step began, and from there the model goes
+on. Before the first of them the filter expects what the task draws, at the place where the episode begins.
 """
 
 from functools import lru_cache
+from typing import Any
 
 import casadi
+import gymnasium
 import numpy as np
 
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, sensors
+from ballbot_gym.env import BallbotEnv, observation_space
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
 
 FACTORS = ("body_mass", "com_height", "force")
@@ -44,6 +52,10 @@ class TrackFilter:
     """
 
     def __init__(self, task: Task, params: BallbotParams, track: Randomization):
+        if params.wheels is not None:
+            raise ValueError(
+                "what a track does not tell is not estimated of a robot with wheels; give lqr, trajopt or nmpc"
+            )
         self._params, self._track = params, track
         low, high = track.delay_steps(task.control_dt)
         self._delays = range(low, high + 1)
@@ -90,11 +102,8 @@ class TrackFilter:
         h[range(8), [11, 12, 13, 14, 11, 12, 15, 16]] = [t, t, 1, 1, 1, 1, 1, 1]
         missed = np.asarray(x, np.float64) - self._z @ h.T
         spread = h @ self._p @ h.T + self._noise
-        gain = np.linalg.solve(spread, h @ self._p).transpose(0, 2, 1)
-        self._z = self._z + np.einsum("kij,kj->ki", gain, missed)
+        self._z, self._p = _corrected(self._z, self._p, h, missed, self._noise)
         self._z[:, _FACTORS] = np.clip(self._z[:, _FACTORS], self._low, self._high)
-        kept = np.eye(_SIZE) - gain @ h
-        self._p = kept @ self._p @ kept.transpose(0, 2, 1) + gain @ self._noise @ gain.transpose(0, 2, 1)
         whitened = np.einsum("ki,ki->k", missed, np.linalg.solve(spread, missed[..., None])[..., 0])
         return -0.5 * (whitened + np.linalg.slogdet(spread)[1])
 
@@ -139,3 +148,146 @@ def _step_function(params: BallbotParams, dt: float) -> casadi.Function:
     x = dynamics.step(robot, z[_X], force * u, dt, dynamics.substeps_for(dt))
     after = casadi.vertcat(x, z[8:])
     return casadi.Function("step", [z, u], [after, casadi.densify(casadi.jacobian(after, z))], {"cse": True})
+
+
+def _corrected(
+    z: np.ndarray, p: np.ndarray, h: np.ndarray, missed: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates z (..., n) and covariances (..., n, n), corrected by what h (m, n) missed (..., m), with its noise (m, m)."""
+    gain = np.linalg.solve(h @ p @ h.T + noise, h @ p).swapaxes(-1, -2)
+    kept = np.eye(z.shape[-1]) - gain @ h
+    p = kept @ p @ kept.swapaxes(-1, -2) + gain @ noise @ gain.swapaxes(-1, -2)
+    return z + np.einsum("...ij,...j->...i", gain, missed), p
+
+
+_WHEELS_SIZE = 14
+_DRAWN = 256  # starts that tell what to expect of one
+_KNOWN = 1e-3  # standard deviation of what they all share, SI units
+_WHEELS_ERROR = (
+    np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
+)  # variances that the model does not explain
+
+
+class SensorFilter:
+    """Estimates the state of a robot with wheels from its sensors and the forces of its wheels.
+
+    | attribute | shape | meaning |
+    |---|---|---|
+    | `x` | (11,) | the state |
+    | `covariance` | (14, 14) | of the state and the gyroscope's biases |
+    """
+
+    def __init__(self, task: Task, params: BallbotParams):
+        self._task, self._params = task, params
+        self._functions = _sensor_functions(params, task.control_dt)
+        samples = sensors.samples(task.control_dt)
+        noise = [sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [sensors.ACCELEROMETER_NOISE**2 / samples] * 3
+        self._noise = np.diag([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+
+    def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
+        """Starts an episode with constants c (nc,), of which sensors show this (no,) at first."""
+        rng = np.random.default_rng(0)
+        draws = rng.random((_DRAWN, self._task.state_draws))
+        starts = np.array([self._task.start(tuple(z), tuple(c), self._params) for z in draws.tolist()])
+        starts[:, :2] = seen[9:11]
+        self._z = np.concatenate([starts.mean(0), np.zeros(3)])
+        self._p = np.diag([*np.maximum(starts.std(0), _KNOWN), *[sensors.GYROSCOPE_BIAS] * 3]) ** 2
+        self._correct(seen, *self._functions[0](self._z))
+
+    def update(self, seen: np.ndarray, u: np.ndarray) -> None:
+        """Takes what sensors show (no,) after a control step with the wheels' forces u (3,), N."""
+        u = np.clip(u, -self._params.force_limit, self._params.force_limit)
+        self._correct(seen, *self._functions[1](self._z, u))
+        after, slopes = self._functions[2](self._z, u)
+        self._z, slopes = np.array(after)[:, 0], np.array(slopes)
+        self._p = slopes @ self._p @ slopes.T + np.diag(_WHEELS_ERROR)
+
+    def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
+        missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - np.array(expected)[:, 0]
+        self._z, self._p = _corrected(self._z, self._p, np.array(slopes), missed, self._noise)
+
+    @property
+    def x(self) -> np.ndarray:
+        return self._z[:11].copy()
+
+    @property
+    def covariance(self) -> np.ndarray:
+        return self._p.copy()
+
+
+class FilteredController:
+    """A controller behind `SensorFilter`, for envs that show sensors; `filter` is what it knows."""
+
+    senses = True
+
+    def __init__(self, task: Task, params: BallbotParams, controller: Controller):
+        self.filter, self._controller = SensorFilter(task, params), controller
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        """Starts at the episode's time t, s, where sensors show x (no,)."""
+        self.filter.reset(x, c)
+        self._u: np.ndarray | None = None
+        self._controller.reset(t, self.filter.x, c)
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        if self._u is not None:
+            self.filter.update(x, self._u)
+        self._u = np.asarray(self._controller.act(t, self.filter.x))
+        return self._u
+
+
+class StateFromSensors(gymnasium.Wrapper):
+    """Shows a policy the observation of the state that `SensorFilter` estimates, in an env that shows sensors."""
+
+    def __init__(self, env: gymnasium.Env):
+        """Args: env: a `BallbotEnv` with observation="sensors" and without history, wrapped or not."""
+        super().__init__(env)
+        ballbot: Any = env.unwrapped
+        if not isinstance(ballbot, BallbotEnv) or ballbot.observation != "sensors" or ballbot.history:
+            raise ValueError('StateFromSensors takes a BallbotEnv with observation="sensors" and without history')
+        self._task, self._limit = ballbot.task, ballbot.params.force_limit
+        self.observation_space = observation_space(ballbot.task, ballbot.params)
+        self.filter = SensorFilter(ballbot.task, ballbot.params)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        seen, info = self.env.reset(seed=seed, options=options)
+        self.filter.reset(seen, info["constants"])
+        self._steps = 0
+        return self._state(info), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        self.filter.update(seen, info["force"])
+        self._steps += 1
+        return self._state(info), reward, terminated, truncated, info
+
+    def _state(self, info: dict[str, Any]) -> np.ndarray:
+        c = self._task.at(info["constants"], self._steps * self._task.control_dt)
+        return np.array(self._task.seen(self.filter.x, c), np.float32)
+
+
+@lru_cache(maxsize=16)
+def _sensor_functions(params: BallbotParams, dt: float) -> list[casadi.Function]:
+    """Readings at an episode's start and over a control step of dt, s, and the step itself, of z and the wheels' forces.
+
+    Each gives its Jacobian with respect to z too.
+    """
+    z, u = casadi.SX.sym("z", _WHEELS_SIZE), casadi.SX.sym("u", 3)
+    x, bias = casadi.vertsplit(z[:11]), casadi.vertcat(z[11:], casadi.DM.zeros(6))
+    after = dynamics.step(params, z[:11], u, dt, dynamics.substeps_for(dt))
+    forces = tuple(casadi.vertsplit(u))
+    first = sensors.undriven(params, tuple(x), dt)
+    following = sensors.mean(params, tuple(x), forces, tuple(casadi.vertsplit(after)), dt)
+    outputs = {
+        "first": casadi.vertcat(*first) + bias,
+        "following": casadi.vertcat(*following) + bias,
+        "step": casadi.vertcat(after, z[11:]),
+    }
+    return [
+        casadi.Function(
+            name, [z] if name == "first" else [z, u], [out, casadi.densify(casadi.jacobian(out, z))], {"cse": True}
+        )
+        for name, out in outputs.items()
+    ]

@@ -42,17 +42,22 @@ def equilibrium_gain(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.
 
     Returns:
         The action per observation (2, 8), and the cost-to-go per squared observation (8, 8). The first eight observations
-        of such a task are the scaled errors of the state. None for every other task.
+        of such a task are the scaled errors of the state. With wheels all no observations count: (3, no) and (no, no). None
+        for every other task.
     """
-    if task.clock or params.wheels is not None:
+    if task.clock:
         return None
     x, c = task.sample(np.random.default_rng(0), params)
     reference = task.reference(x, c, params)
     if task.first_exit or len(reference.x) > 1 or np.abs(np.asarray(task.observe(reference.x[0], c))[:8]).max() > 0:
         return None
-    k, p = discrete_lqr(task, params, reference.x[0], reference.u[0], c)
-    scale = np.array(task.observation_scale[:8])
-    return -k * scale / params.force_limit, p * np.outer(scale, scale)
+    (x,), (u,) = omni.with_wheels(params, reference.x, reference.u)
+    k, p = discrete_lqr(task, params, x, u, c)
+    of_observation = np.zeros((len(x), 8 if params.wheels is None else task.observation_size(params)))
+    of_observation[range(8), range(8)] = task.observation_scale[:8]
+    if params.wheels is not None:  # sin ψ, and the others as `Task.seen` scales them
+        of_observation[range(8, 11), range(-3, 0)] = 1.0, 5.0, 5.0
+    return -k @ of_observation / params.force_limit, of_observation.T @ p @ of_observation
 
 
 def is_equilibrium(params: BallbotParams, x: np.ndarray, u: np.ndarray) -> bool:

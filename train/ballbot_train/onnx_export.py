@@ -60,21 +60,26 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = P
     return files.write(path, model.SerializeToString())
 
 
+_FORCES = "force Fx, Fy on the ball in the world's frame, in units of force_limit_newton, in [-1, 1]"
+_TORQUES = "torque of each motor at standstill, as its pull on the ball, in units of force_limit_newton, in [-1, 1]"
+_HEADING = "\n\nThen cos psi, sin psi, and the rates of psi and of the ball's spin divided by 5 rad/s."
+
+
 def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, str]:
     """What an ONNX file says of its policy: task, layouts and units of input and output, rate, and where it comes from."""
-    described = read_description(policy)
+    described, params = read_description(policy), named_robot(robot)
     learner = described.get("training", {}).get("learner", "unknown")
     return {
         "task": task.id,
         "problem": task.problem(),
         "robot": robot,
-        "observation": observation_table(task),
+        "observation": observation_table(task) + _HEADING * (params.wheels is not None),
         "observation_scale": json.dumps(task.observation_scale),
         "history": str(described.get("spec", {}).get("history", 0)),
         "observation_version": str(OBSERVATION_VERSION),
         "constants": json.dumps(task.constant_names),
-        "action": "force Fx, Fy on the ball in the world's frame, in units of force_limit_newton, in [-1, 1]",
-        "force_limit_newton": repr(float(named_robot(robot).force_limit)),
+        "action": _TORQUES if params.wheels is not None else _FORCES,
+        "force_limit_newton": repr(float(params.force_limit)),
         "control_dt_seconds": repr(task.control_dt),
         "learner": str(learner),
         "weights_sha256": weights_digest(policy),

@@ -44,11 +44,11 @@ _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.S
 class PolicyNetwork(torch.nn.Module):
     """action = squash(W o + MLP(o)): the sum of a linear part, which LQR's gain can initialize, and a network.
 
-    Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit. With a frame, o and the
-    action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so it mirrors exactly.
-    A centred policy takes from the sum what it is in the steady motion in which the episode shall end, and adds the action
-    that keeps it: so it rests at its goal, or orbits on the circle, and not beside it. With routes, a network of its own
-    decides on which sides obstacles are passed.
+    Observations o (..., no) to actions (..., 2) in [−1, 1], forces in units of the robot's limit; with wheels (..., 3).
+    With a frame, o and the action are those of the frame. With mirrors, the sum is averaged over the mirror images, and so
+    it mirrors exactly. A centred policy takes from the sum what it is in the steady motion in which the episode shall end,
+    and adds the action that keeps it: so it rests at its goal, or orbits on the circle, and not beside it. With routes, a
+    network of its own decides on which sides obstacles are passed.
 
     With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in.
     """
@@ -64,14 +64,14 @@ class PolicyNetwork(torch.nn.Module):
         ]
         self.routes = Routes(spec.frame, spec.routes, device) if spec.frame is not None and spec.routes else None
         inputs = spec.observations if self._frame is None else self._frame.size
-        inputs += spec.history * (inputs + 2)
+        inputs += spec.history * (inputs + spec.actions)
         self._steady = self._frame.steady if self._frame is not None and spec.centred else None
-        self.linear = torch.nn.Linear(inputs, 2, bias=not spec.odd, **own) if spec.linear else None
+        self.linear = torch.nn.Linear(inputs, spec.actions, bias=not spec.odd, **own) if spec.linear else None
         widths = (inputs, *spec.hidden)
         layers: list[torch.nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(widths):
             layers += [torch.nn.Linear(fan_in, fan_out, bias=not spec.odd, **own), _ACTIVATIONS[spec.activation]()]
-        last = torch.nn.Linear(widths[-1], 2, bias=not spec.odd, **own)
+        last = torch.nn.Linear(widths[-1], spec.actions, bias=not spec.odd, **own)
         if spec.linear:  # so that the policy starts as its linear part
             for part in last.parameters():
                 torch.nn.init.zeros_(part)
@@ -233,10 +233,9 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
             f"{description_path} reads observation version {spec.observation_version}, this is {OBSERVATION_VERSION}; "
             "train it anew"
         )
-    if spec.observations != len(task.observation_scale):
-        raise PolicyError(
-            f"{description_path} takes {spec.observations} observations, {task.id} has {len(task.observation_scale)}"
-        )
+    observations = task.observation_size(named_robot(spec.robot))
+    if spec.observations != observations:
+        raise PolicyError(f"{description_path} takes {spec.observations} observations, {task.id} has {observations}")
     weights = _read_weights(weights_path)
     # shapes without memory, which a wrong description would ask for
     shapes = {name: tuple(part.shape) for name, part in PolicyNetwork(spec, "meta").state_dict().items()}

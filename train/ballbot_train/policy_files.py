@@ -81,11 +81,8 @@ class PolicySpec:
             raise ValueError(f"task must be text, not {self.task!r}")
         if self.robot not in ROBOTS:
             raise ValueError(f"robot must be one of {', '.join(ROBOTS)}, not {self.robot!r:.200}")
-        if named_robot(self.robot).wheels is not None:
-            raise ValueError(
-                f"policies command two forces, and {self.robot} has three wheels; train one with Stable-Baselines3 on "
-                "ballbot_gym.two_forces.TwoForces, or on the env itself"
-            )
+        if named_robot(self.robot).wheels is not None and (self.frame is not None or self.mirrors):
+            raise ValueError(f"{self.robot} has three wheels, and neither a frame nor mirror images")
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
         check_history(self.history)
@@ -107,8 +104,10 @@ class PolicySpec:
         if len(self.mirrors) > _MOST_MIRRORS:
             raise ValueError(f"mirrors must be at most {_MOST_MIRRORS}, not {len(self.mirrors)}")
         for signs, action in self.mirrors:
-            if len(signs) != self.observations or len(action) != 2 or not {*signs, *action} <= {-1, 1}:
-                raise ValueError(f"mirrors must hold signs of {self.observations} observations and 2 actions")
+            if len(signs) != self.observations or len(action) != self.actions or not {*signs, *action} <= {-1, 1}:
+                raise ValueError(
+                    f"mirrors must hold signs of {self.observations} observations and {self.actions} actions"
+                )
         if self.odd and self.activation != "tanh":
             raise ValueError(f"odd needs the activation tanh, not {self.activation}")
         if bool(self.routes) != (self.frame in FRAMES and FRAMES[self.frame].route is not None):
@@ -119,9 +118,14 @@ class PolicySpec:
             raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")
 
     @property
+    def actions(self) -> int:
+        """Numbers that the policy commands."""
+        return named_robot(self.robot).action_size
+
+    @property
     def seen(self) -> int:
         """Numbers that the policy takes: an observation, and the past behind it."""
-        return self.observations + self.history * (self.observations + 2)
+        return self.observations + self.history * (self.observations + self.actions)
 
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":
@@ -142,9 +146,10 @@ class PolicySpec:
         return cls(**fields)
 
     @classmethod
-    def of(cls, task: Task, **fields: Any) -> "PolicySpec":
-        """The spec for a task; fields are the others."""
-        return cls(task=task.problem(), observations=len(task.observation_scale), **fields)
+    def of(cls, task: Task, robot: str = PAPER, **fields: Any) -> "PolicySpec":
+        """The spec for a task and a robot by name; fields are the others."""
+        observations = task.observation_size(named_robot(robot))
+        return cls(task=task.problem(), observations=observations, robot=robot, **fields)
 
 
 def read_description(path: str | Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, check_some, markdown, print_table, progress_bars
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
-from ballbot_train.evaluation.evaluate import iterate_episodes
+from ballbot_train.evaluation.evaluate import iterate_episodes, shown_to
 from ballbot_train.evaluation.results import Result, columns
 from ballbot_train.executors import Workers
 from ballbot_train.policy_files import paths_of
@@ -47,7 +47,8 @@ def controllers_of(
     known = {task: registry.names(make_task(task, robot), robot, None if tracks or names else "") for task in tasks}
     if not names:
         return known
-    known = {task: [*group, *VARIANTS] for task, group in known.items()}
+    filtered = registry.FILTERED * (named_robot(robot).wheels is not None)
+    known = {task: [*group, *VARIANTS, *(name + filtered for name in group)] for task, group in known.items()}
     # two spellings of one path are one policy
     identities = [_identity(name) for name in names]
     repeated = [name for i, name in enumerate(names) if identities[i] in identities[:i]]
@@ -249,6 +250,7 @@ def _episode_entries(
     if group.made_for is not None:
         believed = make_task(group.task, group.made_for), named_robot(group.made_for)
     made = registry.make_packed(group.controller, packed, *believed)
+    env = shown_to(made, env)
     motions: list[recordings.Motion] = []
     keep = motions.append if record else None
     for result in iterate_episodes(env, made, group.controller, group.task, episodes, seed, known, keep):

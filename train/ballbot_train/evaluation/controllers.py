@@ -14,6 +14,9 @@ from ballbot_gym.tasks import TASKS, Task
 from ballbot_train.console import check_names
 from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
 
+FILTERED = "-ekf"
+"""What follows the name of a controller that gets, of a robot with wheels, sensors through a filter in place of states."""
+
 _BESIDE = (".json", ".safetensors", ".vecnormalize.npz")  # endings of files that belong to a policy or a saved model
 
 
@@ -24,7 +27,7 @@ def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
 
 def is_expert(name: str) -> bool:
     """Whether a name is an expert's or a variant's, and no policy's."""
-    return name in CONTROLLERS or name in VARIANTS
+    return name in VARIANTS or name.removesuffix(FILTERED) in CONTROLLERS
 
 
 def is_file(name: str) -> bool:
@@ -79,7 +82,7 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
     """`digest_of` of a policy by name or file; "" of an expert."""
     if is_expert(name):
         return ""
-    robot = robot if isinstance(robot, str) else robot_name(robot)
+    robot, name = robot if isinstance(robot, str) else robot_name(robot), name.removesuffix(FILTERED)
     return digest_of(str(shipped_policies(task, robot, None).get(name, name)))
 
 
@@ -154,7 +157,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
 
     Args:
         name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
-            or of a model that Stable-Baselines3 saved; see `saved_models`.
+            or of a model that Stable-Baselines3 saved; see `saved_models`. For a robot with wheels `FILTERED` may follow.
         task: what it is to do.
         params: the robot it believes to control.
 
@@ -162,7 +165,11 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
-    if is_expert(name):
+    if name.endswith(FILTERED) and params.wheels is not None:
+        from ballbot_baselines.kalman import FilteredController
+
+        return FilteredController(task, params, make_controller(name.removesuffix(FILTERED), task, params))
+    if name in CONTROLLERS | VARIANTS:
         return (CONTROLLERS | VARIANTS)[name](task, params)
     robot = robot_name(params)
     shipped = shipped_policies(task, robot, None)

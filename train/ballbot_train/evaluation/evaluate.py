@@ -126,6 +126,7 @@ def evaluate(
     try:
         indices = range(checked_episodes(episodes))
         controller = as_controller(policy, env.task, env.params)
+        env = shown_to(controller, env)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), task_name(env.task)
         motions: list[recordings.Motion] = []
@@ -143,6 +144,14 @@ def evaluate(
         return row
     finally:
         env.close()
+
+
+def shown_to(controller: Controller, env: BallbotEnv) -> BallbotEnv:
+    """An env of the same world that shows what a controller takes: sensors, if it `senses`."""
+    if not getattr(controller, "senses", False):
+        return env
+    env.close()
+    return BallbotEnv(env.task, env.physics, params=env.params, randomization=env.randomization, observation="sensors")
 
 
 def checked_episodes(episodes: int) -> int:

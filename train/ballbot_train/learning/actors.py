@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch.optim.swa_utils import AveragedModel
 
+from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.policy import PolicyNetwork
@@ -24,9 +25,16 @@ _ROUTES = (128, 128)  # units of the layers that decide on sides
 
 
 def spec_for(
-    task: Task, symmetry: RoutedSymmetry, hidden: tuple[int, ...], linear: bool = False, history: int = 0
+    task: Task,
+    symmetry: RoutedSymmetry,
+    hidden: tuple[int, ...],
+    linear: bool = False,
+    history: int = 0,
+    robot: str = PAPER,
 ) -> PolicySpec:
     """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
+
+    Three wheels do not have the task's symmetry, so a robot with wheels does without.
 
     Raises:
         ValueError: the task does not have the symmetry that the settings ask for.
@@ -34,6 +42,7 @@ def spec_for(
     fields: dict[str, Any] = {"hidden": hidden, "linear": linear, "squash": "tanh" if linear else "clip"}
     fields["history"] = history
     frame, missing = None, ""
+    symmetry = "none" if named_robot(robot).wheels is not None else symmetry
     if symmetry == "odd":
         fields["odd"] = True
         missing = "" if any(set(mirror.state) == {-1} for mirror in task.mirrors) else "odd symmetry"
@@ -54,7 +63,7 @@ def spec_for(
     elif missing:
         others = 'give "none", "mirrors", "frame" or another as its symmetry'
         raise ValueError(f"{task.id} has no {missing}; {others}")
-    return PolicySpec.of(task, **fields)
+    return PolicySpec.of(task, robot, **fields)
 
 
 def retargeted(start: PolicySpec, mine: PolicySpec) -> PolicySpec:
@@ -66,11 +75,13 @@ def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
     """A policy to start from, with the history of `mine`: it sees more of the past, and at first makes nothing of it.
 
     Raises:
-        ValueError: it sees a longer past than `mine`.
+        ValueError: it sees a longer past than `mine`, or commands another number of motors.
     """
     spec = retargeted(network.spec, mine)
     if network.spec.history > mine.history:
         raise ValueError(f"the policy to start from sees {network.spec.history} earlier observations; give --history")
+    if (spec.actions, spec.observations) != (network.spec.actions, network.spec.observations):
+        raise ValueError(f"a policy of {network.spec.robot} cannot start one of {mine.robot}, which has other motors")
     made = PolicyNetwork(spec)
     weights, shapes = network.state_dict(), made.state_dict()
     for name, weight in weights.items():

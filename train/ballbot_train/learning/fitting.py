@@ -94,4 +94,4 @@ def start_as_lqr(network: PolicyNetwork, task: Task, params: BallbotParams) -> N
         for part in network.linear.parameters():
             part.zero_()
         if (gain := equilibrium_gain(task, params)) is not None:
-            network.linear.weight[:, :8] = torch.tensor(gain[0])
+            network.linear.weight[:, : gain[0].shape[1]] = torch.tensor(gain[0])

@@ -7,7 +7,7 @@ is relative.
 
 Two parts of a task have no gradient and get one here. A first exit lies at the control step at which the cost so far, plus a
 penalty on what the state still lacks of the goal, is least. A penalty on coming closer to a margin than `margin_clearance`
-stands for failures.
+stands for failures, and one on a ball that nearly slips where friction is limited.
 """
 
 import math
@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import torch
 
+from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import robot_name
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -38,6 +40,7 @@ _AVERAGED_ITERATIONS = 20  # over which the policy is a running average
 # of ending outside of the goal, less this depth, in units of the goal functions
 _GOAL_PENALTY, _GOAL_CLEARANCE = 30.0, 0.1
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training. It has no gradient
+_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 3000.0  # as of the margins, for `dynamics.limits` of robots that can slip
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
 _RESTING = 25  # last control steps that lack the goal, where noise keeps the robot from resting in it
 _STEEPEST = 10.0  # slope of the logarithm of an episode's cost with a state: steeper ones, of robots that fall, are cut
@@ -81,9 +84,10 @@ class WholeEpisodes:
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self.task = replace(task, duration=config.episode_seconds)
         world: dict[str, Any] = {"randomization": randomization, "history": history}
-        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, params=params, **world)
+        self._wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=self._wheels and long, params=params, **world)
         self._batch.reset(seed=spawned(seed))
-        network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
+        network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
         start_as_lqr(network, task, params)
         self._make(network)
 
@@ -94,7 +98,7 @@ class WholeEpisodes:
         self._average = average_of(network, _AVERAGED_ITERATIONS)
         self._optimizer = torch.optim.Adam(network.parameters(), config.learning_rate, betas=(0.9, 0.99))
         self._step = self._one_step
-        if config.iterations >= _COMPILE_FROM:
+        if config.iterations >= _COMPILE_FROM and not self._wheels:  # else the batch compiles its part
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     def start_from(self, network: PolicyNetwork) -> None:
@@ -181,10 +185,17 @@ class WholeEpisodes:
                     cost
                     + config.margin_penalty * task.control_dt * (config.margin_clearance - margin).clamp(min=0) ** 2
                 )
+        cost = cost + grip_penalty(self._batch.params, before, force, task.control_dt)
         goal = torch.stack(task.goal(x, c))
         lacking = (goal + _GOAL_CLEARANCE).clamp(min=0).sum(0)
         inside = (goal <= 0).all(0)
         return _Step(result.final_x, cost, lacking, inside, result.failure, new.actuator, new.past)
+
+
+def grip_penalty(params: BallbotParams, x: tuple[Any, ...], force: tuple[Any, ...], dt: float) -> Any:
+    """What a control step of dt, s, in which the ball slips or nearly does, costs in training, of B robots: (B,) or 0."""
+    shortfalls = ((_GRIP_CLEARANCE - limit).clamp(min=0) for limit in dynamics.limits(params, x, force, hold=dt))
+    return sum(_GRIP_PENALTY * dt * shortfall**2 for shortfall in shortfalls)
 
 
 def _tamed(slope: torch.Tensor) -> torch.Tensor:

@@ -67,14 +67,14 @@ def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
     if found is None:
         raise ValueError(f"LQR of {task.id} has other gains in each episode, so no C file can hold it; export a policy")
     network = PolicyNetwork(PolicySpec.of(task, robot=robot, hidden=(), linear=False, odd=True, squash="clip"))
-    gain = np.zeros((2, len(task.observation_scale)))
-    gain[:, :8] = found[0]
+    gain = np.zeros((network.spec.actions, network.spec.observations))
+    gain[:, : found[0].shape[1]] = found[0]
     network.load_state_dict({"mlp.0.weight": torch.as_tensor(gain)})
     return network.eval()
 
 
 def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str) -> str:
-    spec = network.spec
+    spec, params = network.spec, named_robot(robot)
     networks = {
         "mlp": _layers(network.mlp),
         "linear": _layers([network.linear]),
@@ -96,13 +96,15 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         about=_comment(about),
         observations=spec.observations,
         constants=task.constant_names,
-        force_limit=c_number(named_robot(robot).force_limit),
+        force_limit=c_number(params.force_limit),
         dt=c_number(task.control_dt),
         seen=seen,
         inputs=inputs,
         widest=max(weight.shape[0] for layers in networks.values() for weight, _ in layers),
         networks=networks,
-        functions=_functions(network, task, seen, inputs),
+        functions=_functions(network, task, params.state_size, seen, inputs),
+        states=params.state_size,
+        actions=params.action_size,
         activation=spec.activation,
         history=spec.history,
         frame=spec.frame,
@@ -118,13 +120,13 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
     )
 
 
-def _functions(network: PolicyNetwork, task: Task, seen: int, inputs: int) -> list[str]:
+def _functions(network: PolicyNetwork, task: Task, states: int, seen: int, inputs: int) -> list[str]:
     """The printed functions that the template calls."""
     split = casadi.vertsplit
     functions: Functions = {
         "observed": (
-            lambda x, c, t: task.observe(tuple(split(x)), task.at(tuple(split(c)), t)),
-            {"x": 8, "c": len(task.constant_names), "t": 1},
+            lambda x, c, t: task.seen(tuple(split(x)), task.at(tuple(split(c)), t)),
+            {"x": states, "c": len(task.constant_names), "t": 1},
         )
     }
     if network.spec.frame is not None:

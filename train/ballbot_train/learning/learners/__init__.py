@@ -97,6 +97,10 @@ class Algorithm:
                 f"cost and goal of {task.id} depend on the time, which {self.name} does not know; train ppo or sac, and "
                 "from such a policy shac with --horizon 0"
             )
+        if params.wheels is not None and self.name in ("ppo", "sac"):
+            raise ValueError(
+                f"{self.name} here knows no robot with wheels; train shac or dagger, or Stable-Baselines3 on the env itself"
+            )
         given: dict[str, Any] = {"demos": demos, "start": start}
         if randomization is not None or history:
             if self.name == "sac":

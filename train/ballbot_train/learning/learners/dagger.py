@@ -36,6 +36,7 @@ from ballbot_gym.batch import BallbotBatch, BatchEpisodes, BatchState, run_episo
 from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.paths import then_stay
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import robot_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -46,7 +47,9 @@ from ballbot_train.learning.routing import fit_routes
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.shards import is_set
 
-_SPREAD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3])  # standard deviations of a tube, in a state's SI units
+_SPREAD = np.array(
+    [0.1, 0.1, 0.05, 0.05, 0.3, 0.3, 0.3, 0.3, 0.05, 0.3, 0.3]
+)  # standard deviations of a tube, in a state's SI units
 _SMALL = 0.3  # of the force limit
 _HARD_AMONG = 16  # episodes that are drawn for each of the hard ones
 _MIN_STEPS = 2  # plans with fewer remaining control steps are not used as a guess
@@ -199,12 +202,12 @@ class Dagger:
         self._task, self._params, self._seed = task, params, seed
         self._randomization, self._history = randomization, history
         torch.manual_seed(seed)
-        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
+        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
         start_as_lqr(self._network, task, params)
         self._fit = Fit(self._network)
-        none = np.zeros((0, len(task.observation_scale) * (1 + history) + 2 * history))
+        none, self._spread = np.zeros((0, self._network.spec.seen)), _SPREAD[: params.state_size]
         self._streamed = samples if isinstance(samples, StreamedDemos) else None
-        self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, 2)))
+        self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, params.action_size)))
         if start is not None:
             check_start(start.spec, self.network.spec)
             self.network.load_state_dict(started(start, self.network.spec).state_dict())
@@ -422,7 +425,7 @@ class Dagger:
             m states (m, 8), their forces (m, 2), N, and around which of the n each of them is, (m,).
         """
         shape = self.config.tube_samples, len(x)
-        off = _SPREAD * rng.standard_normal((*shape, 8)) * rng.random((*shape, 1))
+        off = self._spread * rng.standard_normal((*shape, len(self._spread))) * rng.random((*shape, 1))
         change = -np.einsum("kij,tkj->tki", gains, off)
         # a derivative is no guide to greater changes
         small = np.abs(change).max(-1) < _SMALL * self._params.force_limit
@@ -471,14 +474,14 @@ class Dagger:
         config = self.config
         tracked = [episode for episode in plans for _ in range(config.tracked_rollouts_per_plan)]
         x = np.array([plan.trajectory.x[0] for plan, _ in tracked])
-        x += config.start_noise * _SPREAD * rng.standard_normal(x.shape)
+        x += config.start_noise * self._spread * rng.standard_normal(x.shape)
         steps = min(
             max(len(plan.trajectory.u) for plan, _ in plans), round(config.label_seconds / self._task.control_dt)
         )
         history, over, _ = self._roll(x, np.array([c for _, c in tracked]), steps)
         for i, (plan, c) in enumerate(tracked):
             met = history[:, i][~over[:, i]]
-            distance, nearest = map(np.asarray, KDTree(plan.trajectory.x[:-1] / _SPREAD).query(met / _SPREAD))
+            distance, nearest = map(np.asarray, KDTree(plan.trajectory.x[:-1] / self._spread).query(met / self._spread))
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
             off, k = met - plan.trajectory.x[nearest], gains[i // config.tracked_rollouts_per_plan]
             forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", k[nearest], off)
@@ -511,7 +514,7 @@ class Dagger:
         ]
         steps = rng.integers(1, longest + 1, len(plans))
         x = np.array([plan.trajectory.x[start] for (plan, _), start in zip(plans, starts, strict=True)])
-        x += config.start_noise * _SPREAD * rng.standard_normal(x.shape)
+        x += config.start_noise * self._spread * rng.standard_normal(x.shape)
         history, over, _ = self._roll(x, np.array([c for _, c in plans]), longest)
         reached = []
         for i, (plan, _) in enumerate(plans):
@@ -562,7 +565,7 @@ class Dagger:
 
     def _samples_of(self, x: np.ndarray, u: np.ndarray, c: np.ndarray, cost: float | np.ndarray) -> Samples:
         """Samples of states (n, 8) and forces (n, 2), N, with constants (n, nc), of episodes whose optima cost `cost`."""
-        observations = np.asarray(self._task.observe(x, c))
+        observations = np.asarray(self._task.seen(x, c))
         weights = np.broadcast_to(1 / np.maximum(cost, _MIN_COST), len(x))
         return Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights)
 

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple, cast
 import torch
 
 from ballbot_baselines.lqr import equilibrium_gain
-from ballbot_gym import dynamics
 from ballbot_gym.batch import COMPILE_OPTIONS, BallbotBatch, BatchState
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
+from ballbot_gym.robots import robot_name
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
@@ -30,7 +30,7 @@ from ballbot_train.learning.critics import CriticInputs
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.learning.whole_episodes import WholeEpisodes
+from ballbot_train.learning.whole_episodes import WholeEpisodes, grip_penalty
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.routes import Routes
 
@@ -97,7 +97,6 @@ _TAU = 0.2  # share by which the target critic moves to the critic after each it
 _MAX_GRAD_NORM = 1.0  # of the policy
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training, whenever it comes
-_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 3000.0  # as of the margins, for `dynamics.limits` of robots that can slip
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
 _SOFTPLUS_ONE = math.log(math.e - 1)  # where softplus is 1
 _DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
@@ -138,7 +137,7 @@ class Critic(torch.nn.Module):
         past: int = 0,
     ):
         super().__init__()
-        own = len(task.observation_scale)
+        own = task.observation_size(params)
         self._inputs = CriticInputs(own, products=False, frame=frame, routes=routes, past=past)
         layers: list[torch.nn.Module] = []
         size = self._inputs.size
@@ -156,7 +155,7 @@ class Critic(torch.nn.Module):
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         scale = 10.0
         if self.p is not None:
-            error = observation[..., :8]
+            error = observation[..., : len(self.p)]
             scale = ((error @ self.p) * error).sum(-1) + 1e-3
         return torch.nn.functional.softplus(self.mlp(self._inputs(observation))[..., 0] + _SOFTPLUS_ONE) * scale
 
@@ -180,9 +179,9 @@ class Shac:
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._own = task
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
-        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history))
+        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
         start_as_lqr(self._network, task, params)
-        past = history * (len(task.observation_scale) + 2)
+        past = history * (task.observation_size(params) + params.action_size)
         seen = self._network.spec.frame, self._network.routes, past
         self.critic = Critic(task, params, config.hidden, *seen)
         self.target = Critic(task, params, config.hidden, *seen)
@@ -190,14 +189,15 @@ class Shac:
         self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         rate = config.critic_learning_rate
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), rate, betas=(0.7, 0.95))
-        self._batch = BallbotBatch(self.task, config.num_envs, compile=False, **world)
+        wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
+        self._batch = BallbotBatch(self.task, config.num_envs, compile=wheels and long, **world)
         self._start = self._batch.reset(seed=spawned(seed))  # (B, no) first observations of the running episodes
         hard = round(config.hard_fraction * config.reset_fraction * config.num_envs)  # new episodes of an iteration
         self._drawn = BallbotBatch(self.task, _HARD_AMONG * hard, compile=False, **world) if hard else None
         if self._drawn is not None:
             self._drawn.reset(seed=spawned(seed) + config.num_envs)
         self._step = self._one_step
-        if config.iterations >= _COMPILE_FROM:
+        if long and not wheels:  # else the batch compiles its part
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
     @property
@@ -300,9 +300,7 @@ class Shac:
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * task.control_dt * squared
-        for limit in dynamics.limits(self._batch.params, before, force, hold=task.control_dt):
-            shortfall = (_GRIP_CLEARANCE - limit).clamp(min=0)
-            shaped = shaped + _GRIP_PENALTY * task.control_dt * shortfall**2
+        shaped = shaped + grip_penalty(self._batch.params, before, force, task.control_dt)
         loss = loss + discount * alive * shaped
         if config.exit_softness:
             alive = alive * torch.sigmoid(torch.stack(task.goal(x, c)).amax(0) / config.exit_softness)
