@@ -84,6 +84,10 @@ class BatchOptima:
     gains: np.ndarray
     slopes: np.ndarray
 
+    def some(self, rows: slice) -> "BatchOptima":
+        """Some of them; no copies."""
+        return BatchOptima(*(getattr(self, field.name)[rows] for field in fields(self)))
+
 
 def solves(task: Task, params: BallbotParams) -> bool:
     """Whether `find_optima` can solve this task here: C code can be compiled, it has all operations of the task, the task has
@@ -143,7 +147,7 @@ def find_optima(
             params,
             x0[rows],
             c[rows],
-            BatchOptima(**{f.name: getattr(optima, f.name)[rows] for f in fields(optima)}),
+            optima.some(rows),
             replace(backoff, margin=max(MARGIN, backoff.margin), goal=max(MARGIN, backoff.goal)),
         )
         batch.search(None if forces is None else forces[rows, :n])

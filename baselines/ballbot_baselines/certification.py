@@ -1,8 +1,9 @@
 """Computes the certified evaluation sets that `ballbot_gym.certified` loads.
 
-`entries` solves episodes one after the other and yields what JSON holds, so that the work can be divided and continued.
+`entries` solves a few episodes after the other and yields what JSON holds, so that the work can be divided and continued.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -10,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_baselines.optimum import Optimum, find_optimum
+from ballbot_baselines.batched import BatchOptima
+from ballbot_baselines.compiled import LANES
+from ballbot_baselines.optimum import Optimum, find_optimum, second_search
 from ballbot_baselines.search import COARSE
 from ballbot_gym import dynamics
 from ballbot_gym.certified import cache
@@ -28,6 +31,9 @@ Entry = dict[str, Any]
 optimal trajectory's "t", "x" and "u" as lists; "draw", which draw of the episode it is, where it is not the first; and
 "found", how it was found: guesses "tried", and "next_basin", by which share the next best local optimum
 costs more. JSON keeps every bit of a float. Where no optimum was found: "episode" and "error", the message."""
+
+AT_ONCE = LANES
+"""Episodes whose second searches share the processor's lanes."""
 
 _MOST_DRAWS = 20
 
@@ -52,21 +58,29 @@ def entries(
     Raises:
         ValueError: no task or robot of that name.
     """
-    task, params = make_task(task, robot), checked_robot(robot)
-    for index in indices:
-        for draw in range(_MOST_DRAWS if params.grips or randomization.moves_optima else 1):
-            entry = _solved(task, params, index, draw, randomization)
-            if "error" not in entry:
-                break
-        yield entry
+    task, params, left = make_task(task, robot), checked_robot(robot), iter(indices)
+    while some := list(itertools.islice(left, AT_ONCE)):
+        second = None
+        if not randomization.moves_optima:  # else each has another robot
+            x0, c = (np.array(part) for part in zip(*(episode(task, params, i, 0) for i in some), strict=True))
+            second = second_search(task, params, x0, c)
+        for k, index in enumerate(some):
+            for draw in range(_MOST_DRAWS if params.grips or randomization.moves_optima else 1):
+                twice = True if second is None or draw else second.some(slice(k, k + 1))
+                entry = _solved(task, params, index, draw, randomization, twice)
+                if "error" not in entry:
+                    break
+            yield entry
 
 
-def _solved(task: Task, params: BallbotParams, index: int, draw: int, randomization: Randomization) -> Entry:
+def _solved(
+    task: Task, params: BallbotParams, index: int, draw: int, randomization: Randomization, twice: bool | BatchOptima
+) -> Entry:
     x0, c = episode(task, params, index, draw)
     drawn = cache.drawn(task, randomization, index, draw)
     delay = randomization.moves_optima and drawn[5] > 0
     try:
-        optimum = optimum_of(task, params, x0, c, randomization, drawn)
+        optimum = optimum_of(task, params, x0, c, randomization, drawn, twice)
         ideal = optimum
         if delay:
             ideal = find_optimum(task, randomization.robot(params, drawn), x0, c, twice=True)
@@ -104,6 +118,7 @@ def optimum_of(
     c: np.ndarray,
     randomization: Randomization,
     drawn: tuple[float, ...],
+    twice: bool | BatchOptima = True,
 ) -> Optimum:
     """The optimum of an episode for which a randomization drew this: of its own robot, and no force comes while it is late.
 
@@ -114,6 +129,7 @@ def optimum_of(
         c: (nc,) constants.
         randomization: without an actuator that lags; noise and pushes move no optimum.
         drawn: what its `draw` drew.
+        twice: as of `find_optimum`, where no force is late.
 
     Raises:
         PlanError: the robot violates a limit before it can be moved, or no try came to a feasible episode.
@@ -122,7 +138,7 @@ def optimum_of(
         params = randomization.robot(params, drawn)
     delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
-        return find_optimum(task, params, x0, c, twice=True)
+        return find_optimum(task, params, x0, c, twice=twice)
     dt, none, states, cost = task.control_dt, np.zeros(params.action_size), [np.asarray(x0, np.float64)], 0.0
     for k in range(delay):
         began = task.at(c, k * dt)

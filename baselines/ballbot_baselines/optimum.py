@@ -89,7 +89,7 @@ def find_optimum(
     guesses: int = _CONSIDERED,
     paths: list[np.ndarray] | None = None,
     start: float = 0.0,
-    twice: bool = False,
+    twice: bool | batched.BatchOptima = False,
 ) -> Optimum:
     """The cheapest episode from state x0 with constants c.
 
@@ -103,8 +103,8 @@ def find_optimum(
             those that `sides.predict` finds likely are solved; `ALL_GUESSES` solves every one.
         paths: ground paths to start from instead of the task's, (n+1, 2) each, m, one point for each control step.
         start: the episode's time at x0, s: the trajectory's times begin there. It matters to tasks with a clock.
-        twice: whether `batched.find_optima` searches too, where it can. It starts from other guesses, and finds something
-            cheaper in about one episode of a hundred.
+        twice: whether `batched.find_optima` searches too, where it can, or what it found for this episode. It starts from
+            other guesses, and finds something cheaper in about one episode of a hundred.
 
     Returns:
         The cheapest optimum found. If no try converged, the cheapest feasible episode found; look at `status`.
@@ -119,7 +119,8 @@ def find_optimum(
     started, before = time.perf_counter(), (spent.solving, spent.setup)
     tried = search(episode, guesses, paths)
     if twice:
-        tried += _found_at_once(episode, min((s.cost for _, s in tried if s.is_optimal), default=math.inf))
+        at_once = second_search(task, params, x0[None], c[None], backoff) if twice is True else twice
+        tried += _cheaper(episode, at_once, min((s.cost for _, s in tried if s.is_optimal), default=math.inf))
     best = min((t for t in tried if t[1].is_within_limits), key=_rank, default=None)
     if best is None:
         tries = "; ".join(f"{s.solver}: {s.status}, violation {s.violation:.1e}" for _, s in tried)
@@ -150,16 +151,21 @@ def find_optimum(
     )
 
 
-def _found_at_once(episode: Shooting, cost: float) -> list[Found]:
-    """Solutions from what `batched.find_optima` finds, if that is cheaper."""
-    task, params = episode.task, episode.params
-    if not batched.solves(task, params):
-        return []
-    found = batched.find_optima(task, params, episode.x0[None], episode.c[None], backoff=episode.backoff)
-    if not found.solved[0] or found.costs[0] > cost * (1 - _NO_CHEAPER):
+def second_search(
+    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, backoff: Backoff = Backoff()
+) -> batched.BatchOptima | None:
+    """What `batched.find_optima` finds for B episodes, or None where it cannot search."""
+    return batched.find_optima(task, params, x0, c, backoff=backoff) if batched.solves(task, params) else None
+
+
+def _cheaper(episode: Shooting, found: batched.BatchOptima | None, cost: float) -> list[Found]:
+    """Solutions from what was found at once for an episode, if that is cheaper."""
+    if found is None or not found.solved[0] or found.costs[0] > cost * (1 - _NO_CHEAPER):
         return []
     x, u = found.states[0, : found.steps[0] + 1], found.forces[0, : found.steps[0]]
-    return [(FROM_BATCH, solution) for solution in episode.solve_to_the_end(x, u / params.force_limit, near=True)]
+    return [
+        (FROM_BATCH, solution) for solution in episode.solve_to_the_end(x, u / episode.params.force_limit, near=True)
+    ]
 
 
 def _next_basin(best: Found, tried: list[Found], compared: dict[int, float]) -> float:

@@ -30,6 +30,7 @@ except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
 
+_JOBS = 32  # at least, so that many workers have something to do
 _Solver = Callable[[Task, Sequence[int]], Iterator[jobs.Entry]]
 
 
@@ -158,10 +159,14 @@ def _missing(task: Task, params: BallbotParams, episodes: list[int], randomizati
 def _elsewhere(
     folder: Path, workers: int | Workers, solve: _Solver, task: Task, missing: list[int]
 ) -> Iterator[jobs.Entry]:
-    """In other processes, in the order in which they finish. A job an episode, because any may be missing."""
-    work = [jobs.Job(f"{index:06d}", solve, (task,), (index,)) for index in missing]
-    for number, (entry,) in jobs.stream(work, folder, workers, lambda *_: None):
-        yield entry
+    """In other processes, in the order in which they finish. Any episode may be missing, so the first of a job names it."""
+    from ballbot_baselines.certification import AT_ONCE
+
+    each = min(AT_ONCE, -(-len(missing) // _JOBS))
+    parts = [tuple(missing[k : k + each]) for k in range(0, len(missing), each)]
+    work = [jobs.Job(f"{part[0]:06d}-{len(part)}", solve, (task,), part) for part in parts]
+    for number, entries in jobs.stream(work, folder, workers, lambda *_: None):
+        yield from entries
         jobs.forget(folder, work[number].name)
     jobs.release(folder)
 
