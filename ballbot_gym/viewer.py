@@ -43,15 +43,10 @@ _GRAB_REACH = 3.0  # m, the farthest that a drag counts
 # another attempt every second. After some failures Chromium delays attempts by more than that, so that none lasts.
 # Here the page waits until the server answers, and then has viser begin one attempt, by a moment of focus.
 #
-# viser moves the camera by keys that drive the robot here. Its listener for that is the document's; the one for keys of
-# commands is an element's, which hears them before. And on a phone viser covers the scene with its controls until somebody
-# folds them.
+# On a phone viser covers the scene with its controls until somebody folds them.
 _CONNECT_AGAIN = """
 if (window.connectsAgain) return;
 window.connectsAgain = true;
-document.documentElement.addEventListener("keydown", (event) => {
-  if (/^(Key[WASDQE]|Arrow)/.test(event.code)) event.stopPropagation();
-});
 const narrow = "(max-width: 36em)";
 const folding = setInterval(() => {
   const heads = [...document.querySelectorAll("div")].filter((e) => !e.children.length && e.textContent === LABEL);
@@ -95,14 +90,13 @@ def import_viser() -> Any:
 class Viewer:
     """A server whose page shows the last drawing. `server` is viser's. Every browser that opens `address` sees the same."""
 
-    def __init__(self, host: str = HOST, port: int = PORT, label: str = "ballbot", follow: bool = True):
+    def __init__(self, host: str = HOST, port: int = PORT, label: str = "ballbot"):
         """Starts the server.
 
         Args:
             host: address to bind. If others than this machine reach it, the page asks for the token in `address`.
             port: where to listen; the next free one, if it is taken.
             label: title of the page.
-            follow: whether the scene moves so that the robot stays in view.
 
         Raises:
             ImportError: viser is missing.
@@ -120,7 +114,6 @@ class Viewer:
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         script = f"const LABEL = {json.dumps(label)};{_CONNECT_AGAIN}"
         self.server.gui._websock_interface.queue_message(viser._messages.RunJavascriptMessage(source=script))
-        self.follow = follow
         self.on_grab: Grab | None = None
         self._host = host
         self._nodes: dict[str, list[Any]] = {}
@@ -184,7 +177,7 @@ class Viewer:
                 self.server.stop()
 
     def _draw(self, drawing: Drawing) -> None:
-        goal = drawing.robots[-1].x[:2] if self.follow and drawing.robots else np.zeros(2)
+        goal = drawing.robots[-1].x[:2] if drawing.robots else np.zeros(2)
         self._shift += (_FOLLOW if np.hypot(*(goal - self._shift)) < _JUMP else 1.0) * (goal - self._shift)
         self._world.position = (-self._shift[0], -self._shift[1], 0.0)
         shown = {"markers"}

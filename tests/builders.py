@@ -70,6 +70,20 @@ class DelayedController:
         return self._pending.pop(0)
 
 
+def random_policy(task, hidden=(8,), mirrors=False, **fields):
+    """A small network for a task whose outputs are not those of its start; `mirrors` are all that the task has."""
+    import torch
+
+    from ballbot_train.policy import PolicyNetwork, PolicySpec
+
+    if mirrors:
+        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
+    torch.manual_seed(0)
+    network = PolicyNetwork(PolicySpec.of(task, hidden=hidden, **fields))
+    torch.nn.init.normal_(network.mlp[-1].weight)
+    return network
+
+
 def task_and_robot(policy):
     """The names of both in the name of a shipped policy, as TASK-ROBOT-LEARNER."""
     task, *others = policy.split("-")

@@ -550,6 +550,10 @@ TYPED = [
     ("train dagger --demos nowhere://set", "nowhere://set cannot be read"),
     ("demos --pushes 1e9", "pushes must be at most 50 per second, one in every control step"),
     ("paper --only fig9", "unknown problem fig9"),
+    (
+        "benchmark --tasks orbit --controllers lqr --randomization windy",
+        "unknown randomization 'windy'; known: 'unknown'",
+    ),
     ("optimize stabilize --duration 1000", "is too long to optimize; give at most 100 s"),
     ("compare a b", "no such file"),
     ("replay stabilize --controllers lqr --physics rk4 --format gif --speed 1e-9", "frames; give another speed or fps"),

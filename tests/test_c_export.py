@@ -5,8 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
-import torch
-from builders import task_and_robot
+from builders import random_policy, task_and_robot
 
 from ballbot_gym import certified, machine_code
 from ballbot_gym.env import BallbotEnv, make_task
@@ -14,8 +13,8 @@ from ballbot_gym.params import default_params
 from ballbot_gym.rollout import rollout
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.policy import PolicyController, PolicyNetwork, save_policy
-from ballbot_train.policy_files import SHIPPED, PolicySpec
+from ballbot_train.policy import PolicyController, save_policy
+from ballbot_train.policy_files import SHIPPED
 from ballbot_train.report.c_export import LARGEST_ERROR, LQR, export_c
 
 COMPILER = machine_code.compiler()
@@ -108,11 +107,7 @@ def test_lqr_of_a_robot_with_wheels_passes_the_test_in_its_file(tmp_path):
 )
 def test_all_that_a_policy_can_do_is_in_the_file(task, fields, tmp_path):
     task = make_task(task)
-    if fields.pop("mirrors", False):
-        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
-    torch.manual_seed(0)
-    network = PolicyNetwork(PolicySpec.of(task, hidden=(8, 6), **fields))
-    torch.nn.init.normal_(network.mlp[-1].weight)
+    network = random_policy(task, (8, 6), **fields)
     policy = save_policy(tmp_path / "mine", network, {"training": {"learner": "a */ b *\\\n/ c"}})
     source = export_c(policy, tmp_path / "mine.c", task)
     compiled = Compiled(source, task, PolicyController(task, default_params(), network))

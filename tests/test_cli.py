@@ -88,7 +88,7 @@ def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, ho
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("ballbot_train.console.Bars.advance", interrupt)
+        patch.setattr("rich.progress.Progress.advance", interrupt)
         patch.setattr("ballbot_train.report.figures.save", interrupt)
         ended, printed = typed(*arguments)
     assert (ended, how in printed) == (130, True), printed

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ballbot_gym import dynamics
-from ballbot_gym.params import URDF_PATH, default_params
+from ballbot_gym.params import URDF_PATH
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)  # high lean, all rates at work
 FORCE = (60.0, -40.0)
@@ -138,9 +138,3 @@ def test_tilt_is_zero_where_rounding_makes_a_cosine_exceed_one(monkeypatch):
     assert (dynamics.tilt(above), dynamics.tilt(below)) == (0, math.pi)
     np.testing.assert_array_equal(dynamics.tilt(np.array([above, below])), [0, math.pi])
     np.testing.assert_array_equal(dynamics.tilt(torch.tensor([above, below], dtype=torch.float64)), [0, math.pi])
-
-
-def test_potential_energy_is_of_the_bodys_height():
-    params = default_params()
-    rest = dynamics.energy(params, (0.0,) * 8)
-    assert rest == pytest.approx(15 * 9.81 * 0.6)

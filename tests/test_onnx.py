@@ -4,8 +4,7 @@ import json
 
 import numpy as np
 import pytest
-import torch
-from builders import task_and_robot
+from builders import random_policy, task_and_robot
 
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import named_robot
@@ -67,11 +66,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
 )
 def test_frame_routes_mirrors_and_oddness_are_inside_the_graph(task, fields, tmp_path):
     task = make_task(task)
-    if fields.pop("mirrors", False):
-        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
-    torch.manual_seed(0)
-    network = PolicyNetwork(PolicySpec.of(task, hidden=(8,), **fields))
-    torch.nn.init.normal_(network.mlp[-1].weight)
+    network = random_policy(task, **fields)
     policy = save_policy(tmp_path / "mine", network, {})
     runtime = session(export_onnx(policy, tmp_path / "mine.onnx", task))
     observations = np.random.default_rng(0).normal(size=(100, len(task.observation_scale))).astype(np.float32)

@@ -5,7 +5,6 @@ import http.client
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -183,14 +182,6 @@ def test_what_cannot_be_done_is_said_and_goes_back(quiet, opened, visitor):
     opened.goes_on()
 
 
-def test_junk_ends_at_most_its_own_connection(quiet, opened, visitor):
-    for k, junk in enumerate(("text", b"", b"\x00" * 100, b"x" * 100_000)):
-        with Visitor(opened.viewer.port) as other, contextlib.suppress(Exception):
-            other.connection.send(junk)
-            other.connection.ping().wait(1)
-        works(opened, visitor, k)
-
-
 def test_who_leaves_while_something_is_saved_or_dragged_harms_nothing(quiet, opened, visitor):
     opened.goes_on()
     with Visitor(opened.viewer.port) as other:
@@ -304,18 +295,6 @@ def test_others_need_the_token_which_becomes_a_cookie():
             wait_for(lambda: visitor.packets > 0)
     finally:
         viewer.close()
-
-
-def test_what_is_no_request_is_dropped(quiet, opened):
-    for sent in (b"\x16\x03\x01 tls?", b"GET\r\n\r\n", b"x" * 70_000, b"GET /../../etc/passwd HTTP/1.1\r\n\r\n"):
-        with (
-            socket.create_connection(("127.0.0.1", opened.viewer.port), timeout=5) as plain,
-            contextlib.suppress(OSError),
-        ):
-            plain.sendall(sent)
-            plain.shutdown(socket.SHUT_WR)
-            assert b"200 OK" not in plain.recv(1000)
-        assert asked(opened.viewer.port)[0].status == 200
 
 
 @pytest.mark.parametrize(("host", "port"), [("192.0.2.1", 8080), ("127.0.0.1", 70_000), ("no.such.host.invalid", 0)])

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from builders import random_policy as network_of
 
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.engines import default_physics
@@ -18,13 +19,6 @@ from ballbot_train.evaluation.controllers import make_controller, names
 from ballbot_train.evaluation.evaluate import evaluate
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_policy, save_policy
 from ballbot_train.policy_files import PolicyError, PolicySpec, read_description, shipped_policies
-
-
-def network_of(task, **fields):
-    torch.manual_seed(0)
-    network = PolicyNetwork(PolicySpec.of(task, hidden=(8,), **fields))
-    torch.nn.init.normal_(network.mlp[-1].weight)
-    return network
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -235,25 +235,6 @@ def test_a_stored_optimum_that_does_not_move_so_is_computed_again(counted, monke
         assert optima.known(task, robot, [0]).costs[0] == pytest.approx(cost, rel=1e-9)
 
 
-def test_a_killed_computation_loses_no_optimum(counted, monkeypatch):
-    task = Nearby(duration=2.0)
-    from ballbot_baselines import certification
-
-    find = certification.find_optimum
-
-    def killed(*problem, **options):
-        if len(counted) == 2:
-            raise KeyboardInterrupt
-        return find(*problem, **options)
-
-    monkeypatch.setattr(certification, "find_optimum", killed)
-    with pytest.raises(KeyboardInterrupt):
-        optima.known(task, "paper", range(4))
-    monkeypatch.setattr(certification, "find_optimum", find)
-    optima.known(task, "paper", range(4))
-    assert len(counted) == 4
-
-
 def test_any_task_and_robot_has_a_row(counted):
     light = replace(named_robot("paper"), body_mass=12.0)
     row = evaluate.evaluate("lqr", Nearby(duration=4.0), 2, "rk4", robot=light)

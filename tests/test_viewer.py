@@ -20,7 +20,7 @@ STATE = np.array([0.5, -0.2, 0.3, -0.4, 0, 0, 0, 0])
 
 @pytest.fixture
 def viewer():
-    viewer = Viewer(port=0, follow=False)
+    viewer = Viewer(port=0)
     yield viewer
     viewer.close()
 

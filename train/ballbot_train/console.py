@@ -3,7 +3,7 @@
 import sys
 import threading
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any, Literal, cast
@@ -116,30 +116,12 @@ def progress_bar() -> Progress:
     return (Progress if console.is_terminal else LineProgress)(*columns, console=console)
 
 
-class Bars:
-    """Progress bars by name."""
-
-    def __init__(self, progress: Progress):
-        self._progress = progress
-        self._bars = {}
-
-    def add(self, totals: Mapping[str, int]) -> None:
-        """Adds a bar for every name; the number is how many steps it has."""
-        for name, total in totals.items():
-            self._bars[name] = self._progress.add_task(printable(name), total=total)
-
-    def advance(self, name: str, count: int) -> None:
-        """Moves a bar on by a number of steps."""
-        self._progress.advance(self._bars[name], count)
-
-
 @contextmanager
-def progress_bars(totals: Mapping[str, int]) -> Iterator[Bars]:
-    """Shows a bar for every name while the block runs; the numbers are how many steps each has."""
+def progress_bars(totals: Mapping[str, int]) -> Iterator[Callable[[str, int], None]]:
+    """Shows a bar for every name while the block runs; the numbers are how many steps each has. Gives what moves one on."""
     with progress_bar() as progress:
-        bars = Bars(progress)
-        bars.add(totals)
-        yield bars
+        bars = {name: progress.add_task(printable(name), total=total) for name, total in totals.items()}
+        yield lambda name, count: progress.advance(bars[name], count)
 
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -80,7 +80,7 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
     from ballbot_train.shards import make
 
     settings = robot_setting(robot)
-    with progress_bars(dict.fromkeys(tasks, episodes)) as bars:
+    with progress_bars(dict.fromkeys(tasks, episodes)) as advance:
         for name in tasks:
             task, params = make_task(name, robot), named_robot(robot)
             made = make(
@@ -92,6 +92,6 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
                 partial(certification.arrays, task=task, params=params),
                 out / name,
                 workers,
-                partial(bars.advance, name),
+                partial(advance, name),
             )
             console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")

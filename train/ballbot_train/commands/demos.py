@@ -30,8 +30,8 @@ def demos(
         workers: who does the work.
     """
     kind, folder = f"{file_name(config.task, config.robot)}-{config.expert}", Path("runs") / "demos"
-    with progress_bars({f"{config.task} {config.expert}": config.episodes}) as bars:
-        progress = partial(bars.advance, f"{config.task} {config.expert}")
+    with progress_bars({f"{config.task} {config.expert}": config.episodes}) as advance:
+        progress = partial(advance, f"{config.task} {config.expert}")
         if shards is not None:
             made = write_shards(config, shards, out or folder / f".{kind}.shards", workers, progress)
             console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards", markup=False)

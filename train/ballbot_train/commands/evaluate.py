@@ -75,14 +75,14 @@ def evaluate(
         "episodes": fresh,
         "physics": "closed form, batched, float64",
     }
-    with progress_bars({"episodes": fresh}) as bars:
-        progress = partial(bars.advance, "episodes")
+    with progress_bars({"episodes": fresh}) as advance:
+        progress = partial(advance, "episodes")
         result = episodes.evaluate_fresh(policy, task, fresh, seed, None, progress, robot, varied)
     if optima:
-        with progress_bars({task: optima}) as bars:
+        with progress_bars({task: optima}) as advance:
             track = f"-{track_of(varied)}" if varied.moves_optima else ""
             folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
-            found = episodes.find_optima(task, optima, seed, folder, workers, bars.advance, robot, varied)
+            found = episodes.find_optima(task, optima, seed, folder, workers, advance, robot, varied)
         result = replace(result, optima=found)
     worst = _worst(result, policy, task, out / "worst", robot, varied)
     episodes.write(result, worst, facts, out)

@@ -4,7 +4,7 @@ import argparse
 import math
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -194,7 +194,7 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
 def command_with(learner: str, run: Run, settings: Any) -> str:
     """The command that makes a run with exactly these settings."""
     words = ["ballbot", "train", learner]
-    for name, value in _shallow(run).items():
+    for name, value in vars(run).items():
         if name in ("task", "seed") or (value != getattr(Run, name) and name != "resume"):
             words += [f"--{name.replace('_', '-')}", str(value)]
     for name, value in asdict(settings).items():
@@ -224,7 +224,3 @@ def _command(
         function = with_options
     function.__doc__ = f"{LEARNERS[name].description[:1].upper()}{LEARNERS[name].description[1:]}."
     return function
-
-
-def _shallow(run: Run) -> dict[str, Any]:
-    return {field.name: getattr(run, field.name) for field in fields(run)}

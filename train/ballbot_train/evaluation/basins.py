@@ -77,12 +77,13 @@ def run(
         robot: by name.
     """
     search = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (robot,), (name,), "boundary") for name in AXES]
-    with progress_bars({"boundary": len(AXES)}) as bars:
-        found = jobs.run(search, out, workers, bars.advance)
-        bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
-        work = cell_jobs(bounds, controllers, points, physics, robot)
-        bars.add({name: sum(len(job.items) for job in work if job.group == name) for name in controllers})
-        done = jobs.run(work, out, workers, bars.advance)
+    with progress_bars({"boundary": len(AXES)}) as advance:
+        found = jobs.run(search, out, workers, advance)
+    bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
+    work = cell_jobs(bounds, controllers, points, physics, robot)
+    totals = {name: sum(len(job.items) for job in work if job.group == name) for name in controllers}
+    with progress_bars(totals) as advance:
+        done = jobs.run(work, out, workers, advance)
     return maps_of(bounds, (entry for entries in done for entry in entries), controllers, points)
 
 

@@ -182,8 +182,8 @@ def run_groups(
         totals[group.counts_for or group.task] += episodes
     parts = [range(start, min(start + CHUNK, episodes)) for start in range(0, episodes, CHUNK)]
     work = [_job(group, part, seed, record) for group in groups for part in parts]
-    with progress_bars(totals) as bars:
-        done = iter(jobs.run(work, out, workers, bars.advance))
+    with progress_bars(totals) as advance:
+        done = iter(jobs.run(work, out, workers, advance))
     results = []
     for group in groups:
         entries = [entry for _ in parts for entry in next(done)]

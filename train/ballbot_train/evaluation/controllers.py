@@ -69,21 +69,17 @@ def made_for(name: str) -> str:
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
 
-def digest_of(name: str) -> str:
-    """SHA-256 of the weights of a policy's file, as hexadecimal digits."""
-    if is_saved_model(name):
-        from ballbot_train.saved_models import digest
-
-        return digest(name)
-    return weights_digest(name)
-
-
 def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> str:
-    """`digest_of` of a policy by name or file; "" of an expert."""
+    """SHA-256 of the weights of a policy by name or file, as hexadecimal digits; "" of an expert."""
     if is_expert(name):
         return ""
     robot, name = robot if isinstance(robot, str) else robot_name(robot), name.removesuffix(FILTERED)
-    return digest_of(str(shipped_policies(task, robot, None).get(name, name)))
+    path = str(shipped_policies(task, robot, None).get(name, name))
+    if is_saved_model(path):
+        from ballbot_train.saved_models import digest
+
+        return digest(path)
+    return weights_digest(path)
 
 
 def task_name(policy: str, task: str | None, robot: str = PAPER) -> str:

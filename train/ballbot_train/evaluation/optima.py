@@ -106,11 +106,11 @@ def compute(
         if not missing:
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
-        with progress_bars({name: len(missing)}) as bars:
+        with progress_bars({name: len(missing)}) as advance:
             solve = _solver(params, randomization)
             some = solve if workers is None else partial(_elsewhere, folder, workers, solve)
             for entry in some(task, missing):
-                bars.advance(name, 1)
+                advance(name, 1)
                 if "error" in entry:
                     failures.append(f"episode {entry['episode']}: {entry['error']}")
                     continue
