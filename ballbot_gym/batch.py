@@ -389,12 +389,12 @@ class BallbotBatch:
         end = self._moved(robot, x, total)
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
         if self.params.grips:
-            floor = dynamics.held_contact(robot, x, total, task.control_dt)
-            first, second = (torch.minimum(*dynamics.grip_limits(robot, part)) for part in floor)
-            kept = (torch.minimum(first, second),)
-            at_begin, at_end = (tuple(part.detach() for part in parts) for parts in floor)
-            needed = torch.maximum(dynamics.needed_friction(at_begin), dynamics.needed_friction(at_end))
-            grip = torch.stack((*at_begin, needed))
+            with torch.no_grad():  # it decides what ends an episode, and nothing else
+                at_begin, at_end = dynamics.held_contact(robot, x, total, task.control_dt)
+                first, second = (torch.minimum(*dynamics.grip_limits(robot, part)) for part in (at_begin, at_end))
+                kept = (torch.minimum(first, second),)
+                needed = torch.maximum(dynamics.needed_friction(at_begin), dynamics.needed_friction(at_end))
+                grip = torch.stack((*at_begin, needed))
         steps = state.steps + 1
         did = outcome(task, x, force, end, c, steps.to(self.dtype), kept)
         terminated, truncated, success, failure = (part > 0 for part in did[3:7])
