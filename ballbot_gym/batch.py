@@ -12,7 +12,7 @@ import logging
 import operator
 import shutil
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -27,13 +27,13 @@ except ImportError as error:
 
 from ballbot_gym import counter_rng, dynamics, sensors
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
-from ballbot_gym.env import limit_names, make_task
+from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.randomization import Randomization, actuate, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import first_violated, outcome
+from ballbot_gym.tasks.transition import first_violated, limit_names, outcome
 
 _log = logging.getLogger(__name__)
 
@@ -130,25 +130,6 @@ class BatchStep(NamedTuple):
     grip: torch.Tensor
     """(4, B) the floor's force on the ball when the step began, f_x, f_y and N, and the friction that the step needs; (0, B)
     where friction is unlimited. It carries no gradient."""
-
-
-class BatchEpisodes(NamedTuple):
-    """One episode of each of B environments."""
-
-    cost: torch.Tensor
-    """(B,) float64, a failure's price included."""
-    success: torch.Tensor
-    """(B,) bool: the episode ended in the goal."""
-    failure: torch.Tensor
-    """(B,) bool: the episode ended at a violated limit."""
-    violated: torch.Tensor
-    """(B,) int64 index in the batch's `limit_names` of the limit at which the episode ended, else −1."""
-    terminated: torch.Tensor
-    """(B,) bool: the episode ended by success or failure, not because its time was over."""
-    steps: torch.Tensor
-    """(B,) int64, control steps taken."""
-    states: torch.Tensor | None
-    """(T, 8, B) states after each control step, where they were recorded. What follows the end of an episode is undefined."""
 
 
 class BallbotBatch:
@@ -528,61 +509,6 @@ class BallbotBatch:
         return BatchState(
             *(part if isinstance(part, torch.Tensor) else torch.stack(part) if part else none for part in rows)
         )
-
-
-@torch.no_grad()
-def run_episodes(
-    batch: BallbotBatch,
-    policy: Callable[[torch.Tensor], torch.Tensor],
-    x: np.ndarray | torch.Tensor,
-    c: np.ndarray | torch.Tensor,
-    record: bool = False,
-    drawn: np.ndarray | None = None,
-) -> BatchEpisodes:
-    """Runs one episode of each environment, all at once and without gradients.
-
-    It stops when the last episode has ended, unless states are recorded.
-
-    Args:
-        batch: where to run; it is reset with seed 0.
-        policy: from observations (B, no) to actions (B, 2).
-        x: (B, 8) initial states.
-        c: (B, nc) constants of the episodes.
-        record: whether to keep the states of all control steps.
-        drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
-    """
-    start = (torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device) for part in (x, c))
-    observation = batch.reset(0, None, *start)
-    if drawn is not None and batch.state is not None:
-        rows = torch.as_tensor(drawn.T, dtype=batch.dtype, device=batch.device).contiguous()
-        batch.state = batch.state._replace(drawn=rows)
-        if batch.history:  # the past before the episode has the drawn errors of sensors too
-            seen = batch.observe(batch.state).T[: sensors.observation_size(batch.task, batch.params, batch.observation)]
-            begun = torch.cat([seen, torch.zeros_like(seen[: batch.params.action_size])])
-            batch.state = batch.state._replace(past=begun.repeat(batch.history, 1))
-        observation = batch.observe(batch.state)
-    running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
-    success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
-    cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)
-    steps = torch.zeros(batch.num_envs, dtype=torch.int64, device=batch.device)
-    violated = torch.full_like(steps, -1)
-    states: list[torch.Tensor] = []
-    for _ in range(batch.task.steps):
-        result = batch.step(policy(observation))
-        observation = result.observation
-        cost += torch.where(running, result.cost, 0.0)
-        steps += running
-        success |= running & result.success
-        failure |= running & result.failure
-        violated = torch.where(running & result.failure, result.violated, violated)
-        terminated |= running & result.terminated
-        running &= ~(result.terminated | result.truncated)
-        if record:
-            states.append(result.final_x)
-        elif not running.any():
-            break
-    recorded = torch.stack(states) if record else None
-    return BatchEpisodes(cost, success, failure, violated, terminated, steps, recorded)
 
 
 def _has_compiler(device: torch.device) -> bool:

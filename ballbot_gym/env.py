@@ -29,13 +29,12 @@ from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.scene import Window, check_render_mode, usable_render_modes, window_trouble
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.transition import outcome
+from ballbot_gym.tasks.transition import limit_names, outcome
 from ballbot_gym.viewer import PageScene
 
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
 _FLOAT32 = np.dtype(np.float32)
-_LARGEST_OBSERVATION = 1e6  # far beyond what any episode shows
 
 
 class EnvState(NamedTuple):
@@ -167,7 +166,7 @@ class BallbotEnv(gymnasium.Env):
         self._sensors: tuple[float, ...] = ()
         self._noisy = self.randomization.is_noisy or self.observation == "sensors"
         self.history = check_history(history)
-        self.observation_space = observation_space(self.task, self.params, self.history, self.observation)
+        self.observation_space = sensors.observation_space(self.task, self.params, self.history, self.observation)
         self._own_size = sensors.observation_size(self.task, self.params, self.observation)
         self._past = np.zeros(self.observation_space.shape, np.float32) if self.history else None
         self._physics_dt = physics_dt
@@ -566,21 +565,6 @@ class BallbotEnv(gymnasium.Env):
 
 REWARD_PARTS = ("reward_survive", "reward_cost", "reward_goal")
 """Keys of `info` whose values add up to the reward."""
-
-GRIP = "grip"
-"""The limit that a robot violates that loses its grip."""
-
-
-def observation_space(task: Task, params: BallbotParams, history: int = 0, observation: str = "state") -> spaces.Box:
-    """What a robot can observe in a task, with so many earlier observations and actions."""
-    own = sensors.observation_size(task, params, observation)
-    size = own + history * (own + params.action_size)
-    return spaces.Box(-_LARGEST_OBSERVATION, _LARGEST_OBSERVATION, (size,), np.float32)
-
-
-def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:
-    """What can end an episode of a robot: the task's limits, and its grip where friction is limited."""
-    return (*task.limit_names, GRIP) if params.grips else task.limit_names
 
 
 def make_task(task: str | Task, robot: str | BallbotParams = PAPER, /, **task_fields: Any) -> Task:

@@ -12,6 +12,9 @@ because the goal of a task is a place. What its leans and speeds are it is not t
 import math
 from typing import Any
 
+import numpy as np
+from gymnasium import spaces
+
 from ballbot_gym import dynamics, omni, ops
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
@@ -28,6 +31,7 @@ SCALE = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
 
 FIRST_DRAWS, DRAWS = 10, 6
 """Uniform numbers that `first` and `following` take."""
+_LARGEST = 1e6  # far beyond what any episode shows
 MEMORY = 17
 """Numbers that they give: the gyroscope's biases, what the encoders did not count yet, readings, and where it began."""
 
@@ -48,6 +52,12 @@ def observation_size(task: Task, params: BallbotParams, observation: str) -> int
     if observation == "state":
         return task.observation_size(params)
     return 11 + len(task.constant_names) + task.clock
+
+
+def observation_space(task: Task, params: BallbotParams, history: int = 0, observation: str = "state") -> spaces.Box:
+    """What a robot can observe in a task, with so many earlier observations and actions."""
+    own = observation_size(task, params, observation)
+    return spaces.Box(-_LARGEST, _LARGEST, (own + history * (own + params.action_size),), np.float32)
 
 
 def samples(dt: float) -> int:

@@ -21,15 +21,17 @@ from ballbot_gym.checks import (
     reset_options,
 )
 from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
-from ballbot_gym.env import REWARD_PARTS, limit_names, make_task, observation_space
+from ballbot_gym.env import REWARD_PARTS, make_task
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import PictureScene
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import spec_of
 from ballbot_gym.robots import PAPER, checked_robot
+from ballbot_gym.sensors import observation_space
 from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import limit_names
 
 try:
     import torch

@@ -92,7 +92,15 @@ def test_only_the_engines_and_the_windows_know_physics_engines_and_viser():
 def test_environments_import_no_solver_and_no_learner_at_their_top():
     heavy = {"casadi", "torch", "stable_baselines3", "pybullet", "mujoco", "scipy", "matplotlib", "viser"}
     # these are written in torch and CasADi, and imported when first used
-    batched = {"autoreset.py", "batch.py", "codegen.py", "counter_rng.py", "native.py", "vector.py"}
+    batched = {
+        "autoreset.py",
+        "batch.py",
+        "batch_episodes.py",
+        "codegen.py",
+        "counter_rng.py",
+        "native.py",
+        "vector.py",
+    }
     gym = [path for path in FILES if package(path) == "ballbot_gym" and path.name not in batched]
     assert relative(path for path in gym if imports(path, only_top_level=True) & heavy) == []
 

@@ -13,7 +13,8 @@ from ballbot_baselines.adaptive import adaptive_nmpc
 from ballbot_baselines.cautious import cautious_trajopt
 from ballbot_baselines.kalman import TrackFilter
 from ballbot_gym import certified
-from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import TRACKS, Randomization

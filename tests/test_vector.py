@@ -13,7 +13,8 @@ import torch
 
 from ballbot_gym import batch as batch_module
 from ballbot_gym import counter_rng, dynamics
-from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import REWARD_PARTS
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.turn import Turn

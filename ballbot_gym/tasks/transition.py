@@ -8,7 +8,16 @@ from typing import Any, NamedTuple
 
 from ballbot_gym import ops
 from ballbot_gym.ops import Vector
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.base import Task
+
+GRIP = "grip"
+"""The limit that a robot violates that loses its grip."""
+
+
+def limit_names(task: Task, params: BallbotParams) -> tuple[str, ...]:
+    """What can end an episode of a robot: the task's limits, and its grip where friction is limited."""
+    return (*task.limit_names, GRIP) if params.grips else task.limit_names
 
 
 class Outcome(NamedTuple):

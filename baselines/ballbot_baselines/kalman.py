@@ -21,7 +21,7 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import dynamics, sensors
-from ballbot_gym.env import BallbotEnv, observation_space
+from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import Controller
@@ -246,7 +246,7 @@ class StateFromSensors(gymnasium.Wrapper):
         if not isinstance(ballbot, BallbotEnv) or ballbot.observation != "sensors" or ballbot.history:
             raise ValueError('StateFromSensors takes a BallbotEnv with observation="sensors" and without history')
         self._task, self._limit = ballbot.task, ballbot.params.force_limit
-        self.observation_space = observation_space(ballbot.task, ballbot.params)
+        self.observation_space = sensors.observation_space(ballbot.task, ballbot.params)
         self.filter = SensorFilter(ballbot.task, ballbot.params)
 
     def reset(

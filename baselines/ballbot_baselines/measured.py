@@ -8,10 +8,11 @@ import numpy as np
 from ballbot_baselines.optimum import Optimum, find_optimum
 from ballbot_gym import dynamics
 from ballbot_gym.checks import finite_array
-from ballbot_gym.env import GRIP, make_task
+from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import GRIP
 from ballbot_gym.trajectory import Trajectory
 
 _SAME_TIME = 1e-9  # s: times that differ by less are one

@@ -20,9 +20,9 @@ import numpy as np
 from gymnasium import spaces
 
 from ballbot_gym import files
-from ballbot_gym.env import observation_space
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.sensors import observation_space
 from ballbot_gym.tasks import Task
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.weights import checked, saved_by_torch

@@ -19,13 +19,15 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from ballbot_gym import files
-from ballbot_gym.batch import BallbotBatch, run_episodes
-from ballbot_gym.env import limit_names, make_task
+from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch_episodes import run_episodes
+from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
+from ballbot_gym.tasks.transition import limit_names
 from ballbot_train import jobs
 from ballbot_train.evaluation.controllers import is_expert, is_saved_model, make_controller
 from ballbot_train.evaluation.evaluate import Predictor

@@ -19,11 +19,11 @@ import numpy as np
 import ballbot_train
 from ballbot_gym import certified, dynamics, files
 from ballbot_gym.engines import PHYSICS, make_simulator
-from ballbot_gym.env import limit_names, make_task
+from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.transition import outcome
+from ballbot_gym.tasks.transition import limit_names, outcome
 from ballbot_train.evaluation import recordings
 from ballbot_train.evaluation.results import UNMEASURED, Result, read_results, summarize, to_json
 

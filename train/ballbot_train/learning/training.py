@@ -47,7 +47,8 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ballbot_gym import certified, files
-from ballbot_gym.batch import BallbotBatch, run_episodes
+from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot

@@ -32,7 +32,8 @@ from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_baselines.tvlqr import tube_gains
 from ballbot_gym import dynamics
-from ballbot_gym.batch import BallbotBatch, BatchEpisodes, BatchState, run_episodes
+from ballbot_gym.batch import BallbotBatch, BatchState
+from ballbot_gym.batch_episodes import BatchEpisodes, run_episodes
 from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.paths import then_stay
 from ballbot_gym.randomization import Randomization
