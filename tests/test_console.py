@@ -17,9 +17,9 @@ def test_progress_into_a_pipe_is_a_line_for_every_bar_that_is_not_full(monkeypat
     printed = Console(file=io.StringIO(), width=100, markup=False)
     monkeypatch.setattr(console, "console", printed)
     monkeypatch.setattr(console, "LINE_SECONDS", 0.05)
-    with console.progress_bars({"turn": 4, "[red]orbit": 2}) as bars:
-        bars.advance("turn", 3)
-        bars.advance("[red]orbit", 2)
+    with console.progress_bars({"turn": 4, "[red]orbit": 2}) as advance:
+        advance("turn", 3)
+        advance("[red]orbit", 2)
         time.sleep(0.3)
     lines = printed.file.getvalue().splitlines()
     assert any(re.fullmatch(r"0:00:0\d turn: 3 of 4", line) for line in lines)

@@ -16,7 +16,6 @@ def compare(
     b: Path,
     /,
     match: tuple[str, str] | None = None,
-    margin: float = comparison.MARGIN,
     training_margin: float = comparison.TRAINING_MARGIN,
     out: Path | None = None,
 ) -> None:
@@ -26,12 +25,12 @@ def compare(
         a: folder of a benchmark, or its leaderboard.json; or the name of a row of the leaderboard, as lqr.
         b: the other.
         match: a controller of A and one of B, to compare controllers of different names.
-        margin: differences of success and regret up to this decide nothing; 0.001 is 0.1 %.
-        training_margin: the same between policies with different weights, which the seed of their training makes differ.
+        training_margin: differences of success and regret up to this decide nothing between policies with different weights,
+            which the seed of their training makes differ; 0.02 is 2 %. Other controllers are told apart from 0.1 % on.
         out: file for the same as JSON.
     """
     runs = read_run(a), read_run(b)
-    compared = comparison.compare(runs[0], runs[1], match, margin, training_margin)
+    compared = comparison.compare(runs[0], runs[1], match, training_margin)
     for key in sorted(runs[0][0].keys() & runs[1][0].keys()):
         first, second = (run[0].get(key) for run in runs)
         if first != second and key not in ("policies", "load"):

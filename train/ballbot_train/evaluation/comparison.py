@@ -59,7 +59,6 @@ def compare(
     a: Run,
     b: Run,
     match: tuple[str, str] | None = None,
-    margin: float = MARGIN,
     training_margin: float = TRAINING_MARGIN,
     seed: int = 0,
 ) -> list[Comparison]:
@@ -69,16 +68,14 @@ def compare(
         a: a run.
         b: another.
         match: a controller of A and one of B to compare instead; where each has but one, they are compared anyway.
-        margin: of success and regret.
-        training_margin: the same between policies with different weights.
+        training_margin: of success and regret, between policies with different weights; else it is `MARGIN`.
         seed: of the bootstrap.
 
     Raises:
-        ValueError: there is nothing to compare, a margin is no number from 0, or a run holds an episode twice.
+        ValueError: there is nothing to compare, the margin is no number from 0, or a run holds an episode twice.
     """
-    for name, number in (("margin", margin), ("training_margin", training_margin)):
-        if not 0 <= number < math.inf:
-            raise ValueError(f"{name} must be a number from 0, not {number}")
+    if not 0 <= training_margin < math.inf:
+        raise ValueError(f"training_margin must be a number from 0, not {training_margin}")
     groups_a, groups_b = _groups(a[1]), _groups(b[1])
     pairs = _pairs(groups_a, groups_b, match)
     if not pairs:
@@ -89,7 +86,7 @@ def compare(
             name_a if name_a == name_b else f"{name_a} → {name_b}",
             groups_a[task, name_a],
             groups_b[task, name_b],
-            training_margin if _trained_apart(f"{task}/{name_a}", f"{task}/{name_b}", a[0], b[0]) else margin,
+            training_margin if _trained_apart(f"{task}/{name_a}", f"{task}/{name_b}", a[0], b[0]) else MARGIN,
             seed,
         )
         for task, name_a, name_b in pairs
