@@ -30,13 +30,13 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
 # of simulated recoveries: bandwidth, rad/s; time constant, s; lean to the side, rad, and how fast it fades, s
-_FAMILY = tuple(itertools.product((7.0, 14.0), (1.0, 1.4), (0.0,), (1.0,)))
+_FAMILY = (*itertools.product((7.0, 14.0), (1.0, 1.4), (0.0,), (1.0,)), (10.0, 2.0, 0.0, 1.0))
 _SIDEWAYS_FAMILY = tuple(itertools.product((7.0, 10.0, 14.0), (1.0, 1.8), (-0.6, -0.3, 0.3, 0.6), (0.3,)))
 # Tries in turn from guesses that are motions, and from those that are none. Small multipliers suit limits that are far away.
 _MOTION = tuple(Options(bends=0, width=width, multiplier=1e-3) for width in (0.2, 0.02))
 _PATH = tuple(Options(bends=bends, width=width, multiplier=1e-2) for bends, width in ((3, 0.2), (6, 0.2), (1, 0.05)))
 _GOAL = tuple(replace(options, multiplier=0.1) for options in _PATH)
-_NEAR_GOAL = (Options(bends=1, width=0.005, multiplier=0.01), *_GOAL)  # where the goal's multipliers are about right
+_NEAR_GOAL = (Options(bends=3, width=0.005, multiplier=0.01), *_GOAL)  # where the goal's multipliers are about right
 _ROUGH_PATH, _ROUGH_GOAL = (
     tuple(replace(options, tolerance=1e-4, violation=1e-3) for options in tries) for tries in (_PATH, _GOAL)
 )
