@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from builders import random_policy, task_and_robot
 
+from ballbot_gym.engines import default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import named_robot
 from ballbot_train.commands.export import export
@@ -45,7 +46,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     history = read_description(SHIPPED / f"{name}.json")["spec"].get("history", 0)
     world = {"randomization": track_in(name) or None, "history": history}
     # in the closed form a ball that would slip ends the episode
-    physics = "bullet" if named_robot(robot).grips else "rk4"
+    physics = default_physics(named_robot(robot)) if named_robot(robot).grips else "rk4"
     seen = observations_of_an_episode(BallbotEnv(task, physics=physics, robot=robot, **world), policy)
     assert len(seen) > 50
     one_by_one = [runtime.run(None, {"observation": row[None]})[0][0] for row in seen]
