@@ -4,7 +4,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import torch
+
+from ballbot_gym.lazy import missing
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise missing(__name__, error.name) from error
 
 from ballbot_gym import sensors
 from ballbot_gym.batch import BallbotBatch
