@@ -251,13 +251,16 @@ class _Batch:
             some, options = guesses.some(rows), [tried for tried in now for _ in left]
             ends = None if end_multipliers is None else end_multipliers[rows]
             again = solver.solve(some.x, some.a, some.steps, lengths, given[rows], options, end_multipliers=ends)
-            found = (again if len(now) == 1 else again.some(np.arange(len(left)))) if found is None else found
             right = again.solved
             if chosen_sides is not None:
                 right = right & (self._sides(some.of, again.x) == chosen_sides[rows]).all(axis=1)
-            for better in (again.solved & ~found.solved[rows], right) if found is not again else ():
-                first = np.unique(np.where(better, rows, -1), return_index=True)[1]
-                found.put(rows, again, first[better[first]])
+            if found is None and len(now) == 1:  # all of them, so nothing is to be copied
+                found = again
+            else:
+                found = again.some(np.arange(len(left))) if found is None else found
+                for better in (again.solved & ~found.solved[rows], right):
+                    first = np.unique(np.where(better, rows, -1), return_index=True)[1]
+                    found.put(rows, again, first[better[first]])
             left = np.setdiff1d(left, rows[right])
         assert found is not None
         found.costs[~found.solved] = np.inf

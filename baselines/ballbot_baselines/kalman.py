@@ -101,8 +101,7 @@ class TrackFilter:
         h = np.eye(8, _SIZE)
         h[range(8), [11, 12, 13, 14, 11, 12, 15, 16]] = [t, t, 1, 1, 1, 1, 1, 1]
         missed = np.asarray(x, np.float64) - self._z @ h.T
-        spread = h @ self._p @ h.T + self._noise
-        self._z, self._p = _corrected(self._z, self._p, h, missed, self._noise)
+        self._z, self._p, spread = _corrected(self._z, self._p, h, missed, self._noise)
         self._z[:, _FACTORS] = np.clip(self._z[:, _FACTORS], self._low, self._high)
         whitened = np.einsum("ki,ki->k", missed, np.linalg.solve(spread, missed[..., None])[..., 0])
         return -0.5 * (whitened + np.linalg.slogdet(spread)[1])
@@ -152,12 +151,16 @@ def _step_function(params: BallbotParams, dt: float) -> casadi.Function:
 
 def _corrected(
     z: np.ndarray, p: np.ndarray, h: np.ndarray, missed: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Estimates z (..., n) and covariances (..., n, n), corrected by what h (m, n) missed (..., m), with its noise (m, m)."""
-    gain = np.linalg.solve(h @ p @ h.T + noise, h @ p).swapaxes(-1, -2)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Estimates z (..., n) and covariances (..., n, n), corrected by what h (m, n) missed (..., m), with its noise (m, m).
+
+    The third is the covariance (..., m, m) that was expected of what was missed.
+    """
+    spread = h @ p @ h.T + noise
+    gain = np.linalg.solve(spread, h @ p).swapaxes(-1, -2)
     kept = np.eye(z.shape[-1]) - gain @ h
     p = kept @ p @ kept.swapaxes(-1, -2) + gain @ noise @ gain.swapaxes(-1, -2)
-    return z + np.einsum("...ij,...j->...i", gain, missed), p
+    return z + np.einsum("...ij,...j->...i", gain, missed), p, spread
 
 
 _WHEELS_SIZE = 14
@@ -204,7 +207,7 @@ class SensorFilter:
 
     def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
         missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - np.array(expected)[:, 0]
-        self._z, self._p = _corrected(self._z, self._p, np.array(slopes), missed, self._noise)
+        self._z, self._p, _ = _corrected(self._z, self._p, np.array(slopes), missed, self._noise)
 
     @property
     def x(self) -> np.ndarray:
@@ -245,7 +248,7 @@ class StateFromSensors(gymnasium.Wrapper):
         ballbot: Any = env.unwrapped
         if not isinstance(ballbot, BallbotEnv) or ballbot.observation != "sensors" or ballbot.history:
             raise ValueError('StateFromSensors takes a BallbotEnv with observation="sensors" and without history')
-        self._task, self._limit = ballbot.task, ballbot.params.force_limit
+        self._task = ballbot.task
         self.observation_space = sensors.observation_space(ballbot.task, ballbot.params)
         self.filter = SensorFilter(ballbot.task, ballbot.params)
 
