@@ -42,7 +42,7 @@ _GOAL_PENALTY, _GOAL_CLEARANCE = 30.0, 0.1
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training. It has no gradient
 _GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 3000.0  # as of the margins, for `dynamics.limits` of robots that can slip
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
-_RESTING = 25  # last control steps that lack the goal, where noise keeps the robot from resting in it
+_RESTING = 25  # last control steps that may lack the goal, of episodes of full length or with noise
 _STEEPEST = 10.0  # slope of the logarithm of an episode's cost with a state: steeper ones, of robots that fall, are cut
 _PATIENCE = 5  # control steps for which episodes go on when all have reached the goal
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
@@ -82,7 +82,7 @@ class WholeEpisodes:
         torch.manual_seed(seed)  # for the network's first weights
         self.config, self.iteration = config, 0
         self.iterations, self.evaluations = config.iterations, config.evaluations
-        self.task = replace(task, duration=config.episode_seconds)
+        self.task, self._own_steps = replace(task, duration=config.episode_seconds), task.steps
         world: dict[str, Any] = {"randomization": randomization, "history": history}
         self._wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
         self._batch = BallbotBatch(self.task, config.num_envs, compile=self._wheels and long, params=params, **world)
@@ -147,12 +147,13 @@ class WholeEpisodes:
         alive, reached = torch.ones(config.num_envs, dtype=torch.bool), torch.zeros(config.num_envs, dtype=torch.bool)
         standing = alive  # an episode that has reached the goal goes on for a while, and may fail then
         noisy = self._batch.randomization.is_noisy
+        rests = not task.first_exit and (noisy or task.steps >= self._own_steps)
         ends, patience = [], _PATIENCE
         ahead = int(noisy or task.clock)  # what noise and clock give changes with the steps
         for k in range(task.steps):
             step = self._step(state)
             total = total + torch.where(alive & standing, step.cost, 0.0)
-            if noisy and not task.first_exit and k >= task.steps - _RESTING:
+            if rests and k >= task.steps - _RESTING:
                 total = total + torch.where(alive, _GOAL_PENALTY / _RESTING * step.lacking, 0.0)
             alive, standing = alive & ~(step.failed & ~reached), standing & ~step.failed
             if task.first_exit:
