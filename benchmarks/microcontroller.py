@@ -1,8 +1,9 @@
 """Exported C files here and on a simulated Cortex-M7: the largest error of an action, instructions per step, sizes.
 
 Each controller drives an episode in Python. The C file then gets the same states in the same order. A step is observing and
-acting. QEMU counts one instruction as one nanosecond, and the steps of the episode are counted one by one, each as the mean
-of many repetitions. It needs gcc and Debian's gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm.
+acting, and estimating before, where a filter is in front. QEMU counts one instruction as one nanosecond, and the steps of the
+episode are counted one by one, each as the mean of many repetitions. It needs gcc and Debian's gcc-arm-none-eabi,
+libnewlib-arm-none-eabi and qemu-system-arm.
 """
 
 import shutil
@@ -14,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ballbot_gym import files
+from ballbot_gym import files, sensors
 from ballbot_gym.env import BallbotEnv, make_task
-from ballbot_gym.params import default_params
-from ballbot_gym.rollout import rollout
-from ballbot_train.evaluation.controllers import make_controller, policy_path
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot
+from ballbot_gym.rollout import Controller, rollout
+from ballbot_train.evaluation.controllers import FILTERED, make_controller, policy_path
 from ballbot_train.report.c_export import LQR, export_c
 from ballbot_train.report.printed import c_number
 
@@ -46,31 +47,42 @@ _MAIN = """
 #include <unistd.h>
 #include "controller.c"
 
-static const float constants[] = {%(constants)s}, states[] = {%(states)s}, actions[] = {%(actions)s};
-enum { STEPS = sizeof actions / sizeof *actions / 2 };
+static const float constants[] = {%(constants)s}, actions[] = {%(actions)s};
+static const float shown[] = {%(shown)s}; /* states, or what sensors show */
+enum { STEPS = sizeof actions / sizeof *actions / BALLBOT_ACTIONS, SHOWN = sizeof shown / sizeof *shown / STEPS };
 
 static void step(int k, float *action)
 {
     float observation[BALLBOT_OBSERVATIONS];
-    ballbot_observe(states + 8 * k, constants, k * BALLBOT_CONTROL_DT, observation);
+    const float *state = shown + SHOWN * k;
+#ifdef FILTERED
+    static const float place[] = {%(place)s};
+    static float estimate[BALLBOT_STATES];
+    if (k)
+        ballbot_estimate(state, actions + BALLBOT_ACTIONS * (k - 1), estimate);
+    else
+        ballbot_first_estimate(state, place, estimate);
+    state = estimate;
+#endif
+    ballbot_observe(state, constants, k * BALLBOT_CONTROL_DT, observation);
     ballbot_act(observation, action);
 }
 
 int main(void)
 {
-    float worst = 0, action[2];
+    float worst = 0, action[BALLBOT_ACTIONS];
     ballbot_reset();
     for (int k = 0; k < STEPS; ++k) {
         step(k, action);
-        for (int i = 0; i < 2; ++i)
-            worst = fmaxf(worst, fabsf(action[i] - actions[2 * k + i]));
+        for (int i = 0; i < BALLBOT_ACTIONS; ++i)
+            worst = fmaxf(worst, fabsf(action[i] - actions[BALLBOT_ACTIONS * k + i]));
     }
     printf("%%.9g\\n", (double)worst);
 #ifdef __arm__
     volatile uint32_t *const timer = (uint32_t *)0xE000E010;
     timer[1] = 0xFFFFFF;
     timer[0] = 5; /* on, at the processor's clock */
-    for (int k = 0; k < STEPS; k += STEPS / 20) {
+    for (int k = 1; k < STEPS; k += STEPS / 20) {
         const uint32_t before = timer[2];
         for (int i = 0; i < %(repetitions)d; ++i)
             step(k, action);
@@ -102,6 +114,7 @@ class Row:
     """One controller. Errors are of actions in [-1, 1]; sizes are of the compiled controller without libm, bytes."""
 
     task: str
+    robot: str
     controller: str
     source_bytes: int
     flash_bytes: int
@@ -121,13 +134,15 @@ def main(
         "stabilize-shac",
         "turn-ppo",
         "weave-dagger",
+        "stabilize-omni-lqr-ekf",
+        "stabilize-omni_strong-shac-ekf",
     ),
     out: Path = Path("runs/microcontroller"),
 ) -> None:
     """Writes OUT/microcontroller.csv.
 
     Args:
-        controllers: TASK-NAME of lqr and of policies that come with the package.
+        controllers: TASK-NAME or TASK-ROBOT-NAME of lqr and of policies that come with the package; behind them -ekf.
         out: folder of the table, and of the code of each controller.
     """
     missing = [tool for tool in ("gcc", _ARM[0], _QEMU[0]) if shutil.which(tool) is None]
@@ -138,15 +153,20 @@ def main(
         )
     rows = []
     for each in controllers:
-        rows.append(_measured(*each.split("-", 1), out / each))
+        task, _, name = each.partition("-")
+        robot, _, rest = name.partition("-")
+        robot, name = (robot, rest) if robot in ROBOTS else (PAPER, name)
+        rows.append(_measured(task, robot, name, out / each))
         print(rows[-1])
     files.write_csv(out / "microcontroller.csv", [asdict(row) for row in rows])
 
 
-def _measured(task: str, name: str, folder: Path) -> Row:
-    problem = make_task(task)
-    source = export_c(LQR if name == LQR else policy_path(name, problem), folder / "controller.c", problem)
-    files.write(folder / "main.c", _MAIN % {**_episode(task, name), "repetitions": _REPETITIONS})
+def _measured(task: str, robot: str, name: str, folder: Path) -> Row:
+    problem, filtered, alone = make_task(task, robot), name.endswith(FILTERED), name.removesuffix(FILTERED)
+    policy = LQR if alone == LQR else policy_path(alone, problem, robot)
+    source = export_c(policy, folder / "controller.c", problem, robot, filtered)
+    main = _MAIN % {**_episode(task, robot, name, filtered), "repetitions": _REPETITIONS}
+    files.write(folder / "main.c", filtered * "#define FILTERED\n" + main)
     files.write(folder / "board.ld", _MAP)
 
     def run(*command: str) -> list[str]:
@@ -163,6 +183,7 @@ def _measured(task: str, name: str, folder: Path) -> Row:
     instructions = [_TICK * int(tick) / _REPETITIONS for tick in ticks]
     return Row(
         task,
+        robot,
         name,
         source.stat().st_size,
         code + data,
@@ -174,16 +195,41 @@ def _measured(task: str, name: str, folder: Path) -> Row:
     )
 
 
-def _episode(task: str, name: str) -> dict[str, str]:
-    """Constants and states of an episode, in float32, and the actions of Python's controller there."""
-    params = default_params()
-    controller = make_controller(name, make_task(task), params)
-    episode = rollout(BallbotEnv(task, physics="rk4"), controller, seed=1)
-    c, states = episode.constants.astype(np.float32), episode.trajectory.x[:-1].astype(np.float32)
-    controller.reset(0.0, states[0], c)
-    dt = make_task(task).control_dt
-    forces = np.array([controller.act(k * dt, x) for k, x in enumerate(states)])
-    arrays = {"constants": np.append(c, 0), "states": states, "actions": (forces / params.force_limit).clip(-1, 1)}
+class _Recorded:
+    """A controller, of which all is kept that it was shown, in float32, and what it did."""
+
+    def __init__(self, controller: Controller, filtered: bool):
+        self._controller, self.senses = controller, filtered
+        self.shown: list[np.ndarray] = []
+        self.forces: list[np.ndarray] = []
+
+    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        self._controller.reset(t, self._single(x), c.astype(np.float32))
+
+    def act(self, t: float, x: np.ndarray) -> np.ndarray:
+        x = self._single(x)
+        self.shown.append(x)
+        self.forces.append(np.asarray(self._controller.act(t, x)))
+        return self.forces[-1]
+
+    def _single(self, x: np.ndarray) -> np.ndarray:
+        """As the C file takes it: of sensors in SI units."""
+        if not self.senses:
+            return x.astype(np.float32)
+        return np.append((x[:9] * sensors.SCALE).astype(np.float32) / np.array(sensors.SCALE), x[9:])
+
+
+def _episode(task: str, robot: str, name: str, filtered: bool) -> dict[str, str]:
+    """Constants of an episode, what the controller was shown in it, in float32, and Python's actions."""
+    params = named_robot(robot)
+    controller = _Recorded(make_controller(name, make_task(task, robot), params), filtered)
+    env = BallbotEnv(task, physics="rk4", robot=robot, observation="sensors" if filtered else "state")
+    c = rollout(env, controller, seed=1).constants.astype(np.float32)
+    shown, place = np.array(controller.shown), np.zeros(2)
+    if filtered:
+        shown, place = shown[:, :9] * sensors.SCALE, shown[0, 9:11]
+    actions = np.clip(np.array(controller.forces) / params.force_limit, -1, 1)
+    arrays = {"constants": np.append(c, 0), "shown": shown, "place": place, "actions": actions}
     return {key: ", ".join(c_number(value) for value in array.ravel()) for key, array in arrays.items()}
 
 

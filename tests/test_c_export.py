@@ -11,6 +11,7 @@ from ballbot_gym import certified, machine_code
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.rollout import rollout
+from ballbot_gym.sensors import SCALE
 from ballbot_train.commands.export import export
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.policy import PolicyController, save_policy
@@ -94,6 +95,59 @@ def test_lqr_of_a_robot_with_wheels_passes_the_test_in_its_file(tmp_path):
     export(LQR, format="c", out=tmp_path / "lqr.c", robot="omni")
     told = subprocess.run([built(tmp_path / "lqr.c", tmp_path / "lqr", "-DBALLBOT_TEST")], capture_output=True)
     assert told.stdout.startswith(b"PASS")
+
+
+class FromSensors:
+    """A C file with the filter as a Controller of an env that shows sensors."""
+
+    senses = True
+
+    def __init__(self, source, limit):
+        self._code, self._limit = ctypes.CDLL(str(built(source, source.with_suffix(".so"), "-fPIC", "-shared"))), limit
+        self._state, self._seen, self._action = (np.zeros(size, np.float32) for size in (11, 12, 3))
+
+    def reset(self, t, x, c):
+        self._code.ballbot_reset()
+        self._begins = True
+
+    def act(self, t, x):
+        sensors, place = (part.astype(np.float32) for part in (x[:9] * SCALE, x[9:11]))
+        pointers = (
+            part.ctypes.data_as(ctypes.c_void_p) for part in (sensors, place, self._state, self._seen, self._action)
+        )
+        sensors, place, state, seen, action = pointers
+        if self._begins:
+            self._code.ballbot_first_estimate(sensors, place, state)
+        else:
+            self._code.ballbot_estimate(sensors, action, state)
+        self._begins = False
+        self._code.ballbot_observe(state, None, ctypes.c_float(t), seen)
+        self._code.ballbot_act(seen, action)
+        return self._limit * self._action.astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("name", "robot", "episodes"),
+    [("shac-ekf", "omni_strong", 2), pytest.param("lqr-ekf", "omni", 20, marks=pytest.mark.slow)],
+)
+def test_a_compiled_filter_drives_certified_episodes_from_sensors_to_the_same_ends(name, robot, episodes, tmp_path):
+    export(name, task="stabilize", format="c", out=tmp_path / "filtered.c", robot=robot)
+    told = subprocess.run([built(tmp_path / "filtered.c", tmp_path / "test", "-DBALLBOT_TEST")], capture_output=True)
+    assert told.stdout.startswith(b"PASS")
+    env = BallbotEnv(robot=robot, physics="rk4", observation="sensors")
+    compiled, known = FromSensors(tmp_path / "filtered.c", env.params.force_limit), certified.load(env.task, robot)
+    made, ends = make_controller(name, env.task, env.params), []
+    for i in range(episodes):
+        driven, own = (rollout(env, each, seed=i, options=known.options(i)) for each in (compiled, made))
+        ends.append(driven.success)
+        assert (driven.success, driven.failure) == (own.success, own.failure)
+        assert driven.cost == pytest.approx(own.cost, rel=1e-3)
+    assert any(ends)
+
+
+def test_a_filter_whose_start_differs_from_episode_to_episode_is_refused():
+    with pytest.raises(ValueError, match="leave out -ekf"):
+        export("shac-ekf", task="orbit", format="c", robot="omni_strong")
 
 
 @pytest.mark.parametrize(

@@ -163,12 +163,26 @@ def _corrected(
     return z + np.einsum("...ij,...j->...i", gain, missed), p, spread
 
 
-_WHEELS_SIZE = 14
 _DRAWN = 256  # starts that tell what to expect of one
 _KNOWN = 1e-3  # standard deviation of what they all share, SI units
-_WHEELS_ERROR = (
-    np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
-)  # variances that the model does not explain
+WHEELS_ERROR = np.array([0] * 4 + [1e-3] * 4 + [0] + [1e-3] * 2 + [0] * 3) ** 2
+"""Variances (14,) that the model does not explain, per control step."""
+
+
+def readings_variance(dt: float) -> np.ndarray:
+    """Variances (9,) of the noise of what sensors read over a control step of dt, s, in SI units."""
+    samples = sensors.samples(dt)
+    noise = [sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [sensors.ACCELEROMETER_NOISE**2 / samples] * 3
+    return np.array([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+
+
+def expected_start(task: Task, params: BallbotParams, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is expected (14,) where an episode with constants c (nc,) begins, and its standard deviations."""
+    draws = np.random.default_rng(0).random((_DRAWN, task.state_draws))
+    starts = np.array([task.start(tuple(z), tuple(c), params) for z in draws.tolist()])
+    starts[:, :2] = 0.0  # which the robot is told
+    deviations = [*np.maximum(starts.std(0), _KNOWN), *[sensors.GYROSCOPE_BIAS] * 3]
+    return np.concatenate([starts.mean(0), np.zeros(3)]), np.array(deviations)
 
 
 class SensorFilter:
@@ -181,33 +195,61 @@ class SensorFilter:
     """
 
     def __init__(self, task: Task, params: BallbotParams):
-        self._task, self._params = task, params
-        self._functions = _sensor_functions(params, task.control_dt)
-        samples = sensors.samples(task.control_dt)
-        noise = [sensors.GYROSCOPE_NOISE**2 / samples] * 3 + [sensors.ACCELEROMETER_NOISE**2 / samples] * 3
-        self._noise = np.diag([*noise, *[sensors.TICK**2 / 6] * 3])  # of the difference of two roundings
+        self._task, self._params, self._dt = task, params, task.control_dt
+        self._model, self._substeps = robot_and_sensors(params), dynamics.substeps_for(task.control_dt)
+        self._noise = np.diag(readings_variance(task.control_dt))
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
         """Starts an episode with constants c (nc,), of which sensors show this (no,) at first."""
-        rng = np.random.default_rng(0)
-        draws = rng.random((_DRAWN, self._task.state_draws))
-        starts = np.array([self._task.start(tuple(z), tuple(c), self._params) for z in draws.tolist()])
-        starts[:, :2] = seen[9:11]
-        self._z = np.concatenate([starts.mean(0), np.zeros(3)])
-        self._p = np.diag([*np.maximum(starts.std(0), _KNOWN), *[sensors.GYROSCOPE_BIAS] * 3]) ** 2
-        self._correct(seen, *self._functions[0](self._z))
+        mean, deviations = expected_start(self._task, self._params, c)
+        self._z, self._p = np.concatenate([seen[9:11], mean[2:]]), np.diag(deviations) ** 2
+        found, slopes = self._at(self._z[:11], np.zeros(3))
+        self._correct(seen, found[11:], slopes[11:])
 
     def update(self, seen: np.ndarray, u: np.ndarray) -> None:
         """Takes what sensors show (no,) after a control step with the wheels' forces u (3,), N."""
         u = np.clip(u, -self._params.force_limit, self._params.force_limit)
-        self._correct(seen, *self._functions[1](self._z, u))
-        after, slopes = self._functions[2](self._z, u)
-        self._z, slopes = np.array(after)[:, 0], np.array(slopes)
-        self._p = slopes @ self._p @ slopes.T + np.diag(_WHEELS_ERROR)
+        self._correct(seen, *self._over_step(u))
+        self._z[:11], slopes = self._after(u)
+        self._p[:11] = slopes @ self._p[:11]
+        self._p[:, :11] = self._p[:, :11] @ slopes.T
+        self._p += np.diag(WHEELS_ERROR)
 
-    def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
-        missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - np.array(expected)[:, 0]
-        self._z, self._p, _ = _corrected(self._z, self._p, np.array(slopes), missed, self._noise)
+    def _at(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What `robot_and_sensors` gives."""
+        found, slopes = self._model(x, u)
+        return np.array(found)[:, 0], np.array(slopes)
+
+    def _after(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The state after a control step, and its Jacobian, by RK4."""
+        x, slopes, dt = self._z[:11], np.eye(11), self._dt / self._substeps
+        for _ in range(self._substeps):
+            rates, changes, more, moved = np.zeros(11), np.zeros((11, 11)), x, slopes
+            for weight, share in ((1, 0.5), (2, 0.5), (2, 1.0), (1, 0.0)):
+                found, at = self._at(more, u)
+                rate, change = found[:11], at[:11] @ moved
+                rates, changes = rates + weight / 6 * rate, changes + weight / 6 * change
+                more, moved = x + share * dt * rate, slopes + share * dt * change
+            x, slopes = x + dt * rates, slopes + dt * changes
+        return x, slopes
+
+    def _over_step(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `sensors.mean` of the estimated state, and the Jacobian."""
+        x, dt, (after, slopes) = self._z[:11], self._dt, self._after(u)
+        (first, at_first), (last, at_last) = self._at(x, u), self._at(after, u)
+        at_last = at_last @ slopes
+        middle = 0.5 * (x + after) + dt / 8 * (first - last)[:11]
+        halfway, at_halfway = self._at(middle, u)
+        at_halfway = at_halfway @ (0.5 * (np.eye(11) + slopes) + dt / 8 * (at_first - at_last)[:11])
+        return (first + 4 * halfway + last)[11:] / 6, (at_first + 4 * at_halfway + at_last)[11:] / 6
+
+    def _correct(self, seen: np.ndarray, expected: np.ndarray, slopes: np.ndarray) -> None:
+        """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian."""
+        of_biases, turned = np.eye(9, 3), np.repeat([1.0, self._dt], (6, 3))
+        missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - turned * expected
+        missed[:3] -= self._z[11:]
+        h = np.hstack([turned[:, None] * slopes, of_biases])
+        self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)
 
     @property
     def x(self) -> np.ndarray:
@@ -272,25 +314,11 @@ class StateFromSensors(gymnasium.Wrapper):
 
 
 @lru_cache(maxsize=16)
-def _sensor_functions(params: BallbotParams, dt: float) -> list[casadi.Function]:
-    """Readings at an episode's start and over a control step of dt, s, and the step itself, of z and the wheels' forces.
-
-    Each gives its Jacobian with respect to z too.
+def robot_and_sensors(params: BallbotParams) -> casadi.Function:
+    """(x, u) -> rates of the state x (11,) over ideal readings (9,), under the wheels' forces u (3,), N, and their Jacobian
+    (20, 11) with respect to x.
     """
-    z, u = casadi.SX.sym("z", _WHEELS_SIZE), casadi.SX.sym("u", 3)
-    x, bias = casadi.vertsplit(z[:11]), casadi.vertcat(z[11:], casadi.DM.zeros(6))
-    after = dynamics.step(params, z[:11], u, dt, dynamics.substeps_for(dt))
-    forces = tuple(casadi.vertsplit(u))
-    first = sensors.undriven(params, tuple(x), dt)
-    following = sensors.mean(params, tuple(x), forces, tuple(casadi.vertsplit(after)), dt)
-    outputs = {
-        "first": casadi.vertcat(*first) + bias,
-        "following": casadi.vertcat(*following) + bias,
-        "step": casadi.vertcat(after, z[11:]),
-    }
-    return [
-        casadi.Function(
-            name, [z] if name == "first" else [z, u], [out, casadi.densify(casadi.jacobian(out, z))], {"cse": True}
-        )
-        for name, out in outputs.items()
-    ]
+    x, u = casadi.SX.sym("x", 11), casadi.SX.sym("u", 3)
+    state, forces = tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(u))
+    found = casadi.vertcat(*dynamics.derivative(params, state, forces), *sensors.ideal(params, state, forces))
+    return casadi.Function("robot", [x, u], [found, casadi.densify(casadi.jacobian(found, x))], {"cse": True})

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Literal
 
 from ballbot_gym.env import make_task
-from ballbot_gym.robots import PAPER, file_name
+from ballbot_gym.robots import PAPER, file_name, named_robot
 from ballbot_train.console import RobotName, console
-from ballbot_train.evaluation.controllers import policy_path, task_name
+from ballbot_train.evaluation.controllers import FILTERED, policy_path, task_name
 
 
 def export(
@@ -24,20 +24,23 @@ def export(
     as a comment, and a test of itself.
 
     Args:
-        policy: a policy file, or the name of a policy that comes with the package; for C also lqr.
+        policy: a policy file, or the name of a policy that comes with the package; for C also lqr. For C of a robot with
+            wheels -ekf may follow: then it takes what the robot's sensors show.
         task: name of its task; default the one that its file names, or else stabilize.
         format: onnx or c.
         out: path of the file; default runs/export/TASK-POLICY with the ending .onnx or .c.
         robot: name of the policy's robot.
     """
+    filtered = policy.endswith(FILTERED) and format == "c" and named_robot(robot).wheels is not None
+    name, policy = Path(policy).stem, policy.removesuffix(FILTERED) if filtered else policy
     task = task_name(policy, task, robot)
     problem = make_task(task, robot)
     source = policy if (policy, format) == ("lqr", "c") else policy_path(policy, problem, robot)
-    path = Path("runs") / "export" / f"{file_name(task, robot)}-{Path(policy).stem}.{format}" if out is None else out
+    path = Path("runs") / "export" / f"{file_name(task, robot)}-{name}.{format}" if out is None else out
     if format == "c":
         from ballbot_train.report.c_export import export_c  # it imports torch
 
-        written, how = export_c(source, path, problem, robot), "compiled with -DBALLBOT_TEST it checks itself"
+        written, how = export_c(source, path, problem, robot, filtered), "compiled with -DBALLBOT_TEST it checks itself"
     else:
         from ballbot_train.onnx_export import export_onnx  # it imports torch
 

@@ -13,9 +13,11 @@ import jinja2
 import numpy as np
 import torch
 
+from ballbot_baselines import kalman
 from ballbot_baselines.lqr import equilibrium_gain
-from ballbot_gym import files
+from ballbot_gym import dynamics, files, sensors
 from ballbot_gym.env import BallbotEnv
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Task
@@ -37,7 +39,7 @@ _TEST_STEPS = 16
 
 
 @own_defaults()
-def export_c(policy: str | Path, path: str | Path, task: Task, robot: str = PAPER) -> Path:
+def export_c(policy: str | Path, path: str | Path, task: Task, robot: str = PAPER, filtered: bool = False) -> Path:
     """Writes a policy, or LQR, as a C file that observes and acts; its first lines say how to use it.
 
     Args:
@@ -45,16 +47,18 @@ def export_c(policy: str | Path, path: str | Path, task: Task, robot: str = PAPE
         path: of the C file.
         task: what the policy was made for.
         robot: by name.
+        filtered: with `kalman.SensorFilter` in front of it, which makes the state from sensors.
 
     Raises:
         PolicyError: as `load_network`; or the policy's actions are not finite.
-        ValueError: the task's LQR depends on the episode; or a frame or an observation cannot be printed.
+        ValueError: the task's LQR, or where its filter expects to start, depends on the episode; or a frame or an observation
+            cannot be printed.
     """
     if policy == LQR:
         network, about = lqr_network(task, robot), {"task": task.id, "problem": task.problem(), "robot": robot}
     else:
         network, about = load_network(policy, task, robot).eval(), metadata(policy, task, robot)
-    return files.write(path, _source(network, about, task, robot))
+    return files.write(path, _source(network, about, task, robot, filtered))
 
 
 def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
@@ -73,7 +77,7 @@ def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
     return network.eval()
 
 
-def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str) -> str:
+def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str, filtered: bool) -> str:
     spec, params = network.spec, named_robot(robot)
     networks = {
         "mlp": _layers(network.mlp),
@@ -114,10 +118,35 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         reach=c_number(REACH),
         mirrors=_numbers(np.array(signs)),
         mirror_count=len(signs),
-        test=_test(network, task, robot),
+        filter=_filter(task, params) if filtered else None,
+        test=_filtered_test(network, task, robot) if filtered else _test(network, task, robot),
         largest_error=c_number(LARGEST_ERROR),
         numbers=_numbers,
+        exact=lambda values: textwrap.fill(", ".join(map(repr, values.tolist())), 120),
     )
+
+
+def _filter(task: Task, params: BallbotParams) -> dict[str, Any]:
+    """What the template needs of `kalman.SensorFilter`."""
+    if task.constant_names:
+        raise ValueError(
+            f"where {task.id} starts depends on the episode, so no C file can hold the filter; leave out -ekf"
+        )
+    model = kalman.robot_and_sensors(params)
+
+    def robot(x: casadi.SX, u: casadi.SX) -> casadi.SX:
+        found, slopes = model(x, u)
+        return casadi.vertcat(found, casadi.vec(slopes.T))
+
+    start, deviations = kalman.expected_start(task, params, np.zeros(0))
+    return {
+        "substeps": dynamics.substeps_for(task.control_dt),
+        "start": start,
+        "start_variance": deviations**2,
+        "model_variance": kalman.WHEELS_ERROR,
+        "reading_variance": kalman.readings_variance(task.control_dt),
+        "model": c_function("robot", robot, {"x": params.state_size, "u": params.action_size}, "double"),
+    }
 
 
 def _functions(network: PolicyNetwork, task: Task, states: int, seen: int, inputs: int) -> list[str]:
@@ -146,6 +175,26 @@ def _layers(modules: Any) -> list[tuple[np.ndarray, np.ndarray | None]]:
     ]
 
 
+def _filtered_test(network: PolicyNetwork, task: Task, robot: str) -> dict[str, np.ndarray]:
+    """What sensors show in an episode's first steps, as float32, and the actions that the policy behind the filter takes."""
+    params = named_robot(robot)
+    controller = kalman.FilteredController(task, params, PolicyController(task, params, network))
+    env = BallbotEnv(task, physics="rk4", robot=robot, observation="sensors")
+    seen, info = env.reset(seed=0)
+    shown, actions = [], []
+    for k in range(_TEST_STEPS):
+        shown.append((seen[:9] * sensors.SCALE).astype(np.float32))
+        seen = np.append(shown[-1] / np.array(sensors.SCALE), seen[9:])
+        if not k:
+            place = seen[9:11]
+            controller.reset(0.0, seen, info["constants"])
+        actions.append(np.clip(controller.act(k * task.control_dt, seen) / params.force_limit, -1, 1))
+        seen, _, _, _, info = env.step(actions[-1])
+    times = task.control_dt * np.arange(_TEST_STEPS, dtype=np.float32)
+    arrays = {"sensors": np.array(shown), "place": place, "constants": np.zeros(1), "times": times}
+    return arrays | {"actions": _finite(np.array(actions))}
+
+
 def _test(network: PolicyNetwork, task: Task, robot: str) -> dict[str, np.ndarray]:
     """States of an episode under the policy, as float32, and the actions that it takes there one after the other."""
     params = named_robot(robot)
@@ -157,9 +206,13 @@ def _test(network: PolicyNetwork, task: Task, robot: str) -> dict[str, np.ndarra
     c = episode.constants.astype(np.float32)
     controller.reset(0.0, states[0], c)
     actions = np.array([controller.act(float(t), x) for t, x in zip(times, states, strict=True)]) / params.force_limit
+    return {"constants": c if c.size else np.zeros(1), "states": states, "times": times, "actions": _finite(actions)}
+
+
+def _finite(actions: np.ndarray) -> np.ndarray:
     if not np.isfinite(actions).all():
         raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it anew")
-    return {"constants": c if c.size else np.zeros(1), "states": states, "times": times, "actions": actions}
+    return actions
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -73,23 +73,24 @@ def javascript_function(name: str, function: Callable[..., Any], arguments: Mapp
     Raises:
         ValueError: the function uses an operation that cannot be printed.
     """
-    lines, returned = _printed(name, function, arguments, r"Math.\1", _javascript_number)
+    lines, returned = _printed(name, function, arguments, r"Math.\1", _number)
     body = "\n".join(f"  const {line};" for line in lines)
     return f"function {name}({', '.join(arguments)}) {{\n{body}\n  return [{', '.join(returned)}];\n}}\n"
 
 
-def c_function(name: str, function: Callable[..., Any], arguments: Mapping[str, int]) -> str:
-    """A C99 function in single precision; arguments and errors as `javascript_function`.
+def c_function(name: str, function: Callable[..., Any], arguments: Mapping[str, int], real: str = "float") -> str:
+    """A C99 function in single precision, or in that of another type; arguments and errors as `javascript_function`.
 
     Returns:
         Its source. It takes pointers to numbers, and another one, `out`, to where its results go, which are no argument's.
     """
-    lines, returned = _printed(name, function, arguments, r"\1f", c_number)
-    takes = ", ".join(f"const float *{argument}" for argument in arguments)
-    body = [f"const float {line};" for line in lines]
+    single = real == "float"
+    lines, returned = _printed(name, function, arguments, r"\1f" if single else r"\1", c_number if single else _number)
+    takes = ", ".join(f"const {real} *{argument}" for argument in arguments)
+    body = [f"const {real} {line};" for line in lines]
     body += [f"(void){argument};" for argument in arguments]  # whether it is used or not
     body += [f"out[{i}] = {value};" for i, value in enumerate(returned)]
-    return f"static void {name}({takes}, float *out)\n{{\n    " + "\n    ".join(body) + "\n}\n"
+    return f"static void {name}({takes}, {real} *out)\n{{\n    " + "\n    ".join(body) + "\n}\n"
 
 
 def c_number(value: float) -> str:
@@ -99,7 +100,7 @@ def c_number(value: float) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def _javascript_number(value: float) -> str:
+def _number(value: float) -> str:
     return repr(value) if value >= 0 else f"({value!r})"
 
 
