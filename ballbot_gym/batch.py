@@ -363,10 +363,7 @@ class BallbotBatch:
                 counter_rng.key(state.seed, state.episode, state.steps + 1), Randomization.PUSH_DRAWS, self.dtype
             )
             total = tuple(f + push for f, push in zip(force, noise.push(z, task.control_dt), strict=True))
-        robot: Any = self.params
-        if noise.varies_robot:
-            robot = ModelNumbers.of(noise.robot(self.params, now.drawn))
-
+        robot = self.model(now.drawn)
         end = self._moved(robot, x, total)
         grip, kept = torch.zeros(0, *end[0].shape, dtype=self.dtype, device=end[0].device), ()
         if self.params.grips:
@@ -450,6 +447,11 @@ class BallbotBatch:
             return self.params
         return self.randomization.robot(self.params, tuple(self.state.drawn[:, i].tolist()))
 
+    def model(self, drawn: tuple[torch.Tensor, ...]) -> Any:
+        """What `dynamics` reads of the robots for whose episodes the randomization drew this, (B,) each."""
+        noise = self.randomization
+        return ModelNumbers.of(noise.robot(self.params, drawn)) if noise.varies_robot else self.params
+
     def _start(
         self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
     ) -> _Rows:
@@ -468,8 +470,7 @@ class BallbotBatch:
         still = torch.zeros_like(seed, dtype=self.dtype)
         forces = self.params.action_size
         actuator = (still,) * (forces + forces * self._past_steps) if noise.varies_actuator else ()
-        robot: Any = ModelNumbers.of(noise.robot(self.params, drawn)) if noise.varies_robot else self.params
-        read = sensors.first(robot, state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
+        read = sensors.first(self.model(drawn), state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
         begun = _Rows(state, constants, zero, episode, seed, drawn, actuator, (), read)
         return begun._replace(past=self.history * (*self._seen(begun), *(still,) * forces)) if self.history else begun
 

@@ -186,14 +186,14 @@ class WholeEpisodes:
                     cost
                     + config.margin_penalty * task.control_dt * (config.margin_clearance - margin).clamp(min=0) ** 2
                 )
-        cost = cost + grip_penalty(self._batch.params, before, force, task.control_dt)
+        cost = cost + grip_penalty(self._batch.model(state.drawn.unbind(0)), before, force, task.control_dt)
         goal = torch.stack(task.goal(x, c))
         lacking = (goal + _GOAL_CLEARANCE).clamp(min=0).sum(0)
         inside = (goal <= 0).all(0)
         return _Step(result.final_x, cost, lacking, inside, result.failure, new.actuator, new.past)
 
 
-def grip_penalty(params: BallbotParams, x: tuple[Any, ...], force: tuple[Any, ...], dt: float) -> Any:
+def grip_penalty(params: Any, x: tuple[Any, ...], force: tuple[Any, ...], dt: float) -> Any:
     """What a control step of dt, s, in which the ball slips or nearly does, costs in training, of B robots: (B,) or 0."""
     shortfalls = ((_GRIP_CLEARANCE - limit).clamp(min=0) for limit in dynamics.limits(params, x, force, hold=dt))
     return sum(_GRIP_PENALTY * dt * shortfall**2 for shortfall in shortfalls)

@@ -300,7 +300,7 @@ class Shac:
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * task.control_dt * squared
-        shaped = shaped + grip_penalty(self._batch.params, before, force, task.control_dt)
+        shaped = shaped + grip_penalty(self._batch.model(state.drawn.unbind(0)), before, force, task.control_dt)
         loss = loss + discount * alive * shaped
         if config.exit_softness:
             alive = alive * torch.sigmoid(torch.stack(task.goal(x, c)).amax(0) / config.exit_softness)
