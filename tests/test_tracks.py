@@ -21,6 +21,7 @@ from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
+from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.evaluation.tracks import EXPERTS, conditions, with_experts
 from ballbot_train.policy import load_network
@@ -103,6 +104,23 @@ def test_fresh_episodes_of_a_track_draw_robots_and_say_what_each_costs():
     assert (result.costs != plain.costs).all()
     assert set(result.measures) > {"body_mass", "com_height", "force"}
     assert 0.7 <= result.measures["body_mass"].min() < result.measures["body_mass"].max() <= 1.4
+
+
+@pytest.mark.parametrize(
+    ("task", "track", "policy", "filtered"),
+    [("stabilize", "noisy", "shac", "shac-ekf"), ("turn", "late", "shac", "shac-adaptive")],
+)
+def test_a_policy_behind_a_filter_succeeds_on_a_track_that_it_never_saw(task, track, policy, filtered):
+    alone, behind = (evaluate(name, task, 12, "rk4", randomization=track) for name in (policy, filtered))
+    assert alone.success < behind.success
+    assert behind.success > 0.9
+    assert controllers_of([task], [filtered]) == {task: [filtered]}
+
+
+def test_a_policy_file_may_be_named_with_its_filter():
+    named = f"{shipped_policies(make_task('stabilize'))['shac']}-ekf"
+    rows = [evaluate(name, "stabilize", 1, "rk4", randomization="noisy") for name in (named, "shac-ekf")]
+    assert rows[0].regret_mean == rows[1].regret_mean
 
 
 def test_adaptive_nmpc_learns_robot_and_delay_in_a_second():

@@ -39,6 +39,9 @@ VARIANTS: dict[str, Callable[[Task, BallbotParams], Controller]] = {
 }
 """Controllers that run where they are named. They have no row on the leaderboard."""
 
+FILTERS = ("-adaptive-ekf", "-ekf", "-adaptive")
+"""What may follow the name of a controller, and puts a filter in front of it; see `adaptive`."""
+
 _MODULES = {
     "lqr": ("LqrController",),
     "measured": ("Regret", "regret"),
@@ -52,6 +55,7 @@ _LAZY = {name: f"{__name__}.{module}:{name}" for module, names in _MODULES.items
 
 __all__ = [
     "CONTROLLERS",
+    "FILTERS",
     "VARIANTS",
     "Backoff",
     "Controller",

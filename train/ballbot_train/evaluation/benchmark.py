@@ -47,8 +47,8 @@ def controllers_of(
     known = {task: registry.names(make_task(task, robot), robot, None if tracks or names else "") for task in tasks}
     if not names:
         return known
-    filtered = registry.FILTERED * (named_robot(robot).wheels is not None)
-    known = {task: [*group, *VARIANTS, *(name + filtered for name in group)] for task, group in known.items()}
+    behind = ("", *registry.filters(named_robot(robot)))
+    known = {task: [*VARIANTS, *(name + each for name in group for each in behind)] for task, group in known.items()}
     # two spellings of one path are one policy
     identities = [_identity(name) for name in names]
     repeated = [name for i, name in enumerate(names) if identities[i] in identities[:i]]

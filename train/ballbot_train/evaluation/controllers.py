@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ballbot_baselines import CONTROLLERS, VARIANTS
+from ballbot_baselines import CONTROLLERS, FILTERS, VARIANTS
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
@@ -15,7 +15,7 @@ from ballbot_train.console import check_names
 from ballbot_train.policy_files import read_description, shipped_policies, weights_digest
 
 FILTERED = "-ekf"
-"""What follows the name of a controller that gets, of a robot with wheels, sensors through a filter in place of states."""
+"""Which of `FILTERS` may follow the name of a controller of a robot with wheels: then it takes sensors in place of states."""
 
 _BESIDE = (".json", ".safetensors", ".vecnormalize.npz")  # endings of files that belong to a policy or a saved model
 
@@ -25,19 +25,31 @@ def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
     return [*CONTROLLERS, *shipped_policies(task, robot, track)]
 
 
+def filters(params: BallbotParams) -> tuple[str, ...]:
+    """What may follow the names of controllers of a robot."""
+    return tuple(FILTERS) if params.wheels is None else (FILTERED,)
+
+
+def plain(name: str) -> str:
+    """The name of a controller without the filter in front of it."""
+    if name in VARIANTS:
+        return name
+    return next((name.removesuffix(ending) for ending in FILTERS if name.endswith(ending)), name)
+
+
 def is_expert(name: str) -> bool:
     """Whether a name is an expert's or a variant's, and no policy's."""
-    return name in VARIANTS or name.removesuffix(FILTERED) in CONTROLLERS
+    return plain(name) in CONTROLLERS | VARIANTS
 
 
 def is_file(name: str) -> bool:
     """Whether a controller's name is the path of a policy file or of a saved model."""
-    return not is_expert(name) and bool(Path(name).suffix)
+    return not is_expert(name) and bool(Path(plain(name)).suffix)
 
 
 def is_saved_model(name: str) -> bool:
     """Whether a controller's name is the path of a model that Stable-Baselines3 saved."""
-    return Path(name).suffix == ".zip"
+    return Path(plain(name)).suffix == ".zip"
 
 
 def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
@@ -49,8 +61,8 @@ def is_made_for(name: str, task: Task, robot: str = PAPER) -> bool:
     if is_saved_model(name):
         from ballbot_train.saved_models import fits  # it imports torch
 
-        return fits(name, task, named_robot(robot))
-    spec = read_description(name)["spec"]
+        return fits(plain(name), task, named_robot(robot))
+    spec = read_description(plain(name))["spec"]
     return spec["task"] == task.problem() and spec.get("robot", PAPER) == robot
 
 
@@ -63,8 +75,8 @@ def made_for(name: str) -> str:
     if is_saved_model(name):
         from ballbot_train.saved_models import observations_of
 
-        return f"a task with {observations_of(name)} observations"
-    spec = read_description(name)["spec"]
+        return f"a task with {observations_of(plain(name))} observations"
+    spec = read_description(plain(name))["spec"]
     robot = spec.get("robot", PAPER)
     return spec["task"] if robot == PAPER else f"{spec['task']} of the robot {robot}"
 
@@ -73,7 +85,7 @@ def policy_digest(name: str, task: Task, robot: str | BallbotParams = PAPER) -> 
     """SHA-256 of the weights of a policy by name or file, as hexadecimal digits; "" of an expert."""
     if is_expert(name):
         return ""
-    robot, name = robot if isinstance(robot, str) else robot_name(robot), name.removesuffix(FILTERED)
+    robot, name = robot if isinstance(robot, str) else robot_name(robot), plain(name)
     path = str(shipped_policies(task, robot, None).get(name, name))
     if is_saved_model(path):
         from ballbot_train.saved_models import digest
@@ -133,7 +145,7 @@ def packed(name: str) -> dict[str, bytes]:
     """
     if not is_file(name):
         return {}
-    path = Path(name)
+    path = Path(plain(name))
     beside = (path.with_name(path.stem + ending) for ending in _BESIDE)
     return {each.name: files.read(each) for each in {path, *beside} if each == path or each.exists()}
 
@@ -153,7 +165,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
 
     Args:
         name: in `CONTROLLERS` or `VARIANTS`, of a policy that comes with the package ("shac"), or the path of a policy file
-            or of a model that Stable-Baselines3 saved; see `saved_models`. For a robot with wheels `FILTERED` may follow.
+            or of a model that Stable-Baselines3 saved; see `saved_models`. One of `filters(params)` may follow.
         task: what it is to do.
         params: the robot it believes to control.
 
@@ -161,10 +173,11 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
-    if name.endswith(FILTERED) and params.wheels is not None:
-        from ballbot_baselines.kalman import FilteredController
+    ending = next((ending for ending in FILTERS if name.endswith(ending)), "")
+    if ending and (name not in VARIANTS or params.wheels is not None):
+        from ballbot_baselines.adaptive import behind_filter  # it imports CasADi
 
-        return FilteredController(task, params, make_controller(name.removesuffix(FILTERED), task, params))
+        return behind_filter(task, params, ending, make_controller(name.removesuffix(ending), task, params))
     if name in CONTROLLERS | VARIANTS:
         return (CONTROLLERS | VARIANTS)[name](task, params)
     robot = robot_name(params)
