@@ -2,7 +2,6 @@ import gc
 import locale
 import shutil
 import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -163,11 +162,3 @@ def test_running_out_of_clients_says_what_to_do(params, monkeypatch):
     monkeypatch.setattr(pybullet, "connect", lambda mode: -1)
     with pytest.raises(RuntimeError, match=r"no free physics client; close\(\)"):
         BulletSimulator(params, 0.02)
-
-
-def test_without_pybullet_a_page_is_shown_in_place_of_the_window(monkeypatch, make_env, capsys):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    env = make_env(physics="rk4", render_mode="human")
-    env.reset(seed=0)
-    env.step([0.0, 0.0])
-    assert "no window, because PyBullet is not installed: the robot is shown at http://" in capsys.readouterr().err
