@@ -139,15 +139,6 @@ def test_gymnasium_checker_has_no_complaint(task, physics):
         env.close()
 
 
-def test_stable_baselines3_checker_has_no_complaint(task):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(task.id, physics="rk4")
-        checker.check_env(env.unwrapped, warn=True, skip_render_check=True)
-        env.close()
-
-
 def test_return_and_cost_recomputed_from_states_and_forces_add_up_to_the_survival_pay(task, physics, make_env, rng):
     env = make_env(task, physics=physics)
     for seed in range(3):
