@@ -118,28 +118,38 @@ def source(task: Task, params: BallbotParams, double: bool) -> str:
     return "\n".join([*defined, text("real.h"), text("native.c"), *blocks])
 
 
-def in_lanes(functions: Sequence[casadi.Function], lanes: int, code: str = "") -> str:
+_TRANSPOSE = """
+static void gather(int rows, const double *columns, real *out) {
+    for (int k = 0; k < LANES; ++k)
+        for (int i = 0; i < rows; ++i)
+            out[i * LANES + k] = columns ? columns[k * rows + i] : 0;
+}
+static void scatter(int rows, const real *in, double *columns) {
+    for (int k = 0; columns && k < LANES; ++k)
+        for (int i = 0; i < rows; ++i)
+            columns[k * rows + i] = in[i * LANES + k];
+}
+"""
+"""CasADi's matrices have a column per stage, and blocks a row per variable. A null pointer is a 0, or not wanted."""
+
+
+def in_lanes(functions: Sequence[casadi.Function], lanes: int) -> str:
     """The C code of functions that CasADi loads as external ones: each computes `lanes` stages, a column each, at once.
 
     Args:
         functions: with dense columns as arguments and results, and distinct names.
         lanes: stages per call, a number that SIMD instructions suit.
-        code: C code that computes a function NAME as NAME_lanes, with the arguments of a `block`; default, what CasADi's
-            functions compute is written out.
 
     Raises:
         NotImplementedError: a function has an operation that is not known here.
     """
-    parts = [f"#define DOUBLE 1\n#define LANES {lanes}", text("real.h"), "typedef long long casadi_int;"]
+    parts = [f"#define DOUBLE 1\n#define LANES {lanes}", text("real.h"), "typedef long long casadi_int;", _TRANSPOSE]
     for function in functions:
         name = function.name()
         symbols = [casadi.SX.sym(f"in{i}", function.size1_in(i)) for i in range(function.n_in())]
         inputs = [(f"in{i}", casadi.vertsplit(part)) for i, part in enumerate(symbols)]
-        if code:
-            outputs = [(f"out{i}", [0] * function.size1_out(i)) for i in range(function.n_out())]
-        else:
-            outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
-            parts.append(block(f"{name}_lanes", inputs, outputs))
+        outputs = [(f"out{i}", casadi.vertsplit(part)) for i, part in enumerate(function.call(symbols))]
+        parts.append(block(f"{name}_lanes", inputs, outputs))
         body = []
         for i, (pointer, rows) in enumerate(inputs):
             body.append(f"real {pointer}[{max(len(rows), 1)} * LANES]; gather({len(rows)}, arg[{i}], {pointer});")
@@ -158,23 +168,7 @@ def in_lanes(functions: Sequence[casadi.Function], lanes: int, code: str = "") -
             f"int {name}(const double **arg, double **res, casadi_int *iw, double *w, int mem) {{\n    {lines}\n"
             "    return 0;\n}"
         )
-    parts[3:3] = [_TRANSPOSE, code]
     return "\n".join(parts)
-
-
-_TRANSPOSE = """
-static void gather(int rows, const double *columns, real *out) {
-    for (int k = 0; k < LANES; ++k)
-        for (int i = 0; i < rows; ++i)
-            out[i * LANES + k] = columns ? columns[k * rows + i] : 0;
-}
-static void scatter(int rows, const real *in, double *columns) {
-    for (int k = 0; columns && k < LANES; ++k)
-        for (int i = 0; i < rows; ++i)
-            columns[k * rows + i] = in[i * LANES + k];
-}
-"""
-"""CasADi's matrices have a column per stage, and blocks a row per variable. A null pointer is a 0, or not wanted."""
 
 
 def text(name: str) -> str:

@@ -26,11 +26,10 @@ from ballbot_gym.picture import YAW, PictureScene
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
-from ballbot_gym.scene import Window, check_render_mode, usable_render_modes, window_trouble
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import limit_names, outcome
-from ballbot_gym.viewer import PageScene
+from ballbot_gym.viewer import PageScene, has_viser, import_viser
 
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
@@ -98,7 +97,7 @@ class BallbotEnv(gymnasium.Env):
     Task, robot, physics and spaces of an env are fixed: setting such an attribute is an AttributeError.
 
     `copy.deepcopy`, `pickle` and `cloudpickle` make an independent env in the same state, which goes on bit-identically. A
-    copy of a Bullet env has a physics client of its own. The window is not copied.
+    copy of a Bullet env has a physics client of its own. The page is not copied.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
@@ -122,8 +121,7 @@ class BallbotEnv(gymnasium.Env):
             task: a name in `TASKS`, or a Task.
             physics: "bullet", the URDF in PyBullet; "mujoco", the same robot in MuJoCo; or "rk4", the closed-form model.
                 Default, the first of these that is installed; "rk4" comes with a warning.
-            render_mode: None; "rgb_array", which needs no display; or "human": PyBullet's window, or a page in the
-                browser where none can open.
+            render_mode: None; "rgb_array", which needs no display; or "human": a page in the browser, in real time.
             params: the robot as a BallbotParams; the same as robot.
             physics_dt: s, the simulator's step; default 1 ms for Bullet, 5 ms for MuJoCo, 2 ms where it has contact, and
                 10 ms for rk4.
@@ -139,11 +137,11 @@ class BallbotEnv(gymnasium.Env):
         Raises:
             ValueError: an unknown task, physics or render mode, or a task field out of its range.
             TypeError: a keyword that is no field of the task.
-            ImportError: physics="bullet" without a usable PyBullet, or "mujoco" without MuJoCo.
-            RuntimeError: render_mode="human" where neither a window nor a page can open.
+            ImportError: physics="bullet" without a usable PyBullet, "mujoco" without MuJoCo, or render_mode="human" without
+                viser.
         """
         self._spec: EnvSpec | None = None
-        self._scene: PictureScene | Window | PageScene | None = None
+        self._scene: PictureScene | PageScene | None = None
         self._state: State = ()  # until the first reset
         self.params = checked_robot(robot, params)
         physics = default_physics(self.params) if physics is None else physics
@@ -151,12 +149,13 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; known: None, 'human', 'rgb_array'")
-        check_render_mode(render_mode)
+        if render_mode == "human":
+            import_viser()
         self.task = make_task(task, self.params, **task_fields)
         self.physics = physics
         self.render_mode = render_mode
-        fps = round(1 / self.task.control_dt)
-        self.metadata = {**self.metadata, "render_modes": usable_render_modes(), "render_fps": fps}
+        modes, fps = ["human", "rgb_array"] if has_viser() else ["rgb_array"], round(1 / self.task.control_dt)
+        self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
         self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
         self.randomization = checked_randomization(randomization, self.params)
         self._disturbance = (
@@ -314,7 +313,7 @@ class BallbotEnv(gymnasium.Env):
         return math.hypot(*self._simulator.slip())
 
     def render(self) -> np.ndarray | None:
-        """The current state as an image (height, width, 3), uint8, or in the window of render_mode="human"."""
+        """The current state as an image (height, width, 3), uint8, or on the page of render_mode="human"."""
         self._check_open()
         if self.render_mode is None:
             gymnasium.logger.warn('render() without a render mode; make the environment with render_mode="rgb_array"')
@@ -326,7 +325,8 @@ class BallbotEnv(gymnasium.Env):
     def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
         """Draws any state x (8,) with this episode's markers, for instance one of a recorded trajectory."""
         if self._scene is None:
-            self._scene = self._make_scene()
+            page = self.render_mode == "human"
+            self._scene = PageScene(self.params, self.task.control_dt) if page else PictureScene(self.params)
             self._scene.set_markers(self.task.markers(self._constants_array))
         return self._scene.draw(tuple(map(float, x)))
 
@@ -405,21 +405,13 @@ class BallbotEnv(gymnasium.Env):
             self._restore_simulator(memory)
 
     def close(self) -> None:
-        """Releases the physics client and the window; may be called again."""
+        """Releases the physics client and the page; may be called again."""
         self._closed = True
         self._steps_left = 0
         self._simulator.close()
         if self._scene is not None:
             self._scene.close()
             self._scene = None
-
-    def _make_scene(self) -> PictureScene | Window | PageScene:
-        """A picture, a window, or a page in the browser where no window can open."""
-        if self.render_mode != "human":
-            return PictureScene(self.params)
-        if reason := window_trouble():
-            return PageScene(self.params, self.task.control_dt, reason)
-        return Window(self.params)
 
     def _check_open(self) -> None:
         if self._closed:

@@ -1,7 +1,7 @@
 """A page in the browser that shows drawings live, by viser. It needs no display, because the browser draws.
 
 This is the one place that knows viser's scene. `ballbot play` adds its controls beside the scene. An environment with
-render_mode="human" shows itself here where no window can open.
+render_mode="human" shows itself here.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -78,12 +79,17 @@ Grab = Callable[[int, str, np.ndarray], None]
 """Gets the id of the client who drags the robot, "start", "update" or "end", and how far (2,) on the floor, m."""
 
 
+def has_viser() -> bool:
+    """Whether viser is installed."""
+    return find_spec("viser") is not None
+
+
 def import_viser() -> Any:
     """viser, or an ImportError that says what to do."""
     try:
         import viser
     except ModuleNotFoundError as error:
-        raise missing("the page", error.name, "play") from error
+        raise missing('the page of render_mode="human" and of `ballbot play`', error.name, "play") from error
     return viser
 
 
@@ -307,15 +313,14 @@ class Viewer:
 
 
 class PageScene:
-    """Shows an environment in a page instead of a window, in real time. It has the methods of `PictureScene`."""
+    """Shows an environment in a page, in real time. It has the methods of `PictureScene`."""
 
-    def __init__(self, params: BallbotParams, frame_seconds: float, reason: str):
+    def __init__(self, params: BallbotParams, frame_seconds: float):
         """Starts the page and says its address on stderr.
 
         Args:
             params: the robot.
             frame_seconds: s, between two drawings.
-            reason: why there is no window.
 
         Raises:
             ImportError: viser is missing.
@@ -325,7 +330,7 @@ class PageScene:
         self._markers: tuple[Marker, ...] = ()
         self._trace: list[np.ndarray] = []
         self._next = 0.0
-        sys.stderr.write(f"no window, because {reason}: the robot is shown at {self._viewer.address}\n")
+        sys.stderr.write(f"the robot is shown at {self._viewer.address}\n")
 
     @property
     def address(self) -> str:

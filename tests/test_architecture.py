@@ -79,12 +79,11 @@ def test_imports_go_down():
     assert {room_of(path) for path in FILES} == set(ROOMS)
 
 
-def test_only_the_engines_and_the_windows_know_physics_engines_and_viser():
-    knowing = [path for path in FILES if imports(path) & {"pybullet", "pybullet_data", "mujoco", "viser"}]
+def test_only_the_engines_and_the_viewer_know_physics_engines_and_viser():
+    knowing = [path for path in FILES if imports(path) & {"pybullet", "mujoco", "viser"}]
     assert relative(knowing) == [
         "ballbot_gym/engines/bullet_client.py",
         "ballbot_gym/engines/mujoco.py",
-        "ballbot_gym/scene.py",
         "ballbot_gym/viewer.py",
     ]
 

@@ -3,7 +3,6 @@ import hashlib
 import itertools
 import json
 import math
-import os
 import pickle
 import subprocess
 import sys
@@ -136,16 +135,7 @@ def test_gymnasium_checker_has_no_complaint(task, physics):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make(task.id, physics=physics)
-        check_env(env.unwrapped, skip_render_check=True)  # its render check opens a window
-        env.close()
-
-
-def test_stable_baselines3_checker_has_no_complaint(task):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(task.id, physics="rk4")
-        checker.check_env(env.unwrapped, warn=True, skip_render_check=True)
+        check_env(env.unwrapped, skip_render_check=True)  # its render check opens a page
         env.close()
 
 
@@ -324,26 +314,11 @@ def test_frames_are_images_that_show_the_lean(task, physics, make_env):
     assert widths[1] > 2 * widths[0]
 
 
-def test_without_a_display_and_without_viser_the_window_is_refused(monkeypatch, make_env):
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
+def test_without_viser_there_is_no_page_and_the_error_says_how_to_get_one(monkeypatch, make_env):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(RuntimeError, match=r'DISPLAY is not set.*ballbot-gym\[play\].*take render_mode="rgb_array"'):
+    with pytest.raises(ImportError, match=r'render_mode="human".*needs viser.*ballbot-gym\[play\]'):
         make_env(render_mode="human")
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X needs a DISPLAY")
-def test_a_display_that_does_not_answer_does_not_end_the_process():
-    code = (
-        "import sys\nsys.modules['viser'] = None\nfrom ballbot_gym import BallbotEnv\n"
-        "try:\n    BallbotEnv(render_mode='human').reset()\n"
-        "except RuntimeError as error:\n    print('refused', error)\n"
-    )
-    environment = {**os.environ, "DISPLAY": ":9876"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0
-    assert "refused" in done.stdout
-    assert "PyBullet can open none on DISPLAY=:9876" in done.stdout
+    assert make_env().metadata["render_modes"] == ["rgb_array"]
 
 
 @pytest.mark.parametrize(

@@ -121,5 +121,5 @@ for task in ballbot_gym.TASKS.values():
     check_env(env.unwrapped)
     env.close()
 """
-    wrote = run(code, "pybullet", "pybullet_data", "viser")
+    wrote = run(code, "pybullet", "viser")
     assert wrote.splitlines() == 4 * ["mujoco (480, 640, 3)"]

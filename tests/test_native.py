@@ -17,7 +17,6 @@ import casadi  # noqa: E402
 from ballbot_gym import Randomization, codegen, machine_code, native  # noqa: E402
 from ballbot_gym.batch import BallbotBatch  # noqa: E402
 from ballbot_gym.env import make_task  # noqa: E402
-from ballbot_gym.robots import named_robot  # noqa: E402
 from ballbot_gym.tasks import TASKS  # noqa: E402
 from ballbot_gym.tasks.stabilize import Stabilize  # noqa: E402
 from ballbot_gym.vector import BallbotVectorEnv  # noqa: E402
@@ -37,36 +36,6 @@ def play(env, actions, seed):
         observation, reward, *_, infos = env.step(action)
         results.append((observation, reward[:, None], infos["state"], infos["tilt"][:, None], infos["constants"]))
     return [np.stack(parts) for parts in zip(*results, strict=True)]
-
-
-@needs_compiler
-@pytest.mark.parametrize(
-    ("name", "robot"), [*((name, "paper") for name in TASKS), ("weave", "rolling"), ("turn", "kugle")]
-)
-def test_a_step_is_that_of_the_batch_in_torch(name, robot):
-    """From the same states, in float64; some envs end in each step, and begin anew."""
-    params = named_robot(robot)
-    task = make_task(name, duration=0.4)
-    envs = native.BallbotNative(make_task(task, params), 21, np.float64, params)
-    batch = BallbotBatch(task, 21, dtype=torch.float64, compile=False, params=params)
-    batch.reset(seed=3)
-    envs.state = envs.initial_state(seed=3)
-    for name, part in batch.state._asdict().items():
-        np.testing.assert_allclose(getattr(envs.state, name), part.numpy(), rtol=1e-14, atol=1e-14, err_msg=name)
-    ended = 0
-    for action in actions_of(21, 50).astype(np.float64):
-        envs.state = type(batch.state)(*(part.numpy().copy() for part in batch.state))
-        got, expected = envs.step(np.asfortranarray(action), None, True), batch.step(torch.from_numpy(action))
-        done = expected.terminated | expected.truncated
-        expected = expected._replace(final_observation=expected.final_observation[done])
-        ended += int(done.sum())
-        for of, to in ((got, expected), (envs.state, batch.state)):
-            for name, part in to._asdict().items():
-                tolerance = 1e-6 if "observation" in name else 1e-10
-                np.testing.assert_allclose(
-                    getattr(of, name), part.numpy(), rtol=tolerance, atol=tolerance, equal_nan=True, err_msg=name
-                )
-    assert ended > 40
 
 
 @needs_compiler

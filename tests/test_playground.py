@@ -14,7 +14,7 @@ import pytest
 import torch
 from browser import start_chromium
 
-from ballbot_gym import certified, dynamics
+from ballbot_gym import certified
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import ActionController, rollout
@@ -156,22 +156,6 @@ def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng
             script += f"found.push({acts});\n"
     found = run_in_node(engine_script(paths) + script + "answer(found);", tmp_path)
     np.testing.assert_allclose(found, expected, atol=1e-4)  # N; a float32 action has steps of 2e-5 N
-
-
-def test_a_push_brings_the_energy_of_its_impulse_times_the_mean_speed_of_the_pushed_point(params, rng):
-    x, p = casadi.SX.sym("x", 8), casadi.SX.sym("p", 2)
-    after = casadi.Function("after", [x, p], [dynamics.pushed(params, x, p)])
-    before, impulse = rng.uniform(-0.7, 0.7, 8), np.array([30.0, -50.0])
-    behind = np.array(after(before, impulse)).ravel()
-
-    def speed(state):  # of the centre of mass, m/s
-        sg, cg, st, ct = np.sin(state[2]), np.cos(state[2]), np.sin(state[3]), np.cos(state[3])
-        height = params.com_height
-        across = [cg * ct * state[6] - sg * st * state[7], ct * state[7]]
-        return state[4:6] + height * np.array(across)
-
-    gained = dynamics.energy(params, tuple(behind)) - dynamics.energy(params, tuple(before))
-    assert gained == pytest.approx(impulse @ (speed(before) + speed(behind)) / 2)
 
 
 def test_a_function_with_an_unknown_operation_is_refused():

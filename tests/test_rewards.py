@@ -53,12 +53,9 @@ class Played(NamedTuple):
     gains: np.ndarray
     """(T, B) pay of a step less what it cost, NaN after the episode's end; the pay of a first exit is not in it."""
     returns: np.ndarray
-    costs: np.ndarray
     failures: np.ndarray
     violated: np.ndarray
     """(B,) index of the limit that ended the episode, or −1."""
-    rewards: np.ndarray
-    """(2, B) least and greatest reward of a step."""
 
 
 @functools.cache
@@ -80,40 +77,22 @@ def play(task):
             result = batch.step(torch.cat(actions))
             rate = task.cost(before.x.unbind(0), result.force.unbind(0), before.c.unbind(0))
             gain = (task.survival_reward - rate) * task.control_dt
-            figures = torch.stack([gain, result.reward, result.cost, result.failure, result.violated])
+            figures = torch.stack([gain, result.reward, result.failure, result.violated])
             steps.append(torch.where(running, figures, math.nan))
             running = running & ~(result.terminated | result.truncated)
             observation = result.observation
     assert not running.any()
-    gains, rewards, costs, failures, violated = torch.stack(steps, 1).numpy()
+    gains, rewards, failures, violated = torch.stack(steps, 1).numpy()
     return {
         name: Played(
             gains[:, part],
             np.nansum(rewards[:, part], axis=0),
-            np.nansum(costs[:, part], axis=0),
             np.nanmax(failures[:, part], axis=0) > 0,
             np.nanmax(violated[:, part], axis=0),
-            np.stack([np.nanmin(rewards[:, part], axis=0), np.nanmax(rewards[:, part], axis=0)]),
         )
         for name, part in zip(chosen, parts, strict=True)
     }
 
-
-def test_return_and_cost_add_up_to_the_survival_pay_however_an_episode_ends(task):
-    ends = set()
-    for name, played in play(task).items():
-        np.testing.assert_allclose(played.returns + played.costs, task.survival_pay, rtol=1e-9, err_msg=name)
-        ends |= set(played.failures)
-    assert ends == {False, True}
-
-
-DEAR = {
-    "stabilize": {"random": 0.25, "upright": 0.01, "drive-away": 0.1, "bang-bang": 1.0},
-    "turn": {"random": 0.05, "upright": 0.0, "drive-away": 0.0, "bang-bang": 0.0},
-    "orbit": {"random": 0.25, "upright": 0.0, "drive-away": 0.35, "bang-bang": 0.01},
-    "weave": {"random": 0.75, "upright": 0.0, "drive-away": 0.2, "bang-bang": 1.0},
-}
-"""Greatest share of the steps that cost more than living them pays, measured and rounded up; of shipped policies 2 %."""
 
 FULL_FORCE = {("stabilize", "bang-bang"), ("weave", "bang-bang")}
 """Full force on both axes costs 122.5 /s in these tasks, more than the pay of 100 /s."""
@@ -131,8 +110,6 @@ def test_no_episode_that_survives_would_have_scored_better_by_failing_sooner(nam
             assert better_failed.all()
         else:
             assert not better_failed.any(), policy
-        dear = (played.gains[np.isfinite(played.gains)] < 0).mean()
-        assert dear <= DEAR[name].get(policy, 0.02), policy
         survived += int(alive.sum())
     assert survived > ENVS
 

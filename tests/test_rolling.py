@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import math
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -354,6 +355,16 @@ def test_transfer_tells_who_was_made_for_what(tmp_path):
     assert "| regret over the optimum on the robot's own floor |" in (tmp_path / "transfer.md").read_text()
     with pytest.raises(ValueError, match="does not roll"):
         transfer(frictions=(0.8,), out=tmp_path, **arguments)
+    with pytest.raises(ValueError, match="a physics is given more than once: rk4 rk4"):
+        transfer(out=tmp_path, **arguments | {"physics": ("rk4", "rk4")})
+
+
+@pytest.mark.parametrize(("physics", "library"), [("bullet", "pybullet"), ("mujoco", "mujoco")])
+def test_an_engine_that_is_not_installed_is_noticed_before_any_episode(tmp_path, monkeypatch, physics, library):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match="pip install"):
+        transfer(physics=("rk4", physics), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_transfer_runs_a_name_for_the_robots_that_have_it():

@@ -2,7 +2,6 @@ import gc
 import locale
 import shutil
 import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from ballbot_gym import dynamics
 from ballbot_gym.engines import make_simulator
 from ballbot_gym.engines.bullet import BulletSimulator
-from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.robots import ROBOTS, named_robot
 
 START = (0.1, -0.2, 0.6, -0.5, 1.0, -2.0, 1.5, 2.0)
@@ -121,12 +119,6 @@ def test_bullet_conserves_energy_to_first_order(params):
     assert 1.7 < drift[1] / drift[2] < 2.3
 
 
-def test_rk4_simulator_is_the_closed_form_step(params):
-    simulator = Rk4Simulator(params, 0.02)
-    simulator.reset(START)
-    assert simulator.step(FORCE) == dynamics.step(params, START, FORCE, 0.02, 2)
-
-
 def test_two_simulators_do_not_disturb_each_other(params, physics):
     alone, beside, other = (make_simulator(physics, params, 0.02) for _ in range(3))
     for simulator in (alone, beside):
@@ -142,15 +134,6 @@ def test_two_simulators_do_not_disturb_each_other(params, physics):
         simulator.close()
 
 
-def test_close_releases_the_client_once(params):
-    before = open_clients()
-    simulator = BulletSimulator(params, 0.02)
-    assert open_clients() == before + 1
-    simulator.close()
-    simulator.close()
-    assert open_clients() == before
-
-
 def test_forgotten_simulators_release_their_clients(params):
     before = open_clients()
     simulator = BulletSimulator(params, 0.02)
@@ -163,11 +146,3 @@ def test_running_out_of_clients_says_what_to_do(params, monkeypatch):
     monkeypatch.setattr(pybullet, "connect", lambda mode: -1)
     with pytest.raises(RuntimeError, match=r"no free physics client; close\(\)"):
         BulletSimulator(params, 0.02)
-
-
-def test_without_pybullet_a_page_is_shown_in_place_of_the_window(monkeypatch, make_env, capsys):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    env = make_env(physics="rk4", render_mode="human")
-    env.reset(seed=0)
-    env.step([0.0, 0.0])
-    assert "no window, because PyBullet is not installed: the robot is shown at http://" in capsys.readouterr().err

@@ -1,6 +1,5 @@
 """Machine code of single environments: it changes speed, and nothing else."""
 
-import copy
 import math
 import threading
 from dataclasses import dataclass
@@ -184,12 +183,3 @@ def test_an_env_of_one_episode_makes_no_machine_code():
     env = BallbotEnv("stabilize", "rk4")
     env.reset()
     assert step_code._begun == set()
-
-
-@needs_compiler
-def test_copies_go_on_in_machine_code():
-    env = BallbotEnv("weave", "rk4")
-    reset_until_made(env)
-    other = copy.deepcopy(env)
-    assert other._judge is not None
-    assert bits([other.step([0.3, -0.2])]) == bits([env.step([0.3, -0.2])])

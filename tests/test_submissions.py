@@ -1,7 +1,5 @@
 """Whoever submits to the leaderboard is believed nothing: each step of each episode must follow from the one before."""
 
-import io
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -165,15 +163,7 @@ def test_a_motion_of_another_engine_is_refused(submitted, tmp_path):
         verify(path, EPISODES)
 
 
-def test_a_cut_file_a_bomb_and_too_few_episodes_are_refused(submitted, tmp_path):
-    content = submitted()[1].read_bytes()
-    with pytest.raises(files.FileError, match=r"is no \.npz file, or a damaged one"):
-        verify(files.write(tmp_path / "cut.npz", content[: len(content) // 2]), EPISODES)
-    bomb = io.BytesIO()
-    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("states.npy", bytes(2**27))
-    with pytest.raises(files.FileError, match="unpacks to 128 MiB; at most 64 MiB are read"):
-        verify(files.write(tmp_path / "bomb.npz", bomb.getvalue()), EPISODES)
+def test_too_few_episodes_are_refused(submitted):
     with pytest.raises(SubmissionError, match="holds 2 episodes, and not 200"):
         verify(submitted()[1])
 

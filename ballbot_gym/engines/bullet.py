@@ -28,7 +28,7 @@ class BulletSimulator(Simulator):
         """
         substeps = whole_substeps(control_dt, 0.001 if physics_dt is None else physics_dt)
         bullet = import_pybullet()
-        self._client = connect(bullet, bullet.DIRECT)
+        self._client = connect(bullet)
         self._release = weakref.finalize(self, bullet.disconnect, self._client)
         self._robot, self._joints = load_robot(bullet, self._client, params)
         self._params = params

@@ -1,4 +1,4 @@
-"""PyBullet's clients, and how the robot is loaded into one. Simulators and the window use it."""
+"""PyBullet's clients, and how the robot is loaded into one."""
 
 import ctypes
 import importlib.util
@@ -26,13 +26,15 @@ def has_pybullet() -> bool:
     return importlib.util.find_spec("pybullet") is not None
 
 
-def import_pybullet(otherwise: str = 'Or use physics="rk4", which needs only NumPy.') -> ModuleType:
+def import_pybullet() -> ModuleType:
     """PyBullet, or an ImportError that says how to get it, and what to do otherwise."""
     try:
         with _silenced() if "pybullet" not in sys.modules else nullcontext():  # it prints when it was built
             import pybullet
     except ImportError as error:
-        raise ImportError(f"PyBullet is not installed. {HOW_TO_GET_IT} {otherwise}") from error
+        raise ImportError(
+            f'PyBullet is not installed. {HOW_TO_GET_IT} Or use physics="rk4", which needs only NumPy.'
+        ) from error
     if not pybullet.isNumpyEnabled():
         raise ImportError(
             "This PyBullet was built without NumPy. Reinstall its wheel with "
@@ -62,14 +64,9 @@ def _silenced() -> Iterator[None]:
             os.close(original)
 
 
-def connect(bullet: ModuleType, mode: int) -> int:
+def connect(bullet: ModuleType) -> int:
     """A new physics client."""
-    try:
-        client = bullet.connect(mode)
-    except bullet.error as error:
-        raise RuntimeError(
-            'PyBullet opens one window per process; close() the environment that has it, or take render_mode="rgb_array"'
-        ) from error
+    client = bullet.connect(bullet.DIRECT)
     if client < 0:
         raise RuntimeError("PyBullet has no free physics client; close() environments that are no longer used")
     return client
@@ -77,11 +74,18 @@ def connect(bullet: ModuleType, mode: int) -> int:
 
 def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[int, tuple[int, ...]]:
     """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _loading:
         path = Path(folder) / "ballbot.urdf"
         path.write_text(params.to_urdf(), encoding="utf-8")
-        # Without this flag Bullet recomputes inertias from collision shapes.
-        robot = load_urdf(bullet, client, path, bullet.URDF_USE_INERTIA_FROM_FILE)
+        # Bullet reads numbers by the process's locale: with decimal commas it would take "0.5" for 0 without a word.
+        found = locale.setlocale(locale.LC_NUMERIC)
+        locale.setlocale(locale.LC_NUMERIC, "C")
+        try:
+            # Without this flag Bullet recomputes inertias from collision shapes.
+            options = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE, "physicsClientId": client}
+            robot = bullet.loadURDF(str(path), **options)
+        finally:
+            locale.setlocale(locale.LC_NUMERIC, found)
     bullet.setGravity(0, 0, -params.gravity, physicsClientId=client)
     index = joint_indices(bullet, client, robot)
     joints = tuple(index[name] for name in _JOINTS)
@@ -100,21 +104,6 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
         robot, joints, bullet.VELOCITY_CONTROL, forces=[0] * len(joints), physicsClientId=client
     )
     return robot, joints
-
-
-def load_urdf(bullet: ModuleType, client: int, path: Path, flags: int = 0) -> int:
-    """Loads a URDF whose base is fixed; returns its body.
-
-    Bullet reads numbers by C's locale: with decimal commas it would take "0.5" for 0 without a word. The locale is that of
-    the whole process, because the thread of a window may be the one that reads.
-    """
-    with _loading:
-        found = locale.setlocale(locale.LC_NUMERIC)
-        locale.setlocale(locale.LC_NUMERIC, "C")
-        try:
-            return bullet.loadURDF(str(path), useFixedBase=True, flags=flags, physicsClientId=client)
-        finally:
-            locale.setlocale(locale.LC_NUMERIC, found)
 
 
 def joint_indices(bullet: ModuleType, client: int, robot: int) -> dict[str, int]:

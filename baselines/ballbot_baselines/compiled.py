@@ -45,18 +45,17 @@ def compiled(name: str, functions: tuple[casadi.Function, ...]) -> tuple[casadi.
 
 
 def in_lanes(
-    name: str, functions: tuple[casadi.Function, ...], code: str = "", flags: tuple[str, ...] = SIMD
+    name: str, functions: tuple[casadi.Function, ...], flags: tuple[str, ...] = SIMD
 ) -> tuple[casadi.Function, ...]:
     """The same functions of `LANES` stages at once, which SIMD instructions compute: a column for each stage.
 
-    Args: as of `compiled`; arguments and results are dense columns. `code` is that of `codegen.in_lanes`, `flags` of the
-        compiler.
+    Args: as of `compiled`; arguments and results are dense columns. `flags` are the compiler's.
 
     Raises:
         ValueError: $BALLBOT_CACHE is no absolute path.
     """
     try:
-        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES, code), functions, flags)
+        found = loaded(f"{name}-lanes", codegen.in_lanes(functions, LANES), functions, flags)
     except NotImplementedError:  # an operation that only CasADi knows as C
         found = compiled(name, functions)
         return tuple(function.map(LANES) for function in found)

@@ -23,13 +23,10 @@ Constraints g, in the order that fatrop needs:
 | at the end | final_path(s_N, p) |
 """
 
-from pathlib import Path
-
 import casadi
 import numpy as np
 
-from ballbot_baselines.compiled import LANES, SIMD, in_lanes
-from ballbot_gym import codegen
+from ballbot_baselines.compiled import LANES, SIMD, compiled, in_lanes
 
 
 class Stage:
@@ -67,48 +64,56 @@ class Stage:
         self.hessian_at = _triplets(hessian)
 
 
+_AHEAD, _SHARE = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+"""Of RK4's four evaluations: how far ahead in a step, and the share of their rates in it."""
+
+
 class RatesStage(Stage):
     """A stage whose result is the state after RK4 steps of given rates, for rates of so many operations that the steps and
     their derivatives, written out, would take minutes to compile.
 
-    The chain rule is applied by loops (rk4.c). Without a compiler CasADi applies it.
+    The chain rule is applied to the derivatives of the rates, which are functions of their own.
     """
 
     def __init__(self, z: casadi.SX, p: casadi.SX, rates: casadi.SX, steps: int):
         n, width = rates.shape[0], z.shape[0]
         used = max(np.flatnonzero(casadi.which_depends(rates, p, 1)) + 1, default=0)
-        p, multipliers = p[:used], casadi.SX.sym("l", n)
-        of_rates = casadi.Function("rates", [z, p], [rates], {"cse": True})
-        z_calls, p_calls, l_calls = (
-            casadi.MX.sym("zpl"[i], part.shape[0]) for i, part in enumerate((z, p, multipliers))
-        )
-        x, w, h = z_calls[:n], z_calls[n:], 1 / steps
+        p, weights = p[:used], casadi.SX.sym("l", n)
+        slopes, curve = casadi.jacobian(rates, z), casadi.hessian(casadi.dot(weights, rates), z)[0]
+        first = casadi.Function("rates_jacobian", [z, p], [rates, casadi.densify(slopes)], {"cse": True})
+        second = casadi.Function("rates_hessian", [z, p, weights], [casadi.densify(curve)], {"cse": True})
+
+        z_all, p_all, l_all = (casadi.MX.sym("zpl"[i], part.shape[0]) for i, part in enumerate((z, p, weights)))
+        x, w, h = z_all[:n], z_all[n:], 1 / steps
+        inputs = casadi.DM.eye(width)[n:, :]
+        moved = casadi.MX(casadi.densify(casadi.DM.eye(width)[:n, :]))  # ∂x/∂z
+        stages = []  # where rates are evaluated, ∂ of that place/∂z, and ∂rates/∂place
         for _ in range(steps):
-            k1 = of_rates(casadi.vertcat(x, w), p_calls)
-            k2 = of_rates(casadi.vertcat(x + h / 2 * k1, w), p_calls)
-            k3 = of_rates(casadi.vertcat(x + h / 2 * k2, w), p_calls)
-            k4 = of_rates(casadi.vertcat(x + h * k3, w), p_calls)
-            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
-        jacobian = casadi.densify(casadi.jacobian(x, z_calls))
-        hessian, gradient = casadi.hessian(casadi.dot(l_calls, x), z_calls)
-        full = casadi.vec(casadi.densify(hessian))
+            rate, change, end, ends = casadi.MX(n, 1), casadi.MX(n, width), x, moved
+            for ahead, share in zip(_AHEAD, _SHARE, strict=True):
+                at = casadi.vertcat(x + h * ahead * rate, w)
+                moves = casadi.densify(casadi.vertcat(moved + h * ahead * change, inputs))
+                rate, slope = first(at, p_all)
+                change = slope @ moves
+                stages.append((at, moves, slope))
+                end, ends = end + h * share * rate, ends + h * share * change
+            x, moved = end, ends
+        price, total = l_all, casadi.MX.zeros(width, width)
+        for step in reversed(range(steps)):
+            before, behind = price, casadi.MX(n, 1)
+            for i in reversed(range(4)):
+                at, moves, slope = stages[4 * step + i]
+                of_rate = h * _SHARE[i] * price + behind
+                total += moves.T @ (second(at, p_all, of_rate) @ moves)
+                back = (of_rate.T @ slope)[:, :n].T
+                before, behind = before + back, h * _AHEAD[i] * back
+            price = before
         functions = (
-            casadi.Function("value", [z_calls, p_calls], [x]),
-            casadi.Function("jacobian", [z_calls, p_calls], [x, casadi.vec(jacobian)]),
-            casadi.Function("hessian", [z_calls, p_calls, l_calls], [casadi.densify(gradient), full]),
+            casadi.Function("value", [z_all, p_all], [x]),
+            casadi.Function("jacobian", [z_all, p_all], [x, casadi.vec(moved)]),
+            casadi.Function("hessian", [z_all, p_all, l_all], [(l_all.T @ moved).T, casadi.vec(total)]),
         )
-        inputs = [("z", casadi.vertsplit(z)), ("p", casadi.vertsplit(p))]
-        slopes = casadi.vertsplit(casadi.vec(casadi.densify(casadi.jacobian(rates, z)).T))  # row by row
-        curve = casadi.vertsplit(casadi.vec(casadi.densify(casadi.hessian(casadi.dot(multipliers, rates), z)[0])))
-        of_rates_in_lanes = [
-            codegen.block("rates_jacobian", inputs, [("rate", casadi.vertsplit(rates)), ("slopes", slopes)]),
-            codegen.block("rates_hessian", [*inputs, ("l", casadi.vertsplit(multipliers))], [("curve", curve)]),
-        ]
-        loops = Path(__file__).with_name("rk4.c").read_text(encoding="utf-8")
-        defined = f"#include <string.h>\nenum {{ N = {n}, M = {width - n}, STEPS = {steps} }};"
-        self.value, self.jacobian, self.hessian = in_lanes(
-            "dynamics", functions, "\n".join([defined, *of_rates_in_lanes, loops])
-        )
+        self.value, self.jacobian, self.hessian = (function.map(LANES) for function in compiled("dynamics", functions))
         self.size, self.width, self.params = n, width, used
         self.jacobian_at, self.hessian_at = (_triplets(casadi.SX.ones(rows, width)) for rows in (n, width))
 

@@ -1,22 +1,16 @@
 """`ballbot transfer`: controllers made for one robot, run on another, in one physics engine or in several."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
-from ballbot_gym import files
-from ballbot_gym.robots import PAPER, ROBOTS, named_robot
+from ballbot_gym.robots import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default, print_rows
-from ballbot_train.evaluation import agreement
+from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
 from ballbot_train.evaluation import transfer as matrix
 from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish, run_groups
 from ballbot_train.evaluation.evaluate import checked_episodes
-from ballbot_train.evaluation.results import Result, leaderboard, write_results
+from ballbot_train.evaluation.results import leaderboard, write_results
 from ballbot_train.executors import Workers
-from ballbot_train.report.film import write_film
-from ballbot_train.report.replay import engines_replay
 
 
 def transfer(
@@ -33,8 +27,6 @@ def transfer(
 ) -> None:
     """Runs controllers that were made for one robot on another: success, falls and cost over that robot's optimum.
 
-    With several --physics it tells which of these figures depend on the engine.
-
     Args:
         tasks: names of tasks.
         controllers: names of experts and policies; default all that the robots have.
@@ -43,7 +35,7 @@ def transfer(
         frictions: coefficients of friction of the floor, for a robot whose ball rolls; default, the robot's own.
         episodes: how many of each task's certified episodes.
         physics: "bullet", "mujoco" or "rk4", with contact where the ball rolls except in the last; default, the first that is
-            installed. With several, also where they disagree, and a film of the first episode that ends otherwise.
+            installed.
         seed: of the bootstrap intervals.
         out: folder of the results; an interrupted run continues here.
         workers: who does the work.
@@ -63,50 +55,6 @@ def transfer(
     results = run_groups(groups, episodes, out, workers, seed)
     rows = leaderboard(results, "made_for", "robot", "friction", "physics", seed=seed)
     write_results("transfer", rows, results, facts, out, matrix.COLUMNS, regret=matrix.REGRET)
-    if len(engines) > 1:
-        _compare(results, chosen, robot, episodes, engines, out)
     title, table = f"{episodes} certified episodes of {robot} per task", [matrix.cells(row) for row in rows]
     publish(out, "transfer", title, matrix.HEADER, table)
     console.print(f"matrix: {out / 'transfer.csv'}")
-
-
-def _compare(
-    results: Sequence[Result],
-    chosen: Mapping[str, Mapping[str, Sequence[str]]],
-    robot: str,
-    episodes: int,
-    engines: Sequence[str],
-    out: Path,
-) -> None:
-    """Tells where engines disagree, and films the first episode that ends otherwise."""
-    found = agreement.disagreements(results)
-    own = chosen.get(robot, {})
-    far = [d for task, names in own.items() for d in agreement.drifts(task, robot, names[0], engines, episodes)]
-    files.write_csv(out / "engines.csv", [asdict(entry) for entry in found])
-    if far:
-        files.write_csv(out / "drift.csv", far)
-        console.print(f"distance of the same forces, which nothing corrects: {out / 'drift.csv'}")
-    print_rows(
-        "where engines disagree",
-        [
-            {
-                "task": d.task,
-                "made for": d.made_for,
-                "controller": d.controller,
-                "friction": f"{d.friction:g}",
-                "engines": f"{d.first}, {d.second}",
-                "ends otherwise": f"{len(d.episodes)}/{d.of}",
-                "regret apart": f"{d.regret:+.2%}" if d.both else "–",
-            }
-            for d in found
-        ],
-    )
-    usual = named_robot(robot).friction
-    for one in found:
-        if one.episodes and one.made_for == robot and one.friction == usual:
-            shown = engines_replay(one.task, one.controller, one.episodes[0], (one.first, one.second), robot)
-            film = write_film(
-                shown, out / f"differs-{one.task}-{Path(one.controller).stem}.webp", shown.duration, width=800
-            )
-            console.print(f"film of the first episode that ends otherwise: {film}")
-            return

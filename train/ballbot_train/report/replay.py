@@ -9,7 +9,6 @@ import numpy as np
 
 from ballbot_gym import certified
 from ballbot_gym.drawing import Drawing, GroundPath, Robot
-from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.robots import PAPER, named_robot
@@ -183,16 +182,6 @@ def replay_of(
             failures.setdefault(result.episode, set()).add(result.failure)
     episode = next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
     return certified_replay(task, controllers, episode, physics, skip_planless=True, robot=robot)
-
-
-def engines_replay(task: str, controller: str, episode: int, physics: Sequence[str], robot: str = PAPER) -> Replay:
-    """A certified episode under one controller in several physics, side by side. Args: as of `certified_replay`."""
-    shown = [certified_replay(task, [controller], episode, engine, robot=robot) for engine in physics]
-    takes = [
-        replace(replay.takes[0], label=f"{replay.takes[0].label} in {PHYSICS_NAMES[engine]}", color=labels.color("", i))
-        for i, (engine, replay) in enumerate(zip(physics, shown, strict=True))
-    ]
-    return replace(shown[0], takes=tuple(takes))
 
 
 def file_replay(paths: Sequence[Path]) -> Replay:
