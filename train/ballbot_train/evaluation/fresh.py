@@ -29,7 +29,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import limit_names
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import is_expert, is_saved_model, make_controller
+from ballbot_train.evaluation.controllers import is_expert, is_saved_model, make_controller, plain
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
@@ -258,10 +258,11 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         TypeError: it is none of these.
     """
     if isinstance(policy, str | Path):
-        if is_expert(str(policy)):
+        if is_expert(str(policy)) or plain(str(policy)) != str(policy):
+            what = "an expert" if is_expert(str(policy)) else "behind a filter"
             raise ValueError(
-                f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
-                "policy, or run the expert on certified episodes with evaluate or ballbot benchmark"
+                f"{policy} is {what}, which acts in one episode at a time, and fresh episodes run all at once; give a "
+                "policy, or run it on certified episodes with ballbot benchmark"
             )
         network = cast(PolicyController, make_controller(str(policy), task, named_robot(robot))).network
 
