@@ -3,7 +3,6 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from builders import DelayedController
 
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
 from ballbot_baselines.disturbance import DisturbanceEstimator
@@ -125,23 +124,6 @@ def test_missed_first_exit_goal_is_planned_anew(make_env):
             x = x + pushed(0.0, 2.0)
     assert env.task.is_goal(x, c)
     assert controller.counts.replans >= 1
-
-
-def test_delay_that_is_known_costs_little(make_env):
-    task = Stabilize()
-    aware, run, _ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2), delay=0.04)
-    assert run.success
-    env, known = make_env(task, physics="rk4"), certified.load(task, "paper")
-    late = find_optimum(task, env.params, coasted(env.params, known.states[2], 2), NO_CONSTANTS)
-    # what cannot be avoided is the start without force
-    unavoidable = late.cost / known.costs[2] - 1
-    assert aware == pytest.approx(unavoidable, abs=0.03)
-
-
-def coasted(params, x, steps):
-    for _ in range(steps):
-        x = dynamics.step(params, x, np.zeros(2), 0.02)
-    return x
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])
