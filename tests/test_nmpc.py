@@ -51,15 +51,6 @@ def test_in_pybullet_it_costs_little_more_than_the_optimum(make_env, task):
     assert found < 0.05  # measured: below 0.03, which Turn's back-off from its goal costs
 
 
-def test_the_plans_state_gets_the_plans_force(task, params, rng):
-    x, c = task.sample(rng, params)
-    controller = NmpcController(task, params, backoff=EXACT)
-    controller.reset(0.0, x, c)
-    force = controller.act(0.0, x)
-    # Intervals of two control steps hold the mean of the plan's two forces: measured, at most 2 % of the limit.
-    np.testing.assert_allclose(force, controller.plan.trajectory.u[0], atol=0.03 * params.force_limit)
-
-
 def test_the_costate_is_the_slope_of_the_optimal_cost(params):
     task = Stabilize()
     x0, h = pushed(2.0, 0.5), 1e-3

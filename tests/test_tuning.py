@@ -16,7 +16,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.tune import tune
 from ballbot_train.learning import tuning
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.learning.tuning import SPACES, Search, encoded, settings_of, zoo_yaml
+from ballbot_train.learning.tuning import SPACES, Search, encoded, settings_of
 
 
 @pytest.mark.parametrize("learner", SPACES)
@@ -129,18 +129,6 @@ def test_another_search_is_not_mixed_into_a_folder(fakes, tmp_path):
         tuning.run(replace(SEARCH, env_steps=5), 2, tmp_path)
 
 
-@pytest.mark.parametrize("learner", ["ppo", "sac"])
-def test_the_file_for_rl_zoo3_has_the_four_ids(learner):
-    yaml = pytest.importorskip("yaml")
-    read = yaml.safe_load(zoo_yaml(learner, {task: LEARNERS[learner].settings(task) for task in TASKS}))
-    assert list(read) == [task.id for task in TASKS.values()]
-    for settings in read.values():
-        assert settings["policy"] == "MlpPolicy"
-        assert isinstance(settings["n_timesteps"], int)
-        assert settings["learning_rate"].startswith("lin_")
-        assert settings["policy_kwargs"].startswith("dict(net_arch=[")
-
-
 def test_a_learner_without_a_space_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no search space for dagger; there is one for ppo"):
         tuning.run(replace(SEARCH, learner="dagger"), 1, tmp_path)
@@ -150,7 +138,6 @@ def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, c
     tune("ppo", trials=2, env_steps=100_000, evaluations=2, out=tmp_path)
     printed = capsys.readouterr().out
     assert "ballbot train ppo --task stabilize" in printed
-    assert (tmp_path / "ppo.yml").exists()
 
 
 def test_real_trainings_have_an_outcome_per_seed():

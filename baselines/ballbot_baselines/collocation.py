@@ -14,7 +14,7 @@ variables q are states that do not change.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi
@@ -27,9 +27,6 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.trajectory import Trajectory
 
-_UNLIKE = 0.2
-"""A guess counts as a motion if its velocities explain all but this share of its changes. Measured: smooth paths and
-solutions leave up to 0.09 unexplained, straight lines 0.54 to 1."""
 _INTERIOR = (np.arange(8) + 0.5) / 8  # where between knots the collocation error is measured
 
 
@@ -157,11 +154,10 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
 def solve(
     problem: Problem, params: BallbotParams, guess: Guess, solver: str = "ipopt", max_iterations: int = 500
 ) -> Plan:
-    """Solves a problem from a guess.
+    """Solves a problem from a guess, which should be about a motion of the robot.
 
-    A guess that is no motion, such as the paper's straight line from state to state, is first bent toward a motion by one
-    or two Newton steps on the dynamics. Without them the solvers take up to 12 times as many iterations from the line, or
-    stop at an infeasible point.
+    From the paper's straight line from state to state the solvers take up to 12 times as many iterations, or stop at an
+    infeasible point.
 
     Raises:
         PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
@@ -175,8 +171,6 @@ def solve(
     states, inputs = np.hstack([knots, constant]), knots[1:, at.inputs]
     optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
     started = time.perf_counter()
-    if not _is_motion(guess):
-        states, inputs = optimizer.toward_consistency(states, inputs, _with_given_times(bounds, states, at))
     result = optimizer.solve(states, inputs, bounds)
     seconds = time.perf_counter() - started
     converged = result.success or result.status == ACCEPTABLE
@@ -186,21 +180,6 @@ def solve(
             f"violated by {result.violation:.1e}. Try another guess or more time."
         )
     return _plan(params, result, at, seconds)
-
-
-def _is_motion(guess: Guess) -> bool:
-    """Whether the guess's velocities and lean rates roughly explain how its positions and leans change."""
-    changes = np.diff(guess.x[:, :4], axis=0)
-    expected = 0.5 * guess.h * (guess.x[1:, 4:] + guess.x[:-1, 4:])
-    return bool(np.abs(changes - expected).sum() <= _UNLIKE * (np.abs(changes) + np.abs(expected)).sum())
-
-
-def _with_given_times(bounds: Bounds, states: np.ndarray, at: _Layout) -> Bounds:
-    """Bounds that also fix the step and the free variables at the guess's values."""
-    lower, upper = bounds.state_lower.copy(), bounds.state_upper.copy()
-    held = slice(at.h, at.start.start)
-    lower[:, held] = upper[:, held] = np.clip(states[:, held], lower[0, held], upper[0, held])
-    return replace(bounds, state_lower=lower, state_upper=upper)
 
 
 def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:

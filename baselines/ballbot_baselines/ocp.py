@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import casadi
 import numpy as np
-import scipy.linalg
 
 from ballbot_baselines.compiled import LONG, SIMD
 from ballbot_baselines.nlp import RatesStage, Stage, StagedNlp
@@ -32,12 +31,6 @@ SUCCEEDED = "Solve_Succeeded"
 """The status of a solver that met its tolerance."""
 ACCEPTABLE = "Solved_To_Acceptable_Level"
 """The status of ipopt where it stopped early, at its acceptable tolerance."""
-
-_DAMPING = 1e-8  # of the Newton step toward consistency: constraints may repeat each other, or have no free variables
-_FAR = 5.0
-"""A second Newton step toward consistency follows where the first changes a variable by at least this much. Measured on 33
-turns and stops from straight lines: there the second saves fatrop a third of its iterations on turns and costs it two on
-stops. After smaller changes it saves nothing."""
 
 
 def no_path(*arguments: casadi.SX) -> casadi.SX:
@@ -220,7 +213,7 @@ class OcpSolver:
         else:
             options |= for_ipopt | {"ipopt": own | {"sb": "yes"}}
         self._nlpsol = casadi.nlpsol("ocp", solver, oracle, options)
-        self._g, self._jac_g = derivatives["nlp_g"], derivatives["nlp_jac_g"]
+        self._g = derivatives["nlp_g"]
         spent.setup += time.perf_counter() - began
 
     def solve(
@@ -273,41 +266,6 @@ class OcpSolver:
             costates=self._costates(np.array(result["lam_g"]).ravel()),
         )
 
-    def toward_consistency(
-        self, states: np.ndarray, inputs: np.ndarray, bounds: Bounds, p: np.ndarray | Sequence[float] = ()
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """A guess moved by the shortest Newton step toward all equality constraints; after a large step, by a second one.
-
-        Use it for guesses that violate the dynamics, such as a straight line between two states: the step bends them toward
-        the nearest motion. Guesses that obey the constraints do not change. A step takes as long as one or two iterations.
-
-        Args:
-            bounds: as `solve` takes them; variables with equal bounds do not change.
-            states: as `solve` takes them.
-            inputs: as `solve` takes them.
-            p: as `solve` takes them.
-
-        Returns:
-            states (N+1, ns) and inputs (N, nw).
-        """
-        lower = _interleave(bounds.state_lower, bounds.input_lower)
-        upper = _interleave(bounds.state_upper, bounds.input_upper)
-        z = np.clip(_interleave(states, inputs), lower, upper)
-        free, equal = lower < upper, self._g_upper == 0
-        for _ in range(2):
-            g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
-            step = self._newton.solve(np.array(jacobian.nonzeros()), free, -np.array(g).ravel()[equal])
-            if not np.isfinite(step).all():
-                break
-            z = np.clip(z + step, lower, upper)
-            if np.abs(step).max(initial=0.0) < _FAR:
-                break
-        return self._divide(z)
-
-    @functools.cached_property
-    def _newton(self) -> "_LeastNorm":
-        return _LeastNorm(self._jac_g.sparsity_out(1), self._g_upper == 0)
-
     def _divide(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
         stages = z[: self.intervals * width].reshape(self.intervals, width)
@@ -323,41 +281,6 @@ class OcpSolver:
 def _equality(equalities: int, constraints: int) -> list[bool]:
     """Whether each constraint is an equality; equalities come first."""
     return [True] * equalities + [False] * (constraints - equalities)
-
-
-class _LeastNorm:
-    """The shortest v (size,) with M v = right, up to `_DAMPING`, for matrices M whose nonzeros stand at the same places.
-
-    What depends on these places alone is found once.
-    """
-
-    def __init__(self, sparsity: casadi.Sparsity, of_rows: np.ndarray):
-        """Makes it for the rows of a matrix that a mask has; they stand stage by stage, so M·Mᵀ is banded."""
-        rows, columns = map(np.array, sparsity.get_triplet())
-        count, self._size = int(of_rows.sum()), sparsity.size2()
-        self._kept = of_rows[rows]
-        self._rows, self._columns = (np.cumsum(of_rows) - 1)[rows[self._kept]], columns[self._kept]
-        firsts = [np.empty(0, np.int64)]
-        seconds = firsts.copy()
-        for ahead in range(len(self._rows)):  # M·Mᵀ sums the products of two nonzeros of one column
-            first = np.flatnonzero(self._columns[ahead:] == self._columns[: len(self._columns) - ahead])
-            if not first.size:
-                break
-            firsts.append(first)
-            seconds.append(first + ahead)
-        self._first, self._second = np.concatenate(firsts), np.concatenate(seconds)
-        below = self._rows[self._second] - self._rows[self._first]
-        self._places = below * count + self._rows[self._first]
-        self._shape = int(below.max(initial=0)) + 1, count
-
-    def solve(self, values: np.ndarray, free: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """v, given all nonzeros, column by column and downwards; which components of v may differ from 0; and right."""
-        values = values[self._kept] * free[self._columns]
-        products = values[self._second] * values[self._first]
-        band = np.bincount(self._places, products, self._shape[0] * self._shape[1]).reshape(self._shape)
-        band[0] += _DAMPING
-        solved = scipy.linalg.solveh_banded(band, right, overwrite_ab=True, lower=True)
-        return np.bincount(self._columns, values * solved[self._rows], self._size)
 
 
 def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:

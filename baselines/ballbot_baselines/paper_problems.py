@@ -118,11 +118,6 @@ def hermite_guess(
     return _along(params, path, x0, x1, duration)
 
 
-def straight_guess(params: BallbotParams, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
-    """The paper's guess: a straight line from state to state, which no motion of the robot follows; duration in s."""
-    return Guess(np.linspace(x0, x1, INTERVALS + 1), np.zeros((INTERVALS + 1, 2)), duration / INTERVALS)
-
-
 def _along(params: BallbotParams, path: np.ndarray, x0: np.ndarray, x1: np.ndarray, duration: float) -> Guess:
     """Zero forces, and states along a ground path (intervals+1, 2), m, from x0 to x1."""
     h = duration / (len(path) - 1)

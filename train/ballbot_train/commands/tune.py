@@ -32,8 +32,7 @@ def tune(
         seeds: trainings per trial, with the seeds 0, 1, 2 ... What counts is their mean.
         env_steps: length of each training.
         evaluations: of each training; after each of them a trial may be pruned.
-        out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), trials.csv, best.json
-            and, for ppo and sac on the paper's robot, settings for rl-zoo3.
+        out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), trials.csv and best.json.
         workers: who runs trials.
         robot: name of a robot.
     """

@@ -17,7 +17,6 @@ A search is a folder:
 | study.db | Optuna's study, in SQLite: every finished trial. `optuna-dashboard sqlite:///…` shows it |
 | trials.csv | a line per trial: its state, its costs over the seeds, its settings |
 | best.json | all settings of the best trial, what each seed reached, and the command that trains with them |
-| ppo.yml or sac.yml | settings of the four ids in the format of rl-zoo3 |
 
 A search that is killed goes on where it stopped; trials that were running begin anew. Trials run in this process, in several,
 or on a Ray cluster. The study stays with this process: workers get the trials that have come to their end, by which they
@@ -39,11 +38,10 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
-from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.executors import NODE_SECONDS, Pool, Workers, open_pool, result_of
 from ballbot_train.learning import training
-from ballbot_train.learning.learners import LEARNERS, ppo, sac
+from ballbot_train.learning.learners import LEARNERS
 
 try:
     import optuna
@@ -319,53 +317,4 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
         "settings": asdict(settings),
     }
     files.write(out / "best.json", json.dumps(best, indent=1) + "\n")
-    if search.robot == PAPER:  # the ids are the paper's robot
-        tuned = {task: LEARNERS[search.learner].settings(task) for task in TASKS}
-        files.write(out / f"{search.learner}.yml", zoo_yaml(search.learner, tuned | {search.task: settings}))
     return best
-
-
-def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:
-    """Settings of PPO or SAC by name of task as a file of hyperparameters for rl-zoo3."""
-    lines = [
-        f"# Hyperparameters of Stable-Baselines3's {learner.upper()} for rl-zoo3, found by `ballbot tune {learner}`:",
-        "# python -m rl_zoo3.train --algo NAME --env ID --conf-file THIS --gym-packages ballbot_gym "
-        "--env-kwargs physics:\"'rk4'\"",
-        "# Not expressed here, because rl-zoo3 has no setting for them: critics that see products, symmetric actors,",
-        "# the schedules of discount and standard deviation, scaled rewards, shorter training episodes, longer control",
-        "# steps.",
-    ]
-    for task, chosen in settings.items():
-        lines += ["", f"{TASKS[task].id}:"]
-        lines += [f"  {name}: {value}" for name, value in _zoo(learner, chosen).items()]
-    return "\n".join(lines) + "\n"
-
-
-def _zoo(learner: str, chosen: Any) -> dict[str, Any]:
-    common = {
-        "n_envs": chosen.num_envs,
-        "n_timesteps": chosen.iterations * chosen.num_envs * chosen.num_steps,
-        "policy": "MlpPolicy",
-        "learning_rate": f"lin_{chosen.learning_rate:.3g}",
-        "batch_size": chosen.batch_size,
-        "gamma": chosen.gamma,
-    }
-    if learner == "ppo":
-        return common | {
-            "n_steps": chosen.num_steps,
-            "n_epochs": ppo.UPDATE_EPOCHS,
-            "gae_lambda": round(chosen.gae_lambda, 4),
-            "clip_range": ppo.CLIP_RANGE,
-            "max_grad_norm": ppo.MAX_GRAD_NORM,
-            "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, log_std_init={math.log(chosen.std):.3f})"',
-        }
-    return common | {
-        "buffer_size": chosen.buffer_size,
-        "n_steps": chosen.n_steps,
-        "train_freq": 1,
-        "gradient_steps": chosen.gradient_steps,
-        "tau": sac.TAU,
-        "ent_coef": f"auto_{sac.ENT_COEF}",
-        "target_entropy": round(chosen.target_entropy, 3),
-        "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, activation_fn=nn.SiLU)"',
-    }
