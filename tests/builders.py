@@ -55,21 +55,6 @@ class FunctionController:
         return np.asarray(self.function(t, x), np.float64)
 
 
-class DelayedController:
-    """Another controller whose forces are applied some control steps late, like those of a slow computer; at first 0."""
-
-    def __init__(self, controller, steps):
-        self._controller, self._steps = controller, steps
-
-    def reset(self, t, x, c):
-        self._pending = [np.zeros(2)] * self._steps
-        self._controller.reset(t, x, c)
-
-    def act(self, t, x):
-        self._pending.append(self._controller.act(t, x))
-        return self._pending.pop(0)
-
-
 def random_policy(task, hidden=(8,), mirrors=False, **fields):
     """A small network for a task whose outputs are not those of its start; `mirrors` are all that the task has."""
     import torch

@@ -13,7 +13,6 @@ from builders import FunctionController, result
 
 import ballbot_train
 from ballbot_baselines import CONTROLLERS
-from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks import TASKS
@@ -95,11 +94,6 @@ def test_a_name_is_no_formula_in_csv(name, tmp_path):
         (row,) = csv.DictReader(file)
     assert row["controller"][0] not in "=+-@\t\r"
     assert float(row["cost"]) == results[0].cost
-
-
-def test_numbers_and_columns_in_csv(tmp_path):
-    files.write_csv(tmp_path / "a.csv", [{"=x": -1.5, "y": "-15", "z": "-"}])
-    assert (tmp_path / "a.csv").read_text() == "'=x,y,z\n-1.5,-15,'-\n"
 
 
 class Standing:

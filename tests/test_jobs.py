@@ -210,20 +210,6 @@ def test_a_result_names_the_commit_of_the_checkout_that_tracks_the_code(tmp_path
     assert commit_of(tracked).endswith("-dirty")
 
 
-def test_jobs_are_taken_only_when_there_is_room_for_them(tmp_path):
-    taken = []
-
-    def many():
-        for i in range(50):
-            taken.append(i)
-            yield job(squares, tmp_path / "log", [i], f"job{i}")
-
-    for done, (number, entries) in enumerate(jobs.stream(many(), tmp_path, 1, ignore)):
-        assert entries == [{"square": number**2}]
-        assert len(taken) <= done + 2
-    assert len(taken) == 50
-
-
 def unpicklable(items):
     yield {"item": 0}
     raise Unpicklable(lambda: None)

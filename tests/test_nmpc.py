@@ -3,7 +3,6 @@ import pytest
 
 pytest.importorskip("casadi")
 
-from builders import DelayedController
 
 from ballbot_baselines import Backoff, LqrController, NmpcController, find_optimum, offset_free_nmpc
 from ballbot_baselines.disturbance import DisturbanceEstimator
@@ -50,15 +49,6 @@ def test_in_pybullet_it_costs_little_more_than_the_optimum(make_env, task):
     found, run, _ = regret(make_env, task, 1, physics="bullet")
     assert run.success
     assert found < 0.05  # measured: below 0.03, which Turn's back-off from its goal costs
-
-
-def test_the_plans_state_gets_the_plans_force(task, params, rng):
-    x, c = task.sample(rng, params)
-    controller = NmpcController(task, params, backoff=EXACT)
-    controller.reset(0.0, x, c)
-    force = controller.act(0.0, x)
-    # Intervals of two control steps hold the mean of the plan's two forces: measured, at most 2 % of the limit.
-    np.testing.assert_allclose(force, controller.plan.trajectory.u[0], atol=0.03 * params.force_limit)
 
 
 def test_the_costate_is_the_slope_of_the_optimal_cost(params):
@@ -125,23 +115,6 @@ def test_missed_first_exit_goal_is_planned_anew(make_env):
             x = x + pushed(0.0, 2.0)
     assert env.task.is_goal(x, c)
     assert controller.counts.replans >= 1
-
-
-def test_delay_that_is_known_costs_little(make_env):
-    task = Stabilize()
-    aware, run, _ = regret(make_env, task, 2, wrap=lambda nmpc: DelayedController(nmpc, 2), delay=0.04)
-    assert run.success
-    env, known = make_env(task, physics="rk4"), certified.load(task, "paper")
-    late = find_optimum(task, env.params, coasted(env.params, known.states[2], 2), NO_CONSTANTS)
-    # what cannot be avoided is the start without force
-    unavoidable = late.cost / known.costs[2] - 1
-    assert aware == pytest.approx(unavoidable, abs=0.03)
-
-
-def coasted(params, x, steps):
-    for _ in range(steps):
-        x = dynamics.step(params, x, np.zeros(2), 0.02)
-    return x
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])

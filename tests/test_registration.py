@@ -242,22 +242,6 @@ def test_any_task_and_robot_has_a_row(counted):
     assert 0 <= row.regret_mean < 1
 
 
-@pytest.mark.slow
-def test_two_processes_that_fill_one_cache_agree(module, tmp_path):
-    code = (
-        f"import {module}, ballbot_train.evaluation.optima as optima\n"
-        "print(*optima.known('reach', 'paper', range(3)).costs[:3].tolist())"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    both = [
-        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    printed = [process.communicate()[0].splitlines()[-1] for process in both]
-    assert printed[0] == printed[1]
-    assert len(printed[0].split()) == 3
-
-
 def test_a_goal_that_cannot_be_reached_names_the_methods_to_look_at(monkeypatch):
     from ballbot_baselines import certification
 

@@ -27,7 +27,6 @@ from ballbot_train import save_vecnormalize
 from ballbot_train.evaluation.benchmark import controllers_of, policy_digests
 from ballbot_train.evaluation.evaluate import Predictor, evaluate
 from ballbot_train.evaluation.fresh import evaluate_fresh
-from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.saved_models import load_actor, statistics_of
 
@@ -153,13 +152,6 @@ def test_a_function_that_does_what_the_wrapper_did_is_scored_as_the_model_in_it(
         observation, _, terminated, truncated, info = env.step(model.predict(observation, deterministic=True)[0])
         expected, done = expected + info["cost"], terminated or truncated
     assert cost.cost_mean == pytest.approx(expected, rel=1e-6)
-
-
-def test_models_of_our_own_vector_env_are_in_its_spaces(tmp_path):
-    venv = BallbotVecEnv(gymnasium.make_vec("BallbotStabilize-v0", num_envs=2).unwrapped)
-    model = PPO("MlpPolicy", venv, policy_kwargs={"net_arch": [4]}, device="cpu")
-    model.save(tmp_path / "model.zip")
-    assert evaluate(model, "stabilize", 1, "rk4").episodes == evaluate(tmp_path / "model.zip", "stabilize", 1).episodes
 
 
 def test_a_model_that_lost_its_vecnormalize_is_refused(normalized):

@@ -162,14 +162,6 @@ def test_no_episode_starts_in_its_goal(task, params):
     assert inside == 0
 
 
-def test_sampled_constants_are_named_and_accepted(task, params):
-    _, c = draw(task, params, 200)
-    assert c.shape == (200, len(task.constant_names))
-    assert len(set(task.constant_names)) == len(task.constant_names)
-    for constants in c:
-        task.check_constants(constants, params)
-
-
 def test_batches_and_torch_draw_the_same_episodes_as_single_robots(task, params, rng):
     torch = pytest.importorskip("torch")
     z = rng.random((40, task.constant_draws + task.state_draws))

@@ -134,7 +134,6 @@ class NmpcController:
         iterations: int = 1,
         backoff: Backoff = BACKOFF,
         offset_free: bool = False,
-        delay: float = 0.0,
     ):
         """Builds the program; `reset` does the planning.
 
@@ -145,19 +144,15 @@ class NmpcController:
             iterations: most iterations per step: 1 is the real-time iteration, some 20 converge.
             backoff: how far the plan keeps from its limits; the horizon's margins keep half of it.
             offset_free: whether to estimate how the robot's accelerations differ from the model's, and to correct the model.
-            delay: s, whole control steps, from `act` until its force acts. Forces already commanded are taken into account.
 
         Raises:
-            ValueError: a horizon or delay that is no whole number of control steps, or a horizon of fewer than 2.
+            ValueError: a horizon that is no whole number of control steps, or of fewer than 2.
         """
         self._task, self._params, self.backoff = task, params, backoff
         self._iterations, self._offset_free = iterations, offset_free
-        steps, self._delay = round(horizon / task.control_dt), round(delay / task.control_dt)
-        for name, seconds, count in (("horizon", horizon, steps), ("delay", delay, self._delay)):
-            if count < 0 or abs(count * task.control_dt - seconds) > 1e-9:
-                raise ValueError(
-                    f"{name} must be a whole number of control steps of {task.control_dt} s, not {seconds} s"
-                )
+        steps = round(horizon / task.control_dt)
+        if steps < 0 or abs(steps * task.control_dt - horizon) > 1e-9:
+            raise ValueError(f"horizon must be a whole number of control steps of {task.control_dt} s, not {horizon} s")
         self._grid = Grid.make(steps, min(nodes or (steps if params.grips else _NODES), steps))
         self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
         self._qp = horizon_qp(task, params.rolls, params.grips, params.wheels is not None, len(self._grid.lengths))
@@ -167,18 +162,14 @@ class NmpcController:
         self.counts = Counts()
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        c, self.disturbance = np.asarray(c, np.float64), None
-        for _ in range(self._delay):  # before the first force acts there is none
-            x = self._moved(x, np.zeros(self._params.action_size))
-        begins = t + self._delay * self._task.control_dt
-        self.start(t, c, prepared_plan(self._task, self._params, x, c, self.backoff, begins))
+        c = np.asarray(c, np.float64)
+        self.start(t, c, prepared_plan(self._task, self._params, x, c, self.backoff, t))
 
     def start(self, t: float, c: np.ndarray, prepared: PreparedPlan) -> None:
         """As `reset`, with a plan that `prepared_plan` has made before, for instance in another process."""
         self._c, self._lost = np.asarray(c, np.float64), False
         self.disturbance = DisturbanceEstimator(self._params.force_limit) if self._offset_free else None
         self._before: tuple[np.ndarray, np.ndarray] | None = None
-        self._commanded = [np.zeros(self._params.action_size)] * self._delay
         self._follow(t, prepared)
 
     def adapt(self, params: BallbotParams) -> None:
@@ -198,11 +189,8 @@ class NmpcController:
         self._reserve = self._reserve_of_grip()
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        measured, limit = np.asarray(x, np.float64), self._params.force_limit
-        self._estimate(measured)
-        x = measured
-        for u in self._commanded:
-            x = self._moved(x, u)
+        x, limit = np.asarray(x, np.float64), self._params.force_limit
+        self._estimate(x)
         elapsed = round((t - self._start) / self._task.control_dt)
         if elapsed >= self._length and self._found_new_plan(t, x):
             elapsed = 0
@@ -214,17 +202,8 @@ class NmpcController:
             u = limit * self._qp.a[0] if self._solve(x) else self._fall_back(x)
             self.predicted = self._x_plan + self._dx
         u = np.clip(u, -limit, limit)
-        acting, *self._commanded = [*self._commanded, u]
-        self._before = measured, acting
+        self._before = x, u
         return u
-
-    def _moved(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """The state after a control step with force u, N."""
-        dt = self._task.control_dt
-        x = np.asarray(dynamics.step(self._params, x, u, dt, dynamics.substeps_for(dt)), np.float64)
-        if self.disturbance is not None:
-            x = x + dt * self.disturbance.rates(x[None], u[None] / self._params.force_limit)[0][0]
-        return x
 
     def _reserve_of_grip(self) -> float:
         """The reserve of grip that the horizon keeps: the back-off, or what the plan keeps if that is less."""
@@ -249,8 +228,7 @@ class NmpcController:
             return False
         self.counts.replans += 1
         try:
-            begins = t + self._delay * self._task.control_dt
-            self._follow(t, prepared_plan(self._task, self._params, x, self._c, self.backoff, begins))
+            self._follow(t, prepared_plan(self._task, self._params, x, self._c, self.backoff, t))
         except PlanError:
             self._lost = True
         return not self._lost
