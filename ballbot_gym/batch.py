@@ -191,6 +191,7 @@ class BallbotBatch:
         self.observation = sensors.check_observation(observation, self.params, self.randomization)
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
+        self.most_steps = self.task.steps  # fewer truncate episodes sooner; neither pay nor goal changes
         for name in ModelNumbers._fields:
             getattr(self.params, name)  # computed and kept, before torch.compile meets a lock there
         self._substeps = dynamics.substeps_for(self.task.control_dt)
@@ -376,6 +377,8 @@ class BallbotBatch:
         steps = state.steps + 1
         did = outcome(task, x, force, end, c, steps.to(self.dtype), kept)
         terminated, truncated, success, failure = (part > 0 for part in did[3:7])
+        if self.most_steps < task.steps:
+            truncated = truncated | (~terminated & (steps >= self.most_steps))
         done = terminated | truncated
         reward = task.survival_reward * task.control_dt - did.running + did.goal
 

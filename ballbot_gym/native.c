@@ -101,6 +101,7 @@ enum { REWARD, COST, SURVIVE, RUNNING, GOAL };
 typedef struct {
     int64_t taken, done; /* robots that threads have taken, and finished */
     int64_t B;
+    int64_t most;        /* control steps, after which an episode is truncated */
     int64_t bad;         /* whether an action is not finite */
     int64_t env, component; /* how far apart the actions of robots are, and the components of one, in numbers */
     const real *x, *c, *action;
@@ -141,6 +142,8 @@ static inline __attribute__((always_inline)) void tell(const Memory *m, int64_t 
     for (int i = 0; i < FLAGS; ++i)
         for (int64_t k = 0; k < count; ++k)
             flags[i * B + k] = (uint8_t)(marks[i * LANES + k] != 0);
+    for (int64_t k = 0; k < count; ++k)
+        flags[TRUNCATED * B + k] |= (uint8_t)(!flags[TERMINATED * B + k] & (m->new_steps[n + k] >= m->most));
     for (int64_t k = 0; k < count; ++k)
         flags[DONE * B + k] = flags[TERMINATED * B + k] | flags[TRUNCATED * B + k];
 }

@@ -84,6 +84,7 @@ class BallbotNative:
         self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
         self.randomization, self.history, self.threads = Randomization(), 0, threads
         self.observation = "state"
+        self.most_steps = task.steps
         self._state: State = None
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
@@ -188,7 +189,7 @@ class BallbotNative:
             actions = actions.T  # the same memory, in the order that `_pointer` likes
         read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
         idle = 0 if waiting is None else _pointer(waiting)
-        memory = _Memory(0, 0, self.num_envs, 0, *apart, *read, idle, *addresses)
+        memory = _Memory(0, 0, self.num_envs, self.most_steps, 0, *apart, *read, idle, *addresses)
         self._run(memory)
         if memory.bad:  # what was written is forgotten
             check_finite(given)
@@ -300,7 +301,7 @@ class _Memory(ctypes.Structure):
     """What a step reads and writes; native.c says what each is."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("taken", "done", "size", "bad", "env", "component")),
+        *((name, ctypes.c_int64) for name in ("taken", "done", "size", "most", "bad", "env", "component")),
         *(
             (name, ctypes.c_void_p)
             for name in (

@@ -11,7 +11,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ballbot_gym import dynamics
 from ballbot_gym.checks import (
     check_constant_names,
     check_finite,
@@ -170,7 +169,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space = observation_space(self.task, self.params, self.history, self.observation)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._most_steps = _most_steps(max_episode_steps, self.task)
+        self.batch.most_steps = _most_steps(max_episode_steps, self.task)
         self._none, self._nothing = np.full(self.num_envs, -1), np.zeros(self.num_envs)
         self._everywhere = np.ones(self.num_envs, np.bool_)
         self._ends = sparse_rows(self.num_envs, self.single_observation_space.shape[0])
@@ -186,7 +185,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec_of(spec, self.task, self.params, self.randomization, self._most_steps)
+        self._spec = spec_of(spec, self.task, self.params, self.randomization, self.batch.most_steps)
 
     @property
     def limit_names(self) -> tuple[str, ...]:
@@ -265,8 +264,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             )
         restart = self.autoreset_mode is AutoresetMode.SAME_STEP
         result, now, end, ended = self._advance(actions, waiting, restart)
-        if self._most_steps < self.task.steps:
-            result, now, end, ended = self._cut(result, now, end, ended, restart)
         done = result.terminated | result.truncated
         infos: dict[str, Any] = {}
         if not restart:
@@ -386,28 +383,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         arrays["final_observation"] = arrays["final_observation"][ended]
         result = result._replace(**arrays)
         return result, *self._step_infos(result, constants, drawn, ended, waiting, restart), ended
-
-    def _cut(
-        self, result: Any, now: StepInfo, end: StepInfo, ended: np.ndarray, restart: bool
-    ) -> tuple[Any, StepInfo, StepInfo, np.ndarray]:
-        """What `_advance` returns, and episodes that have had `max_episode_steps` are truncated too."""
-        state: Any = self.batch.state
-        cut = (self._array(state.steps) >= self._most_steps) & ~(result.terminated | result.truncated)
-        if not cut.any():
-            return result, now, end, ended
-        result = result._replace(truncated=result.truncated | cut)
-        if not restart:
-            return result, now, end, ended
-        final, observation, tilt = (part.copy("K") for part in (result.observation, result.observation, now.tilt))
-        final[ended] = result.final_observation
-        with torch.no_grad():
-            self.batch.state = self.batch.initial_state(None, self._to_batch(cut))
-            observation[cut] = self._array(self.batch.observe(self.batch.state), np.float32)[cut]
-        x, c = self._x_and_c()
-        tilt[cut] = dynamics.tilt(tuple(x[:, cut]))
-        now, ended = begun(now, np.flatnonzero(cut)), np.flatnonzero(result.terminated | result.truncated)
-        result = result._replace(observation=observation, final_observation=final[ended])
-        return result, now._replace(x=x, c=c, tilt=tilt, drawn=self._drawn()), end, ended
 
     def _step_infos(
         self,

@@ -553,7 +553,10 @@ TYPED = [
     ),
     ("optimize stabilize --duration 1000", "is too long to optimize; give at most 100 s"),
     ("compare a b", "no such file"),
-    ("replay stabilize --controllers lqr --physics rk4 --format gif --speed 1e-9", "frames; give another speed or fps"),
+    (
+        "replay stabilize --controllers lqr --physics rk4 --format webp --speed 1e-9",
+        "frames; give another speed or fps",
+    ),
     ("train dance", "unknown learner dance; known: dagger, ppo"),
     ("train shac --demos x", "shac uses no demonstrations"),
     ("train ppo --task weave --symmetry routes", "invalid choice"),

@@ -87,7 +87,7 @@ def test_names_are_text_in_figures(tmp_path):
     name = "<b><a href='https://x.y'>$\\frac{1}$ & $x"
     curve = figures.Curve(name, leaning(0.1, 0.1), "red")
     assert figures.save(figures.trajectory_figure(name, [curve]), tmp_path / "a.png").stat().st_size > 1000
-    write_film(Replay(name, (Take(name, leaning(0.1, 0.1), "red", name),)), tmp_path / "a.gif", 0.1, width=64)
+    write_film(Replay(name, (Take(name, leaning(0.1, 0.1), "red", name),)), tmp_path / "a.webp", 0.1, width=64)
 
 
 def test_the_report_of_a_robot_shows_its_episodes():

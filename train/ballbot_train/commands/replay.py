@@ -10,7 +10,7 @@ from ballbot_train.report.film import Format, film_times, write_film, write_stri
 from ballbot_train.report.replay import Replay, certified_replay, file_replay
 
 _MOST_FRAMES = 100_000
-_WIDTHS = {"mp4": 1280, "gif": 640, "webp": 640}  # px
+_WIDTHS = {"mp4": 1280, "webp": 640}  # px
 
 
 def replay(
@@ -36,12 +36,12 @@ def replay(
         controllers: names of controllers or policy files; several are shown side by side.
         episode: index of the certified episode.
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
-        format: png, a strip of pictures; mp4, gif or webp, a film.
+        format: png, a strip of pictures; mp4 or webp, a film.
         seconds: time of the last picture, s; default the end of the episode.
         frames: number of pictures in a strip, at equal times.
         fps: frames per second of a film.
         speed: seconds of the episode per second of film; 0.5 is slow motion.
-        width: width of a film, px; default 1280 for mp4, 640 for gif and webp.
+        width: width of a film, px; default 1280 for mp4, 640 for webp.
         out: folder of the file. The file is named after task, controllers and episode.
         robot: whose episode; a trajectory file is drawn with the paper's.
         frictions: coefficients of friction of floors, for a robot whose ball rolls: every controller is shown on each of

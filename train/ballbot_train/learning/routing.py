@@ -29,28 +29,24 @@ def fit_routes(
     task: Task,
     params: BallbotParams,
     seed: int,
-    episodes: int | None = None,
-    gradient_steps: int | None = None,
 ) -> float:
-    """Fits the network to the predicted costs of slaloms drawn for training: of `EPISODES`, by default.
+    """Fits the network to the predicted costs of `EPISODES` slaloms drawn for training.
 
     Returns:
         How much more its choices cost than the ones predicted to be the best, relative to the cost of the episode, on a tenth
         of these slaloms, to which it was not fitted.
     """
-    episodes = EPISODES if episodes is None else episodes
-    gradient_steps = _STEPS if gradient_steps is None else gradient_steps
-    console.print(f"learning on which sides to pass obstacles, from {episodes:,} drawn slaloms")
-    observations, regrets = predicted_regrets(task, params, seed, episodes)
+    console.print(f"learning on which sides to pass obstacles, from {EPISODES:,} drawn slaloms")
+    observations, regrets = predicted_regrets(task, params, seed, EPISODES)
     layouts = routes.layout(torch.as_tensor(observations, dtype=torch.float32))
     costs = torch.as_tensor(regrets, dtype=torch.float32)
     wanted = torch.softmax(-costs / _TOLERANCE, -1)
-    kept = max(1, episodes // 10)
+    kept = max(1, EPISODES // 10)
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(routes.parameters(), _RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, gradient_steps)
-    for _ in range(gradient_steps):
-        drawn = torch.randint(kept, episodes, (_BATCH,), generator=generator)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS)
+    for _ in range(_STEPS):
+        drawn = torch.randint(kept, EPISODES, (_BATCH,), generator=generator)
         loss = torch.nn.functional.cross_entropy(routes.mlp(layouts[drawn]), wanted[drawn])
         optimizer.zero_grad()
         loss.backward()

@@ -19,10 +19,9 @@ from ballbot_gym.picture import picture
 from ballbot_train.report import figures
 from ballbot_train.report.replay import LEAST_SLIP, Replay
 
-Format = Literal["png", "mp4", "gif", "webp"]
+Format = Literal["png", "mp4", "webp"]
 
 _FAILED = "#c01818"
-_GIF_COLORS = 128
 _FONT = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
 _COLUMNS = 4
 _STRIP_SIZE = (520, 390)  # pixels of a strip's picture
@@ -59,8 +58,8 @@ def write_film(
 
     Args:
         replay: the takes.
-        path: path of the file. Its ending selects the format: .mp4, .gif or .webp. The file appears when it is complete.
-            GIF and WebP repeat forever, and pause at the end.
+        path: path of the file. Its ending selects the format: .mp4 or .webp. The file appears when it is complete.
+            WebP repeats forever, and pauses at the end.
         seconds: time of the episode at which the film ends.
         fps: frames per second.
         speed: seconds of the episode per second of film.
@@ -71,7 +70,7 @@ def write_film(
         OSError: the file cannot be written, or there is no ffmpeg.
     """
     pictures = _reported(film_frames(replay, film_times(seconds, fps, speed), width), on_frame)
-    content = _mp4(pictures, fps, path) if path.suffix == ".mp4" else _animation(pictures, fps, path.suffix)
+    content = _mp4(pictures, fps, path) if path.suffix == ".mp4" else _webp(pictures, fps)
     return files.write(path, content)
 
 
@@ -94,20 +93,14 @@ def _mp4(pictures: Iterator[np.ndarray], fps: int, path: Path) -> bytes:
         return unfinished.read_bytes()
 
 
-def _animation(pictures: Iterator[np.ndarray], fps: int, ending: str) -> bytes:
-    """A GIF or a WebP that repeats forever."""
+def _webp(pictures: Iterator[np.ndarray], fps: int) -> bytes:
+    """A film that repeats forever."""
     images = [Image.fromarray(frame) for frame in pictures]
     frame_ms = round(1000 / fps)
     durations = [frame_ms] * (len(images) - 1) + [frame_ms + round(1000 * _PAUSE)]
-    if ending == ".gif":
-        # One palette without dithering: pixels that do not move stay equal from frame to frame, which keeps the file small.
-        palette = images[-1].quantize(_GIF_COLORS)
-        images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-        options: dict[str, Any] = {"format": "GIF", "optimize": True}
-    else:
-        options = {"format": "WEBP", "quality": 75, "method": 4}
+    options: dict[str, Any] = {"duration": durations, "loop": 0, "quality": 75, "method": 4}
     buffer = io.BytesIO()
-    images[0].save(buffer, save_all=True, append_images=images[1:], duration=durations, loop=0, **options)
+    images[0].save(buffer, "WEBP", save_all=True, append_images=images[1:], **options)
     return buffer.getvalue()
 
 
