@@ -134,6 +134,30 @@ def wheel_forces(params: Any, x: Vector, force: Vector, yaw_torque: Any = 0.0) -
     return ops.stack(tuple(parts), like=force)
 
 
+def torque_on_ball(params: Any, x: Vector, turning: tuple[Any, Any, Any], u: Vector) -> tuple[Any, ...]:
+    """Σ a_i f_i in the world, N·m, of the wheels on a ball that turns in the world, rad/s, and may slip on the floor.
+
+    The rotors' part is that of the acceleration that the robot has in state x (..., 11) where its ball does not slip.
+    """
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot, _, psi_dot, _ = ops.components(x)
+    sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
+    axes = (cos_g, 0.0, -sin_g), (-sin_g * sin_t, cos_t, -cos_g * sin_t), (sin_g * cos_t, sin_t, cos_g * cos_t)
+    own = -theta_dot, cos_t * gamma_dot, sin_t * gamma_dot + psi_dot
+    w = tuple(_dot(axis, turning) - body for axis, body in zip(axes, own, strict=True))
+    faster = accelerations(params, x, u)
+    rotors = params.ball_radius**2 * params.wheels.mass
+    felt = [
+        pull - share * rotors * _dot(row, faster)
+        for pull, share, row in zip(
+            _pulls(params, x, u, w),
+            (ACROSS, ACROSS, ALONG),
+            zip(*relative_turning(params, x)[1], strict=True),
+            strict=True,
+        )
+    ]
+    return tuple(_dot(column, felt) for column in zip(*axes, strict=True))
+
+
 def with_wheels(params: Any, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States (n, 8) and forces (m, 2), m ≤ n, N, of the robot without wheels, as (n, 11) and (m, 3) of one with wheels.
 
@@ -189,24 +213,10 @@ def mass_matrix(params: Any, x: Vector, columns: tuple[tuple[Any, ...], ...]) ->
 
 def equations(params: Any, x: Vector, u: Vector) -> tuple[list[list[Any]], list[Any]]:
     """M (6, 6) and q (6) of M v̇ = q for state x (..., 11) and the wheels' forces u (..., 3), N."""
-    _, _, gamma, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, spin = ops.components(x)
+    _, _, gamma, theta, _, _, gamma_dot, theta_dot, _, psi_dot, spin = ops.components(x)
     sin_g, cos_g, sin_t, cos_t = ops.sin(gamma), ops.cos(gamma), ops.sin(theta), ops.cos(theta)
-    r, wheels = params.ball_radius, params.wheels
     w, columns = relative_turning(params, x)
-    w1, w2, w3 = w
-    # ẇ without J v̇: the ball's turning, constant in the world, seen from frame B, less that of the body
-    rate2, rate3 = cos_t * gamma_dot, sin_t * gamma_dot  # of frame B, whose rate about its first axis is −θ̇
-    b1, b2, b3 = w1 - theta_dot, w2 + rate2, w3 + rate3 + psi_dot  # the ball's turning
-    bias1 = rate3 * b2 - rate2 * b3 + psi_dot * w2
-    bias2 = -rate3 * b1 - theta_dot * b3 + gamma_dot * sin_t * theta_dot - psi_dot * w1
-    bias3 = rate2 * b1 + theta_dot * b2 - gamma_dot * cos_t * theta_dot
-    t1, t2, t3 = torque(r, u, psi)
-    drag, rotors = r * r * wheels.drag(params.force_limit), r * r * wheels.mass
-    pulls = (
-        t1 - ACROSS * (drag * w1 + rotors * bias1),
-        t2 - ACROSS * (drag * w2 + rotors * bias2),
-        t3 - ALONG * (drag * w3 + rotors * bias3),
-    )
+    pulls = _pulls(params, x, u, w)
     h, axial = params.first_moment, params.axial_inertia
     half_slope = (axial - params.pivot_inertia) * sin_t * cos_t
     rates2, product = gamma_dot * gamma_dot + theta_dot * theta_dot, gamma_dot * theta_dot
@@ -216,10 +226,30 @@ def equations(params: Any, x: Vector, u: Vector) -> tuple[list[list[Any]], list[
         h * params.gravity * sin_g * cos_t - 2 * half_slope * product - axial * cos_t * theta_dot * psi_dot,
         h * params.gravity * cos_g * sin_t + gamma_dot * (half_slope * gamma_dot + axial * cos_t * psi_dot),
         -axial * cos_t * product,
-        floor_torque(wheels, spin),
+        floor_torque(params.wheels, spin),
     )
     q = [own + _dot(column, pulls) for own, column in zip(q, columns, strict=True)]
     return mass_matrix(params, x, columns), q
+
+
+def _pulls(params: Any, x: Vector, u: Vector, w: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+    """Σ a_i f_i, N·m, of a ball that turns at w, rad/s, in frame B, less what the rotors take of it for J v̇."""
+    *_, theta, _, _, gamma_dot, theta_dot, psi, psi_dot, _ = ops.components(x)
+    sin_t, cos_t = ops.sin(theta), ops.cos(theta)
+    r, wheels, (w1, w2, w3) = params.ball_radius, params.wheels, w
+    # ẇ without J v̇: the ball's turning, constant in the world, seen from frame B, less that of the body
+    rate2, rate3 = cos_t * gamma_dot, sin_t * gamma_dot  # of frame B, whose rate about its first axis is −θ̇
+    b1, b2, b3 = w1 - theta_dot, w2 + rate2, w3 + rate3 + psi_dot  # the ball's turning
+    bias1 = rate3 * b2 - rate2 * b3 + psi_dot * w2
+    bias2 = -rate3 * b1 - theta_dot * b3 + gamma_dot * sin_t * theta_dot - psi_dot * w1
+    bias3 = rate2 * b1 + theta_dot * b2 - gamma_dot * cos_t * theta_dot
+    t1, t2, t3 = torque(r, u, psi)
+    drag, rotors = r * r * wheels.drag(params.force_limit), r * r * wheels.mass
+    return (
+        t1 - ACROSS * (drag * w1 + rotors * bias1),
+        t2 - ACROSS * (drag * w2 + rotors * bias2),
+        t3 - ALONG * (drag * w3 + rotors * bias3),
+    )
 
 
 def floor_torque(wheels: Wheels, spin: Any) -> Any:

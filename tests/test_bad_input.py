@@ -573,6 +573,7 @@ TYPED = [
     ("evaluate dagger --fresh 10", "unknown controller dagger"),  # Stabilize has none
     ("replay stabilize turn", "give one task"),
     ("export lqr", "lqr is an expert"),
+    ("export shac-ekf --task orbit --robot omni_strong --format c", "leave out -ekf"),
 ]
 
 

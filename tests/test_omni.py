@@ -180,13 +180,14 @@ def two_force_gain(robot):
 
 
 @pytest.mark.parametrize("name", ["omni", "omni_strong"])
-def test_in_grip_mujoco_follows_the_closed_form(name, rng):
-    pytest.importorskip("mujoco")
+@pytest.mark.parametrize(("physics", "module", "most"), [("mujoco", "mujoco", 5e-4), ("bullet", "pybullet", 2e-3)])
+def test_in_grip_engines_follow_the_closed_form(name, physics, module, most, rng):
+    pytest.importorskip(module)
     robot = named_robot(name)
     gain, errors = two_force_gain(robot), []
     for _ in range(6):
         x = np.array([0.5, 0.5, 0.1, 0.1, 0.5, 0.5, 0.3, 0.3, 3, 1, 1]) * rng.uniform(-1, 1, 11)
-        exact, simulator = make_simulator("rk4", robot, 0.02, 0.001), make_simulator("mujoco", robot, 0.02)
+        exact, simulator = make_simulator("rk4", robot, 0.02, 0.001), make_simulator(physics, robot, 0.02)
         exact.reset(tuple(x))
         simulator.reset(tuple(x))
         for _ in range(25):
@@ -195,9 +196,9 @@ def test_in_grip_mujoco_follows_the_closed_form(name, rng):
             assert dynamics.keeps_grip(robot, dynamics.held_contact(robot, tuple(x), u, 0.02))
             x, found = np.array(exact.step(u)), np.array(simulator.step(u))
         errors.append(np.hypot(*(found - x)[:2]))
-        np.testing.assert_allclose(found[[2, 3, 8, 9, 10]], x[[2, 3, 8, 9, 10]], atol=5e-3)
-        np.testing.assert_allclose(simulator.floor_force(), dynamics.contact(robot, x, u), atol=1e-3 * robot.weight)
-    assert max(errors) < 5e-4  # m; measured in 20: 3e-5 in the median, 2e-4 at most
+        np.testing.assert_allclose(found[[2, 3, 8, 9, 10]], x[[2, 3, 8, 9, 10]], atol=10 * most)
+        np.testing.assert_allclose(simulator.floor_force(), dynamics.contact(robot, x, u), atol=2 * most * robot.weight)
+    assert max(errors) < most  # m; measured in 20: MuJoCo 2e-4, PyBullet, which is of first order, 9e-4
 
 
 def test_mujoco_goes_on_from_what_it_remembers():
@@ -208,12 +209,6 @@ def test_mujoco_goes_on_from_what_it_remembers():
     after = simulator.step((1.0, 2.0, 3.0))
     simulator.reset(x, memory)
     assert simulator.step((1.0, 2.0, 3.0)) == after
-
-
-def test_bullet_has_no_wheels():
-    pytest.importorskip("pybullet")
-    with pytest.raises(ValueError, match='no robot with wheels; give physics="mujoco" or "rk4"'):
-        BallbotEnv(robot="omni", physics="bullet")
 
 
 @pytest.mark.parametrize("engine", ["torch", "native"])

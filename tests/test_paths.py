@@ -1,20 +1,10 @@
 """Ground paths: they start and end as asked, and they are the same numbers as their formulas written out."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ballbot_gym.paths import catmull_rom, cubic, hermite_basis, then_stay
-
-
-def test_basis_is_that_of_cubic_hermite_splines():
-    spline = pytest.importorskip("scipy.interpolate").CubicHermiteSpline
-    s = np.linspace(0, 1, 11)
-    for i, polynomial in enumerate(hermite_basis(s)):
-        values, slopes = np.zeros(2), np.zeros(2)
-        (slopes if i % 2 else values)[i // 2] = 1.0
-        np.testing.assert_allclose(polynomial, spline([0, 1], values, slopes)(s), atol=1e-15)
+from ballbot_gym.paths import catmull_rom, cubic, then_stay
 
 
 def test_cubic_has_the_positions_and_velocities_asked_for_at_its_ends(rng):

@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ballbot_baselines import certification, righting
-from ballbot_baselines.linearize import linearize
 from ballbot_baselines.lqr import discrete_lqr
 from ballbot_baselines.nmpc import NmpcController
 from ballbot_baselines.optimum import Backoff, find_optimum
@@ -104,17 +103,6 @@ def test_the_papers_robot_is_a_rolling_one_of_no_radius_and_inertia(rng):
         np.testing.assert_allclose(dynamics.contact(almost, x, u)[2], normal, rtol=1e-6)
 
 
-def test_the_linearization_of_the_rolling_robot_moves_as_derived(rolling):
-    a, b = linearize(rolling, np.zeros(8), np.zeros(2))
-    # -a, b, c, -d of the paper's (5) and (6), which are 35.07, 60.40, 0.295 and 0.397
-    assert (a[4, 2], a[6, 2], b[4, 0], b[6, 0]) == pytest.approx((-33.12, 57.77, 0.316, -0.441), abs=0.005)
-
-
-def test_standing_the_floor_carries_the_weight(robot):
-    assert dynamics.contact(robot, np.zeros(8), np.zeros(2)) == pytest.approx((0, 0, robot.weight))
-    assert dynamics.limits(robot, np.zeros(8), np.zeros(2)) == pytest.approx((0.98, 1))
-
-
 def test_the_contact_at_the_end_of_a_step_is_that_of_its_end_state(rolling, rng):
     """Extrapolated without integration: 2 % of the weight at the rates of a fast lean."""
     for x, u in random_states(rng):
@@ -123,11 +111,6 @@ def test_the_contact_at_the_end_of_a_step_is_that_of_its_end_state(rolling, rng)
         assert begin == dynamics.contact(rolling, x, 0.5 * u)
         exact = dynamics.contact(rolling, dynamics.step(rolling, x, 0.5 * u, 0.02), 0.5 * u)
         np.testing.assert_allclose(end, exact, atol=0.02 * rolling.weight)
-
-
-def test_the_paper_has_no_limits_of_grip(params, rng):
-    assert dynamics.limits(params, np.zeros(8), np.zeros(2)) == ()
-    assert params.moving_mass == params.total_mass
 
 
 @pytest.mark.parametrize(

@@ -72,8 +72,6 @@ def decimal_commas(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_robots_move_the_same_bit_for_bit_where_decimals_have_commas(name, physics, decimal_commas):
     robot, varied = named_robot(name), replace(named_robot(name), com_height=0.55)
-    if robot.wheels is not None and physics == "bullet":
-        pytest.skip("Bullet has no wheels")
     start, force = (*GENTLE, 0.0, 0.0, 0.0)[: robot.state_size], (5.0, -3.0, 1.0)[: robot.action_size]
     ends = []
     for changes in (lambda: None, decimal_commas):

@@ -119,8 +119,8 @@ def test_a_policy_behind_a_filter_succeeds_on_a_track_that_it_never_saw(task, tr
 
 def test_a_policy_file_may_be_named_with_its_filter():
     named = f"{shipped_policies(make_task('stabilize'))['shac']}-ekf"
-    rows = [evaluate(name, "stabilize", 1, "rk4", randomization="noisy") for name in (named, "shac-ekf")]
-    assert rows[0].regret_mean == rows[1].regret_mean
+    by_path, by_name = (evaluate(name, "stabilize", 1, "rk4", randomization="noisy") for name in (named, "shac-ekf"))
+    assert by_path.regret_mean == by_name.regret_mean
 
 
 def test_adaptive_nmpc_learns_robot_and_delay_in_a_second():

@@ -80,12 +80,6 @@ def test_before_and_after_the_ends_hold(linear, slopes):
         np.testing.assert_array_equal(trajectory.force(t), trajectory.u[end])
 
 
-def test_single_state_is_a_trajectory_too():
-    trajectory = Trajectory([0.0], np.ones((1, 8)), np.zeros((1, 2)))
-    assert trajectory.duration == 0
-    np.testing.assert_array_equal(trajectory.state(5.0), np.ones(8))
-
-
 GOOD = {"t": [0.0, 1.0], "x": np.zeros((2, 8)), "u": np.zeros((1, 2))}
 
 BAD_ARRAYS = {
@@ -109,12 +103,6 @@ BAD_ARRAYS = {
 def test_arrays_that_are_no_trajectory_are_refused(change, problem):
     with pytest.raises(TrajectoryError, match=problem):
         Trajectory(**{**GOOD, **change})
-
-
-def test_write_makes_folders_and_returns_the_path(tmp_path):
-    path = files.write(tmp_path / "a" / "b" / "text.txt", "γ")
-    assert path.read_text(encoding="utf-8") == "γ"
-    assert files.write(str(path), b"bytes").read_bytes() == b"bytes"
 
 
 @pytest.mark.parametrize("method", ["replace", "write_bytes"])

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable
 
-from ballbot_gym.engines.bullet import BulletContactSimulator, BulletSimulator
+from ballbot_gym.engines.bullet import BulletContactSimulator, BulletOmniSimulator, BulletSimulator
 from ballbot_gym.engines.bullet_client import HOW_TO_GET_IT, has_pybullet, import_pybullet
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.engines.mujoco import (
@@ -28,8 +28,8 @@ __all__ = [
     "make_simulator",
 ]
 
-PHYSICS: dict[str, tuple[Callable[..., Simulator], Callable[..., Simulator], Callable[..., Simulator] | None]] = {
-    "bullet": (BulletSimulator, BulletContactSimulator, None),
+PHYSICS: dict[str, tuple[Callable[..., Simulator], Callable[..., Simulator], Callable[..., Simulator]]] = {
+    "bullet": (BulletSimulator, BulletContactSimulator, BulletOmniSimulator),
     "mujoco": (MujocoSimulator, MujocoContactSimulator, MujocoOmniSimulator),
     "rk4": (Rk4Simulator, Rk4Simulator, Rk4Simulator),
 }
@@ -79,15 +79,8 @@ def default_physics(params: BallbotParams | None = None) -> str:
 def make_simulator(
     physics: str, params: BallbotParams, control_dt: float, physics_dt: float | None = None
 ) -> Simulator:
-    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`.
-
-    Raises:
-        ValueError: this physics cannot simulate the robot.
-    """
-    make = PHYSICS[physics][_kind(params)]
-    if make is None:
-        raise ValueError(f'physics={physics!r} has no robot with wheels; give physics="mujoco" or "rk4"')
-    return make(params, control_dt, physics_dt)
+    """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`."""
+    return PHYSICS[physics][_kind(params)](params, control_dt, physics_dt)
 
 
 def _kind(params: BallbotParams) -> int:

@@ -2,6 +2,7 @@
 
 import weakref
 
+from ballbot_gym import omni
 from ballbot_gym.engines.bullet_client import connect, import_pybullet, joint_indices, load_robot, set_surface
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
 from ballbot_gym.params import BallbotParams
@@ -38,7 +39,7 @@ class BulletSimulator(Simulator):
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
         # Joints are reset in place: reloading the URDF takes a hundred times longer.
-        for i, joint in enumerate(self._joints):
+        for i, joint in enumerate(self._joints[:4]):
             self._bullet.resetJointState(self._robot, joint, x[i], x[i + 4], self._client)
 
     def set_params(self, params: BallbotParams) -> None:
@@ -147,3 +148,47 @@ class BulletContactSimulator(BulletSimulator):
             force=(0, 0, 0),
             physicsClientId=client,
         )
+
+
+class BulletOmniSimulator(BulletContactSimulator):
+    """A robot with three omni-wheels in PyBullet, on a floor: the ball may slip, and leave the floor.
+
+    The motors' torque falls with the wheels' speed over the real ball. The rotors' is that of the acceleration that the robot
+    would have if its ball did not slip. Both are held over a step of Bullet.
+    """
+
+    def __init__(self, params: BallbotParams, control_dt: float, physics_dt: float | None = None):
+        """Args: as for `BulletSimulator`."""
+        super().__init__(params, control_dt, physics_dt)
+        self._steps, self._substeps = self._substeps, 1
+        self._bullet.setPhysicsEngineParameter(
+            fixedTimeStep=control_dt / self._steps, numSubSteps=1, physicsClientId=self._client
+        )
+
+    def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
+        """Puts the robot into state x, with a ball that rolls without slipping."""
+        super().reset(x[:8])
+        bullet, client, radius = self._bullet, self._client, self._params.ball_radius
+        bullet.resetJointState(self._robot, self._joints[4], x[8], x[9], client)
+        spin = (-x[5] / radius, x[4] / radius, x[10])
+        bullet.resetJointStateMultiDof(self._robot, self._ball, (0, 0, 0, 1), spin, physicsClientId=client)
+
+    def step(self, u: tuple[float, ...]) -> State:
+        bullet, client, robot, wheels = self._bullet, self._client, self._robot, self._params.wheels
+        assert wheels is not None
+        x, turning = self._state()
+        for _ in range(self._steps):
+            tx, ty, tz = omni.torque_on_ball(self._params, x, turning, u)
+            brake = omni.floor_torque(wheels, turning[2])
+            bullet.applyExternalTorque(robot, self._ball, (tx, ty, tz + brake), bullet.WORLD_FRAME, client)
+            bullet.applyExternalTorque(robot, self._joints[4], (-tx, -ty, -tz), bullet.WORLD_FRAME, client)
+            bullet.stepSimulation(client)
+            x, turning = self._state()
+        return x
+
+    def _state(self) -> tuple[State, tuple[float, float, float]]:
+        """The state (11,), and how the ball turns in the world, rad/s."""
+        bullet, client = self._bullet, self._client
+        a, b, c, d, e = bullet.getJointStates(self._robot, self._joints, client)
+        turning = bullet.getLinkState(self._robot, self._ball, computeLinkVelocity=1, physicsClientId=client)[7]
+        return (a[0], b[0], c[0], d[0], a[1], b[1], c[1], d[1], e[0], e[1], turning[2]), turning

@@ -15,7 +15,7 @@ from types import ModuleType
 
 from ballbot_gym.params import BallbotParams
 
-_JOINTS = ("x", "y", "gamma", "theta")
+_JOINTS = ("x", "y", "gamma", "theta", "psi")  # the last where wheels turn the body
 _loading = threading.Lock()
 
 HOW_TO_GET_IT = 'Get it with "pip install pybullet", under Python 3.11 or older: newer ones have no wheel.'
@@ -73,7 +73,7 @@ def connect(bullet: ModuleType) -> int:
 
 
 def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[int, tuple[int, ...]]:
-    """Loads the robot without motors, damping or joint speed limits; returns its body and its four joints in order."""
+    """Loads the robot without motors, damping or joint speed limits; returns its body and its joints in order."""
     with tempfile.TemporaryDirectory() as folder, _loading:
         path = Path(folder) / "ballbot.urdf"
         path.write_text(params.to_urdf(), encoding="utf-8")
@@ -88,7 +88,7 @@ def load_robot(bullet: ModuleType, client: int, params: BallbotParams) -> tuple[
             locale.setlocale(locale.LC_NUMERIC, found)
     bullet.setGravity(0, 0, -params.gravity, physicsClientId=client)
     index = joint_indices(bullet, client, robot)
-    joints = tuple(index[name] for name in _JOINTS)
+    joints = tuple(index[name] for name in _JOINTS if name in index)
     for joint in range(-1, len(index)):
         bullet.changeDynamics(
             robot,
