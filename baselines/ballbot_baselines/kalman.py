@@ -196,59 +196,32 @@ class SensorFilter:
 
     def __init__(self, task: Task, params: BallbotParams):
         self._task, self._params, self._dt = task, params, task.control_dt
-        self._model, self._substeps = robot_and_sensors(params), dynamics.substeps_for(task.control_dt)
+        self._model, (self._after, self._over_step) = robot_and_sensors(params), _control_step(params, task.control_dt)
         self._noise = np.diag(readings_variance(task.control_dt))
 
     def reset(self, seen: np.ndarray, c: np.ndarray) -> None:
         """Starts an episode with constants c (nc,), of which sensors show this (no,) at first."""
         mean, deviations = expected_start(self._task, self._params, c)
         self._z, self._p = np.concatenate([seen[9:11], mean[2:]]), np.diag(deviations) ** 2
-        found, slopes = self._at(self._z[:11], np.zeros(3))
-        self._correct(seen, found[11:], slopes[11:])
+        found, slopes = self._model(self._z[:11], np.zeros(3))
+        self._correct(seen, found[11:], slopes[11:, :])
 
     def update(self, seen: np.ndarray, u: np.ndarray) -> None:
         """Takes what sensors show (no,) after a control step with the wheels' forces u (3,), N."""
         u = np.clip(u, -self._params.force_limit, self._params.force_limit)
-        self._correct(seen, *self._over_step(u))
-        self._z[:11], slopes = self._after(u)
+        self._correct(seen, *self._over_step(self._z[:11], u))
+        after, slopes = self._after(self._z[:11], u)
+        self._z[:11], slopes = np.array(after)[:, 0], np.array(slopes)
         self._p[:11] = slopes @ self._p[:11]
         self._p[:, :11] = self._p[:, :11] @ slopes.T
         self._p += np.diag(WHEELS_ERROR)
 
-    def _at(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What `robot_and_sensors` gives."""
-        found, slopes = self._model(x, u)
-        return np.array(found)[:, 0], np.array(slopes)
-
-    def _after(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The state after a control step, and its Jacobian, by RK4."""
-        x, slopes, dt = self._z[:11], np.eye(11), self._dt / self._substeps
-        for _ in range(self._substeps):
-            rates, changes, more, moved = np.zeros(11), np.zeros((11, 11)), x, slopes
-            for weight, share in ((1, 0.5), (2, 0.5), (2, 1.0), (1, 0.0)):
-                found, at = self._at(more, u)
-                rate, change = found[:11], at[:11] @ moved
-                rates, changes = rates + weight / 6 * rate, changes + weight / 6 * change
-                more, moved = x + share * dt * rate, slopes + share * dt * change
-            x, slopes = x + dt * rates, slopes + dt * changes
-        return x, slopes
-
-    def _over_step(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `sensors.mean` of the estimated state, and the Jacobian."""
-        x, dt, (after, slopes) = self._z[:11], self._dt, self._after(u)
-        (first, at_first), (last, at_last) = self._at(x, u), self._at(after, u)
-        at_last = at_last @ slopes
-        middle = 0.5 * (x + after) + dt / 8 * (first - last)[:11]
-        halfway, at_halfway = self._at(middle, u)
-        at_halfway = at_halfway @ (0.5 * (np.eye(11) + slopes) + dt / 8 * (at_first - at_last)[:11])
-        return (first + 4 * halfway + last)[11:] / 6, (at_first + 4 * at_halfway + at_last)[11:] / 6
-
-    def _correct(self, seen: np.ndarray, expected: np.ndarray, slopes: np.ndarray) -> None:
+    def _correct(self, seen: np.ndarray, expected: casadi.DM, slopes: casadi.DM) -> None:
         """Corrects by what sensors show instead of readings, of wheels speeds, and their Jacobian."""
         of_biases, turned = np.eye(9, 3), np.repeat([1.0, self._dt], (6, 3))
-        missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - turned * expected
+        missed = np.asarray(seen[:9], np.float64) * sensors.SCALE - turned * np.array(expected)[:, 0]
         missed[:3] -= self._z[11:]
-        h = np.hstack([turned[:, None] * slopes, of_biases])
+        h = np.hstack([turned[:, None] * np.array(slopes), of_biases])
         self._z, self._p, _ = _corrected(self._z, self._p, h, missed, self._noise)
 
     @property
@@ -322,3 +295,30 @@ def robot_and_sensors(params: BallbotParams) -> casadi.Function:
     state, forces = tuple(casadi.vertsplit(x)), tuple(casadi.vertsplit(u))
     found = casadi.vertcat(*dynamics.derivative(params, state, forces), *sensors.ideal(params, state, forces))
     return casadi.Function("robot", [x, u], [found, casadi.densify(casadi.jacobian(found, x))], {"cse": True})
+
+
+@lru_cache(maxsize=16)
+def _control_step(params: BallbotParams, dt: float) -> tuple[casadi.Function, casadi.Function]:
+    """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `sensors.mean` gives of it. Each gives its
+    Jacobian with respect to x too.
+    """
+    model, substeps = robot_and_sensors(params), dynamics.substeps_for(dt)
+    x, u, own = casadi.MX.sym("x", 11), casadi.MX.sym("u", 3), casadi.DM.eye(11)
+    after, slopes, h = x, own, dt / substeps
+    for _ in range(substeps):
+        rates, changes, more, moved = casadi.MX(11, 1), casadi.MX(11, 11), after, slopes
+        for weight, share in ((1, 0.5), (2, 0.5), (2, 1.0), (1, 0.0)):
+            found, at = model(more, u)
+            rate, change = found[:11], at[:11, :] @ moved
+            rates, changes = rates + weight / 6 * rate, changes + weight / 6 * change
+            more, moved = after + share * h * rate, slopes + share * h * change
+        after, slopes = after + h * rates, slopes + h * changes
+    (first, at_first), (last, at_last) = model(x, u), model(after, u)
+    at_last = at_last @ slopes
+    halfway, at_halfway = model(0.5 * (x + after) + dt / 8 * (first - last)[:11], u)
+    at_halfway = at_halfway @ (0.5 * (own + slopes) + dt / 8 * (at_first - at_last)[:11, :])
+    read, of_read = first + 4 * halfway + last, at_first + 4 * at_halfway + at_last
+    return (
+        casadi.Function("after", [x, u], [after, slopes]),
+        casadi.Function("over", [x, u], [read[11:] / 6, of_read[11:, :] / 6]),
+    )
