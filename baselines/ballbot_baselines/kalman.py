@@ -299,8 +299,8 @@ def robot_and_sensors(params: BallbotParams) -> casadi.Function:
 
 @lru_cache(maxsize=16)
 def _control_step(params: BallbotParams, dt: float) -> tuple[casadi.Function, casadi.Function]:
-    """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `sensors.mean` gives of it. Each gives its
-    Jacobian with respect to x too.
+    """(x, u) -> the state after a control step of dt, s, by RK4; and (x, u) -> what `sensors.mean` gives of it. Each gives
+    its Jacobian with respect to x too.
     """
     model, substeps = robot_and_sensors(params), dynamics.substeps_for(dt)
     x, u, own = casadi.MX.sym("x", 11), casadi.MX.sym("u", 3), casadi.DM.eye(11)
