@@ -74,10 +74,11 @@ def controllers_of(
 
 
 def _identity(name: str) -> str:
-    """The path of a policy's file, whichever of its files is named; of anything else the name."""
+    """The path of a policy's file, whichever of its files is named, and its filter; of anything else the name."""
     if not registry.is_file(name):
         return name
-    return str((Path(name) if registry.is_saved_model(name) else paths_of(name)[1]).resolve())
+    path = registry.plain(name)
+    return str((Path(path) if registry.is_saved_model(name) else paths_of(path)[1]).resolve()) + name.removeprefix(path)
 
 
 def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:

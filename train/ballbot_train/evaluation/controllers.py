@@ -27,14 +27,17 @@ def names(task: Task, robot: str = PAPER, track: str | None = "") -> list[str]:
 
 def filters(params: BallbotParams) -> tuple[str, ...]:
     """What may follow the names of controllers of a robot."""
-    return tuple(FILTERS) if params.wheels is None else (FILTERED,)
+    return FILTERS if params.wheels is None else (FILTERED,)
 
 
 def plain(name: str) -> str:
     """The name of a controller without the filter in front of it."""
-    if name in VARIANTS:
-        return name
-    return next((name.removesuffix(ending) for ending in FILTERS if name.endswith(ending)), name)
+    return name if name in VARIANTS else name.removesuffix(_filter_of(name))
+
+
+def _filter_of(name: str) -> str:
+    """Which of `FILTERS` a name ends with, or ""."""
+    return next((ending for ending in FILTERS if name.endswith(ending)), "")
 
 
 def is_expert(name: str) -> bool:
@@ -173,7 +176,7 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
-    ending = next((ending for ending in FILTERS if name.endswith(ending)), "")
+    ending = _filter_of(name)
     if ending and (name not in VARIANTS or params.wheels is not None):
         from ballbot_baselines.adaptive import behind_filter  # it imports CasADi
 
