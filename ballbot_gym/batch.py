@@ -309,6 +309,10 @@ class BallbotBatch:
         """(B, no) observations of a state, with the sensors' noise. A pure function."""
         return self._observe(_rows(state))
 
+    def sensed(self, state: BatchState) -> torch.Tensor:
+        """(8, B) states as sensors report them, with the noise that `observe` shows. A pure function."""
+        return torch.stack(self._sensed(_rows(state)))
+
     def step(self, actions: torch.Tensor) -> BatchStep:
         """Holds forces for one control step; see `transition`. Call `reset` first.
 
@@ -495,17 +499,18 @@ class BallbotBatch:
 
     def _seen(self, now: _Rows) -> tuple[torch.Tensor, ...]:
         """The present observation with the sensors' noise, which depends on the number of steps taken in the episode."""
-        x, c = now.x, now.c
+        c = now.c
         if self.task.clock:
             c = self.task.at(c, now.steps.to(self.dtype) * self.task.control_dt)
-        if now.sensors:
-            return sensors.seen(now.sensors, c)
-        if self.randomization.is_noisy:
-            key = counter_rng.key(now.seed, now.episode, now.steps + 1)
-            z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
-            time = now.steps.to(self.dtype) * self.task.control_dt
-            x = self.randomization.sensed(x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
-        return tuple(self.task.seen(x, c))
+        return sensors.seen(now.sensors, c) if now.sensors else tuple(self.task.seen(self._sensed(now), c))
+
+    def _sensed(self, now: _Rows) -> tuple[torch.Tensor, ...]:
+        if not self.randomization.is_noisy:
+            return now.x
+        key = counter_rng.key(now.seed, now.episode, now.steps + 1)
+        z = counter_rng.uniforms(key, Randomization.PUSH_DRAWS + Randomization.NOISE_DRAWS, self.dtype)
+        time = now.steps.to(self.dtype) * self.task.control_dt
+        return self.randomization.sensed(now.x, z[Randomization.PUSH_DRAWS :], now.drawn, time)
 
     def _stacked(self, rows: _Rows) -> BatchState:
         """The rows as tensors."""

@@ -38,7 +38,8 @@ class Controller(Protocol):
 class ActionController:
     """A function from observation to action as a Controller. It gets the observations that the env would show.
 
-    This is the one place where an observation is turned into a force.
+    This is the one place where an observation is turned into a force. It acts in B episodes at once, given states (B, 8) and
+    constants (B, nc), if the function takes observations (B, no).
     """
 
     def __init__(
@@ -57,19 +58,26 @@ class ActionController:
         self._begins = True
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._c, self._begins = tuple(np.asarray(c, np.float64).tolist()), True
+        self._c, self._begins = _components(c), True
 
     def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        seen = self._task.seen(tuple(np.asarray(x).tolist()), self._task.at(self._c, t))
-        own = np.array(seen, np.float32)
+        own = np.array(self._task.seen(_components(x), self._task.at(self._c, t)), np.float32).T
         if self._begins:
-            self._past = np.tile(np.append(own, np.zeros(self._params.action_size, np.float32)), self._history)
-        observation = np.concatenate([own, self._past]) if self._history else own
+            still = np.zeros((*own.shape[:-1], self._params.action_size), np.float32)
+            self._past = np.tile(np.concatenate([own, still], -1), self._history)
+        observation = np.concatenate([own, self._past], -1) if self._history else own
         action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
         if self._history:
-            self._past = np.concatenate([own, action.clip(-1.0, 1.0).astype(np.float32), self._past])[: len(self._past)]
+            tried = action.clip(-1.0, 1.0).astype(np.float32)
+            self._past = np.concatenate([own, tried, self._past], -1)[..., : self._past.shape[-1]]
         return self._params.force_limit * action
+
+
+def _components(vector: np.ndarray) -> tuple[Any, ...]:
+    """The components of a vector (n,), or of B of them (B, n), which are (B,) then."""
+    vector = np.asarray(vector, np.float64)
+    return tuple(vector.tolist() if vector.ndim == 1 else vector.T)
 
 
 @dataclass(frozen=True, repr=False)

@@ -18,10 +18,12 @@ from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
 from ballbot_gym.randomization import TRACKS, Randomization
+from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation.benchmark import controllers_of
+from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.evaluation.tracks import EXPERTS, conditions, with_experts
 from ballbot_train.policy import load_network
@@ -115,6 +117,15 @@ def test_a_policy_behind_a_filter_succeeds_on_a_track_that_it_never_saw(task, tr
     assert alone.success < behind.success
     assert behind.success > 0.9
     assert controllers_of([task], [filtered]) == {task: [filtered]}
+
+
+def test_a_batch_of_filters_does_what_one_does():
+    fresh = evaluate_fresh("shac-adaptive", "turn", 3, randomization="late")
+    env = BallbotEnv("turn", physics="rk4", randomization="late")
+    controller = make_controller("shac-adaptive", env.task, env.params)
+    for i in range(3):
+        given = {"state": fresh.states[i], "constants": fresh.constants[i], "drawn": fresh.drawn[i]}
+        assert rollout(env, controller, options=given).cost == pytest.approx(fresh.costs[i], rel=1e-4)
 
 
 def test_a_policy_file_may_be_named_with_its_filter():

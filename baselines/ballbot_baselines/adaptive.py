@@ -10,13 +10,13 @@ What friction the floor has is not seen before the robot slips, so plans take th
 
 import contextlib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ballbot_baselines.kalman import FilteredController, TrackFilter
 from ballbot_baselines.nmpc import BACKOFF, NmpcController
 from ballbot_baselines.shooting import Backoff
-from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.rollout import Controller, PlanError
@@ -35,7 +35,10 @@ _TRACKS = {
 
 
 class BehindTrackFilter:
-    """A controller that acts on what `filter` estimates. It knows what may vary on a track, and how far."""
+    """A controller that acts on what `filter` estimates. It knows what may vary on a track, and how far.
+
+    It acts in B episodes at once, given states (B, 8) and constants (B, nc), if the controller does.
+    """
 
     def __init__(self, task: Task, params: BallbotParams, track: Randomization, controller: Controller):
         self._task, self._params, self._controller = task, params, controller
@@ -52,23 +55,19 @@ class BehindTrackFilter:
             self._adapt(t)
         limit = self._params.force_limit
         # the robot applies a share of what it is asked for
-        u = self._controller.act(*self._when_free(t)) * limit / self.filter.robot.force_limit
+        u = self._controller.act(self._when_free(t), self.filter.when_free()) / self.filter.factors[..., 2:]
         self._u = np.clip(u, -limit, limit)
         return self._u
 
     def _begin(self, t: float) -> None:
-        self._controller.reset(*self._when_free(t), self._c)
+        self._controller.reset(self._when_free(t), self.filter.when_free(), self._c)
 
     def _adapt(self, t: float) -> None:
         """Tells the controller what is known now of the robot."""
 
-    def _when_free(self, t: float) -> tuple[float, np.ndarray]:
-        """When the next command will begin to act, s, and the state (8,) then."""
-        x, dt, robot = self.filter.x, self._task.control_dt, self.filter.robot
-        share = robot.force_limit / self._params.force_limit
-        for u in self.filter.under_way:
-            x = np.asarray(dynamics.step(robot, x, share * u, dt, dynamics.substeps_for(dt)))
-        return t + dt * self.filter.delay, x
+    def _when_free(self, t: float) -> Any:
+        """When the next command will begin to act, s; (B,) of B episodes."""
+        return t + self._task.control_dt * self.filter.delay
 
 
 class AdaptiveNmpcController(BehindTrackFilter):
@@ -101,7 +100,7 @@ class AdaptiveNmpcController(BehindTrackFilter):
         """Plans the rest of the episode for the estimated robot from the state in which the next force begins to act."""
         self._factors, self._delay = self.filter.factors, self.filter.delay
         nmpc = NmpcController(self._task, self.filter.robot, backoff=self._backoff)
-        nmpc.reset(*self._when_free(t), self._c)
+        nmpc.reset(self._when_free(t), self.filter.when_free(), self._c)
         self._controller, self.plans = nmpc, self.plans + 1
 
 

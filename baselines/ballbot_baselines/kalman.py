@@ -20,9 +20,10 @@ import casadi
 import gymnasium
 import numpy as np
 
+from ballbot_baselines.compiled import LANES, InPlace, in_lanes
 from ballbot_gym import dynamics, sensors
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import BallbotParams
+from ballbot_gym.params import BallbotParams, ModelNumbers
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
@@ -40,15 +41,15 @@ _EVIDENCE = 3.0  # of a longer delay over a shorter one, as a difference of log-
 
 
 class TrackFilter:
-    """Estimates what a track does not tell, from reported states and commanded forces.
+    """Estimates what a track does not tell, from reported states and commanded forces, in one episode or in B at once.
 
     | attribute | shape | meaning |
     |---|---|---|
-    | `x` | (8,) | the state |
-    | `factors` | (3,) | on the nominal values of what `FACTORS` names |
-    | `covariance` | (17, 17) | of all that is estimated |
-    | `deviations` | (3,) | standard deviations of `factors` |
-    | `delay` | | control steps from a command to its force |
+    | `x` | (8,), or (B, 8) as that of `reset` | the state |
+    | `factors` | (..., 3) | on the nominal values of what `FACTORS` names |
+    | `covariance` | (..., 17, 17) | of all that is estimated |
+    | `deviations` | (..., 3) | standard deviations of `factors` |
+    | `delay` | (...) | control steps from a command to its force |
     """
 
     def __init__(self, task: Task, params: BallbotParams, track: Randomization):
@@ -56,10 +57,9 @@ class TrackFilter:
             raise ValueError(
                 "what a track does not tell is not estimated of a robot with wheels; give lqr, trajopt or nmpc"
             )
-        self._params, self._track = params, track
+        self._params, self._track, self._dt = params, track, task.control_dt
         low, high = track.delay_steps(task.control_dt)
-        self._delays = range(low, high + 1)
-        self._step = _step_function(params, task.control_dt).map(len(self._delays))
+        self._delays = np.arange(low, high + 1)
         self._low, self._high = np.array([getattr(track, name) for name in FACTORS]).T
         errors = np.repeat((track.odometry_drift, track.lean_bias, track.lean_rate_bias), 2)
         self._prior = np.concatenate([np.full(8, _WIDE), (self._high - self._low) / np.sqrt(12), errors]) ** 2
@@ -67,86 +67,108 @@ class TrackFilter:
         self._noise = np.diag(np.maximum(track.noise, _LEAST_NOISE)) ** 2
 
     def reset(self, x: np.ndarray) -> None:
-        """Starts an episode, of which sensors report state x (8,) at first."""
-        count = len(self._delays)
+        """Starts an episode, of which sensors report state x (8,) at first, or B episodes (B, 8)."""
+        one_for_each = (*x.shape[:-1], len(self._delays))
+        calls = -(-int(np.prod(one_for_each)) // LANES)
+        count = calls * LANES
+        self._before, self._held = np.zeros((count, _SIZE)), np.zeros((count, 2))
+        self._after, self._slopes = np.zeros((count, 8)), np.zeros((count, _SIZE, 8))
+        step = _step_function(self._params, self._dt).map(calls)
+        self._step = InPlace(step, [self._before, self._held], [self._after, self._slopes])
         middle = np.concatenate([np.zeros(8), (self._low + self._high) / 2, np.zeros(6)])
-        self._z, self._p = np.tile(middle, (count, 1)), np.tile(np.diag(self._prior), (count, 1, 1))
-        self._z[:, _X] = x
-        self._likelihood = np.zeros(count)
-        self._steps, self._best = 0, 0
-        self._commands = [np.zeros(2)] * (self._delays[-1] + 1)  # the latest first
+        self._z, self._p = np.tile(middle, (*one_for_each, 1)), np.tile(np.diag(self._prior), (*one_for_each, 1, 1))
+        self._z[..., _X] = x[..., None, :]
+        self._likelihood = np.zeros(one_for_each)
+        self._best = np.zeros(x.shape[:-1], np.int64)
+        self._commands = [np.zeros((*x.shape[:-1], 2))] * (self._delays[-1] + 1)  # the latest first
         self._correct(x, 0.0)
 
     def update(self, t: float, x: np.ndarray, u: np.ndarray) -> None:
-        """Takes the reported state x (8,) at the episode's time t, s, and the force u (2,), N, that was asked for before."""
+        """Takes the reported state x (..., 8) at the episode's time t, s, and the force u (..., 2), N, asked for before."""
         self._commands = [np.asarray(u, np.float64), *self._commands[:-1]]
-        forces = np.array([self._commands[delay] for delay in self._delays])
-        after, slopes = (np.array(each) for each in self._step(self._z.T, forces.T))
-        a = slopes.reshape(_SIZE, len(forces), _SIZE).transpose(1, 0, 2)
+        forces = np.stack([self._commands[delay] for delay in self._delays], -2)
+        count = self._likelihood.size
+        self._before[:count], self._held[:count] = self._z.reshape(-1, _SIZE), forces.reshape(-1, 2)
+        self._step()
+        slopes = self._slopes[:count].swapaxes(-1, -2).reshape(*forces.shape[:-1], 8, _SIZE)
         # Factors multiply each other: what they move x by is wrong by about the share that they are uncertain by.
-        of_factors, moved = self._p[:, _FACTORS, _FACTORS], a[:, _X, _FACTORS]
-        share = np.trace(of_factors, axis1=1, axis2=2)[:, None]
-        second_order = share * np.einsum("kij,kjl,kil->ki", moved, of_factors, moved)
-        self._z = after.T.copy()
-        self._p = a @ self._p @ a.transpose(0, 2, 1)
-        spread = np.diagonal(self._p, axis1=1, axis2=2)
+        of_factors, moved = self._p[..., _FACTORS, _FACTORS], slopes[..., _FACTORS]
+        share = np.trace(of_factors, axis1=-2, axis2=-1)[..., None]
+        second_order = share * np.einsum("...ij,...jl,...il->...i", moved, of_factors, moved)
+        self._z[..., _X] = self._after[:count].reshape(*forces.shape[:-1], 8)
+        self._p[..., _X, :] = slopes @ self._p
+        self._p[..., _X] = self._p @ slopes.swapaxes(-1, -2)
+        spread = np.diagonal(self._p, axis1=-2, axis2=-1)
         index = np.arange(_SIZE)
-        self._p[:, index, index] += np.where(spread < self._prior, self._walk, 0.0)
-        self._p[:, index[_X], index[_X]] += second_order
+        self._p[..., index, index] += np.where(spread < self._prior, self._walk, 0.0)
+        self._p[..., index[_X], index[_X]] += second_order
         self._likelihood += self._correct(x, t)
-        self._best = int(np.argmax(self._likelihood >= self._likelihood.max() - _EVIDENCE))
+        likely = self._likelihood >= self._likelihood.max(-1, keepdims=True) - _EVIDENCE
+        self._best = np.argmax(likely, -1)
 
     def _correct(self, x: np.ndarray, t: float) -> np.ndarray:
         """Corrects all filters by what sensors report, and says how likely each found it."""
         h = np.eye(8, _SIZE)
         h[range(8), [11, 12, 13, 14, 11, 12, 15, 16]] = [t, t, 1, 1, 1, 1, 1, 1]
-        missed = np.asarray(x, np.float64) - self._z @ h.T
+        missed = np.asarray(x, np.float64)[..., None, :] - self._z @ h.T
         self._z, self._p, spread = _corrected(self._z, self._p, h, missed, self._noise)
-        self._z[:, _FACTORS] = np.clip(self._z[:, _FACTORS], self._low, self._high)
-        whitened = np.einsum("ki,ki->k", missed, np.linalg.solve(spread, missed[..., None])[..., 0])
+        self._z[..., _FACTORS] = np.clip(self._z[..., _FACTORS], self._low, self._high)
+        whitened = np.einsum("...i,...i->...", missed, np.linalg.solve(spread, missed[..., None])[..., 0])
         return -0.5 * (whitened + np.linalg.slogdet(spread)[1])
+
+    def _believed(self, each: np.ndarray) -> np.ndarray:
+        """What the believed filter has of what each filter has (..., filters, n)."""
+        return np.take_along_axis(each, self._best[..., None, None], -2)[..., 0, :]
 
     @property
     def x(self) -> np.ndarray:
-        return self._z[self._best, _X].copy()
+        return self._believed(self._z)[..., _X]
 
     @property
     def factors(self) -> np.ndarray:
-        return self._z[self._best, _FACTORS].copy()
+        return self._believed(self._z)[..., _FACTORS]
 
     @property
     def covariance(self) -> np.ndarray:
-        return self._p[self._best].copy()
+        return np.take_along_axis(self._p, self._best[..., None, None, None], -3)[..., 0, :, :]
 
     @property
     def deviations(self) -> np.ndarray:
-        return np.sqrt(np.diagonal(self.covariance)[_FACTORS])
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)[..., _FACTORS])
 
     @property
-    def delay(self) -> int:
+    def delay(self) -> np.ndarray:
         return self._delays[self._best]
 
-    @property
-    def under_way(self) -> list[np.ndarray]:
-        """The commanded forces (2,), N, that have not begun to act, the earliest first."""
-        return self._commands[: self.delay][::-1]
+    def when_free(self) -> np.ndarray:
+        """The state (..., 8) in which the next command will begin to act."""
+        x, share = self.x, self.factors[..., 2:]
+        robot: Any = self.robot if x.ndim == 1 else ModelNumbers.of(self.robot)
+        for age in range(self._delays[-1], 0, -1):  # of commands that have not begun to act, the earliest first
+            if (waits := self.delay >= age).any():
+                forces = share * self._commands[age - 1]
+                after = dynamics.step(robot, x, forces, self._dt, dynamics.substeps_for(self._dt))
+                x = np.where(waits[..., None], after, x)
+        return x
 
     @property
     def robot(self) -> BallbotParams:
-        """The estimated robot, on the slipperiest floor of the track."""
-        mass, height, force = self.factors.tolist()
+        """The estimated robot, on the slipperiest floor of the track; of B episodes its numbers are (B,)."""
+        mass, height, force = self.factors.T if self.factors.ndim > 1 else self.factors.tolist()
         return self._track.robot(self._params, (mass, 1.0, height, 1.0, 1.0, 0.0, force, self._track.friction[0]))
 
 
 @lru_cache(maxsize=16)
 def _step_function(params: BallbotParams, dt: float) -> casadi.Function:
-    """(z, commanded force) -> z after a control step of dt, s, in which the force acts, and its Jacobian."""
+    """(z, commanded force) -> x after a control step of dt, s, in which the force acts, and its Jacobian (8, 17) as a column;
+    of `LANES` filters at once.
+    """
     z, u = casadi.SX.sym("z", _SIZE), casadi.SX.sym("u", 2)
     mass, height, force = (z[8 + i] for i in range(3))
     robot = Randomization().robot(params, (mass, 1.0, height, 1.0))
     x = dynamics.step(robot, z[_X], force * u, dt, dynamics.substeps_for(dt))
-    after = casadi.vertcat(x, z[8:])
-    return casadi.Function("step", [z, u], [after, casadi.densify(casadi.jacobian(after, z))], {"cse": True})
+    slopes = casadi.vec(casadi.densify(casadi.jacobian(x, z)))
+    return in_lanes("filter", (casadi.Function("step", [z, u], [x, slopes], {"cse": True}),))[0]
 
 
 def _corrected(

@@ -64,7 +64,7 @@ def evaluate(
     from ballbot_train.evaluation import fresh as episodes  # it imports torch
 
     episodes.check_fresh(fresh, seed)
-    episodes.as_batch_policy(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
+    episodes.history_of(policy, make_task(task, robot), robot)  # refuses experts, before anything is written
     jobs.make_folder(out)
     facts = provenance() | {
         "task": task,

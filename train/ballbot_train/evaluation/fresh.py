@@ -18,6 +18,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from ballbot_baselines.adaptive import BehindTrackFilter
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
@@ -25,17 +26,16 @@ from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
-from ballbot_gym.rollout import PlanError
+from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import limit_names
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import is_expert, is_saved_model, make_controller, plain
+from ballbot_train.evaluation.controllers import is_expert, is_saved_model, make_controller
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
 from ballbot_train.policy import PolicyController
-from ballbot_train.policy_files import read_description, shipped_policies
 from ballbot_train.weights import own_precision
 
 try:
@@ -237,19 +237,24 @@ def draw_robots(
 
 def history_of(policy: Any, task: Task, robot: str = PAPER) -> int:
     """How many earlier observations a policy wants to see, that is given as to `as_batch_policy`."""
-    if isinstance(policy, str | Path) and not is_saved_model(str(policy)):
-        path = shipped_policies(task, robot, None).get(str(policy), policy)
-        return int(read_description(path)["spec"].get("history", 0))
+    if isinstance(policy, str | Path):
+        if is_saved_model(str(policy)):
+            return 0
+        policy = getattr(_controller(str(policy), task, robot), "network", None)
     return getattr(getattr(policy, "spec", None), "history", 0)
 
 
-def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[torch.Tensor], torch.Tensor]:
-    """A policy as a function from observations (B, no) to actions (B, 2), for one episode of each of B environments.
+BatchPolicy = Callable[[torch.Tensor], torch.Tensor]
+"""From observations (B, no) to actions (B, 2)."""
+
+
+def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> BatchPolicy:
+    """A policy as a function from observations to actions, for one episode of each environment of a batch.
 
     Args:
-        policy: a policy file, a saved model, the name of a shipped policy, a model with Stable-Baselines3's `predict`, or a
-            function of tensors such as a `PolicyNetwork`. It is given float32.
-        task: what it is to do.
+        policy: a policy file, a saved model, the name of a shipped policy, of which a filter's may follow, a model with
+            Stable-Baselines3's `predict`, or a function of tensors such as a `PolicyNetwork`. It is given float32.
+        batch: where it acts.
         robot: by name, of a policy by name or file.
 
     Raises:
@@ -258,13 +263,10 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         TypeError: it is none of these.
     """
     if isinstance(policy, str | Path):
-        if is_expert(str(policy)) or plain(str(policy)) != str(policy):
-            what = "an expert" if is_expert(str(policy)) else "behind a filter"
-            raise ValueError(
-                f"{policy} is {what}, which acts in one episode at a time, and fresh episodes run all at once; give a "
-                "policy, or run it on certified episodes with ballbot benchmark"
-            )
-        network = cast(PolicyController, make_controller(str(policy), task, named_robot(robot))).network
+        controller = _controller(str(policy), batch.task, robot)
+        if isinstance(controller, BehindTrackFilter):
+            return _behind_filter(controller, batch)
+        network = cast(PolicyController, controller).network
 
         def act(observation: torch.Tensor) -> torch.Tensor:
             with own_precision():
@@ -272,7 +274,7 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
 
         return act
     if callable(getattr(policy, "predict", None)):
-        predictor = Predictor(policy, task, named_robot(robot))
+        predictor = Predictor(policy, batch.task, named_robot(robot))
         begins = itertools.chain([True], itertools.repeat(False))
         return lambda observation: torch.as_tensor(
             predictor(observation.float().numpy(), next(begins)), device=observation.device
@@ -281,6 +283,30 @@ def as_batch_policy(policy: Any, task: Task, robot: str = PAPER) -> Callable[[to
         function: Any = policy
         return lambda observation: function(observation.float())
     raise TypeError(f"{policy!r} is no policy: give a name, a file, a model with predict, or a function of tensors")
+
+
+def _controller(policy: str, task: Task, robot: str) -> Controller:
+    """The controller of that name, which acts in many episodes at once."""
+    if is_expert(policy):
+        raise ValueError(
+            f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
+            "policy, or run it on certified episodes with ballbot benchmark"
+        )
+    return make_controller(policy, task, named_robot(robot))
+
+
+def _behind_filter(controller: BehindTrackFilter, batch: BallbotBatch) -> BatchPolicy:
+    """The controller as a function of observations, in place of which it takes what sensors report of states."""
+    times = itertools.count(0.0, batch.task.control_dt)
+
+    def act(observation: torch.Tensor) -> torch.Tensor:
+        assert batch.state is not None
+        x, t = batch.sensed(batch.state).T.double().numpy(), next(times)
+        if t == 0:
+            controller.reset(t, x, batch.state.c.T.double().numpy())
+        return torch.from_numpy(controller.act(t, x) / batch.params.force_limit)
+
+    return act
 
 
 def evaluate_fresh(
@@ -310,15 +336,15 @@ def evaluate_fresh(
     """
     task, params, varied = make_task(task, robot), named_robot(robot), checked_randomization(randomization)
     check_fresh(episodes, seed)
-    act, drawn = as_batch_policy(policy, task, robot), draw_robots(task, range(episodes), seed, varied)
     world: dict[str, Any] = {"randomization": varied, "history": history_of(policy, task, robot)}
+    drawn = draw_robots(task, range(episodes), seed, varied)
     states, constants = draw(task, range(episodes), seed, robot=robot)
     runs = []
     for start in range(0, episodes, _BATCH):
         x, c = states[start : start + _BATCH], constants[start : start + _BATCH]
         batch = BallbotBatch(task, len(x), compile=False, dtype=torch.float64, robot=robot, **world)
         some = drawn[start : start + _BATCH] if drawn.shape[1] else None
-        runs.append(run_episodes(batch, act, x, c, drawn=some))
+        runs.append(run_episodes(batch, as_batch_policy(policy, batch, robot), x, c, drawn=some))
         on_progress(len(x))
     described = [task.measures(x, c, params) for x, c in zip(states, constants, strict=True)]
     vary = {name: row for name, row in zip(Randomization.DRAWN, drawn.T, strict=False) if np.ptp(row) > 0}

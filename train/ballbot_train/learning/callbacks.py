@@ -10,7 +10,6 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import Task
-from ballbot_train.evaluation.fresh import as_batch_policy
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.learning.training import score_and_validate
 from ballbot_train.saved_models import save_vecnormalize
@@ -66,8 +65,7 @@ class RegretCallback(BaseCallback):
 
     def evaluate(self) -> dict[str, float]:
         """Measures the present model; returns the figures by name. Raises a PolicyError if it acts in other spaces."""
-        policy = as_batch_policy(self.model, self.task, self._robot)
-        return score_and_validate(policy, self.task, self._robot, self.validation_episodes)
+        return score_and_validate(self.model, self.task, self._robot, self.validation_episodes)
 
     def _on_step(self) -> bool:
         if self.n_calls % self.eval_freq == 0:

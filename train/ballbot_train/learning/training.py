@@ -36,7 +36,7 @@ import os
 import shlex
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +58,6 @@ from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate, fresh
 from ballbot_train.learning import VALIDATION_EPISODES
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
-from ballbot_train.policy_files import PolicySpec
 from ballbot_train.provenance import provenance
 from ballbot_train.weights import own_defaults, saved_by_torch
 
@@ -66,10 +65,6 @@ _CONFIG = "config.json"
 _VALIDATION_SEED, _CERTIFIED_SEED = 0, 1
 _CHECKPOINT_LIMIT = 2**34  # bytes
 _CHECKPOINT_SECONDS = float(os.environ.get("BALLBOT_CHECKPOINT_SECONDS", "60"))
-
-
-Policy = Callable[[torch.Tensor], torch.Tensor]
-"""From observations (B, no) to actions (B, 2)."""
 
 
 class Learner(Protocol):
@@ -115,7 +110,7 @@ _COLUMNS = (
 
 
 def score_and_validate(
-    policy: Policy,
+    policy: Any,
     task: Task,
     robot: str = PAPER,
     episodes: int = VALIDATION_EPISODES,
@@ -123,7 +118,7 @@ def score_and_validate(
 ) -> dict[str, float]:
     """Measures a policy on the certified episodes and on the validation set, which shares none with others, in one batch.
 
-    With a randomization the optima are those of its episodes.
+    With a randomization the optima are those of its episodes. A policy is what `fresh.as_batch_policy` takes.
 
     | figure | is |
     |---|---|
@@ -142,10 +137,10 @@ def score_and_validate(
     if known.drawn.shape[1]:  # else the track moves no optimum
         draws[0] = known.drawn
     drawn, states, constants = map(np.concatenate, (draws, (known.states, x), (known.constants, c)))
-    spec = getattr(policy, "spec", None)
-    history = spec.history if isinstance(spec, PolicySpec) else 0
+    history = fresh.history_of(policy, task, robot)
     batch = BallbotBatch(task, len(states), compile=False, robot=robot, randomization=randomization, history=history)
-    run = run_episodes(batch, policy, states, constants, drawn=drawn if drawn.shape[1] else None)
+    act = fresh.as_batch_policy(policy, batch, robot)
+    run = run_episodes(batch, act, states, constants, drawn=drawn if drawn.shape[1] else None)
     cost, success, failure = run.cost.double().numpy(), run.success.numpy(), run.failure.numpy()
     priced = fresh.priced(cost, success, task)
     standing = (cost[:count] / known.costs - 1)[~failure[:count]]
