@@ -371,6 +371,9 @@ def _pair(name: str, value: Any) -> Range:
         raise ValueError(f"Randomization: {name} must be a finite range (low, high), not {value!r}") from None
 
 
+ROBOT_FACTORS = ("body_mass", "com_height", "force")
+"""What filters estimate of a robot, and informed policies are told: factors on the nominal values."""
+
 TRACKS: dict[str, Randomization] = {
     "unknown": Randomization(body_mass=(0.7, 1.4), com_height=(0.85, 1.15), force=(0.85, 1.1), friction=(0.6875, 1.25)),
     "late": Randomization(actuator_delay=(0.0, 0.06)),

@@ -39,7 +39,8 @@ class ActionController:
     """A function from observation to action as a Controller. It gets the observations that the env would show.
 
     This is the one place where an observation is turned into a force. It acts in B episodes at once, given states (B, 8) and
-    constants (B, nc), if the function takes observations (B, no).
+    constants (B, nc), if the function takes observations (B, no). Where `told` is set, it follows, (..., 3),
+    what `ROBOT_FACTORS` names, as far as it is known.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class ActionController:
         self._task, self._params, self._action, self._history = task, params, action, history
         self._c: tuple[float, ...] = ()
         self._begins = True
+        self.told: np.ndarray | None = None
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         self._c, self._begins = _components(c), True
@@ -66,6 +68,8 @@ class ActionController:
             still = np.zeros((*own.shape[:-1], self._params.action_size), np.float32)
             self._past = np.tile(np.concatenate([own, still], -1), self._history)
         observation = np.concatenate([own, self._past], -1) if self._history else own
+        if self.told is not None:
+            observation = np.concatenate([observation, self.told.astype(np.float32)], -1)
         action = real_array(self._action(observation, self._begins), "action").astype(np.float64)
         self._begins = False
         if self._history:

@@ -1,6 +1,7 @@
 """Controllers on robots that nobody told them."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,8 +27,10 @@ from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.fresh import evaluate_fresh
 from ballbot_train.evaluation.tracks import EXPERTS, conditions, with_experts
-from ballbot_train.policy import load_network
-from ballbot_train.policy_files import read_description, shipped_policies, track_in
+from ballbot_train.learning.actors import started
+from ballbot_train.onnx_export import export_onnx
+from ballbot_train.policy import load_network, save_policy
+from ballbot_train.policy_files import PolicyError, read_description, shipped_policies, track_in
 
 
 def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):
@@ -213,3 +216,24 @@ def test_the_past_of_an_episode_with_given_draws_begins_with_their_sensors(rng):
     assert torch.equal(first[:, :8], first[:, 8:16])
     assert torch.equal(first[:, :8], first[:, 18:26])
     assert torch.equal(first[:, 16:18], torch.zeros(3, 2))
+
+
+def test_an_informed_policy_acts_as_its_start_at_first_and_runs_behind_a_filter(tmp_path):
+    import torch
+
+    start = load_network(shipped_policies(make_task("stabilize"))["shac"], make_task("stabilize"))
+    informed = started(start, replace(start.spec, informed=True))
+    told = torch.tensor([[1.0, 1.0, 1.0], [1.3, 0.9, 0.9]])
+    observations = torch.rand(2, 8, generator=torch.Generator().manual_seed(0)) - 0.5
+    torch.testing.assert_close(informed(torch.cat([observations, told], 1)), start(observations))
+    for part in informed.parameters():
+        part.data += 0.1
+    mirrored = informed(torch.cat([-observations, told], 1))
+    torch.testing.assert_close(mirrored, -informed(torch.cat([observations, told], 1)))
+    path = save_policy(tmp_path / "policy", started(start, replace(start.spec, informed=True)), {})
+    named, behind = (evaluate(name, "stabilize", 3, "rk4", randomization="unknown") for name in (path, "shac-adaptive"))
+    assert named.cost_mean == pytest.approx(behind.cost_mean)
+    with pytest.raises(PolicyError, match="informed"):
+        export_onnx(path, tmp_path / "policy.onnx", make_task("stabilize"))
+    with pytest.raises(ValueError, match="give --informed"):
+        started(informed, start.spec)

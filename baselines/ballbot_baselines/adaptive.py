@@ -60,10 +60,13 @@ class BehindTrackFilter:
         return self._u
 
     def _begin(self, t: float) -> None:
+        self._adapt(t)
         self._controller.reset(self._when_free(t), self.filter.when_free(), self._c)
 
     def _adapt(self, t: float) -> None:
         """Tells the controller what is known now of the robot."""
+        if getattr(self._controller, "told", None) is not None:
+            self._controller.told = self.filter.factors  # pyright: ignore[reportAttributeAccessIssue]
 
     def _when_free(self, t: float) -> Any:
         """When the next command will begin to act, s; (B,) of B episodes."""

@@ -24,12 +24,9 @@ from ballbot_baselines.compiled import LANES, InPlace, in_lanes
 from ballbot_gym import dynamics, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams, ModelNumbers
-from ballbot_gym.randomization import Randomization
+from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
-
-FACTORS = ("body_mass", "com_height", "force")
-"""What is estimated of the robot: factors on the nominal values."""
 
 _X, _FACTORS = slice(0, 8), slice(8, 11)
 _SIZE = 17
@@ -46,7 +43,7 @@ class TrackFilter:
     | attribute | shape | meaning |
     |---|---|---|
     | `x` | (8,), or (B, 8) as that of `reset` | the state |
-    | `factors` | (..., 3) | on the nominal values of what `FACTORS` names |
+    | `factors` | (..., 3) | on the nominal values of what `ROBOT_FACTORS` names |
     | `covariance` | (..., 17, 17) | of all that is estimated |
     | `deviations` | (..., 3) | standard deviations of `factors` |
     | `delay` | (...) | control steps from a command to its force |
@@ -60,7 +57,7 @@ class TrackFilter:
         self._params, self._track, self._dt = params, track, task.control_dt
         low, high = track.delay_steps(task.control_dt)
         self._delays = np.arange(low, high + 1)
-        self._low, self._high = np.array([getattr(track, name) for name in FACTORS]).T
+        self._low, self._high = np.array([getattr(track, name) for name in ROBOT_FACTORS]).T
         errors = np.repeat((track.odometry_drift, track.lean_bias, track.lean_rate_bias), 2)
         self._prior = np.concatenate([np.full(8, _WIDE), (self._high - self._low) / np.sqrt(12), errors]) ** 2
         self._walk = np.array([0] * 4 + [_MODEL_ERROR] * 4 + [_FACTOR_WALK] * 3 + [0] * 6) ** 2

@@ -37,8 +37,8 @@ def export_onnx(policy: str | Path, path: str | Path, task: Task, robot: str = P
     """Writes a policy as an ONNX file, after checking that it acts as the policy does.
 
     The model has one input, `observation` (batch, no) float32 as the task observes, with the past behind it if the policy
-    has a history, and one output, `action` (batch, 2)
-    float32 in [−1, 1], in units of the force limit. Its metadata says what these are; see `metadata`.
+    has a history, and one output, `action` (batch, 2) float32 in [−1, 1], in units of the force limit. Its metadata says what
+    these are; see `metadata`.
 
     Args:
         policy: the policy's file.
@@ -68,6 +68,10 @@ _HEADING = "\n\nThen cos psi, sin psi, and the rates of psi and of the ball's sp
 def metadata(policy: str | Path, task: Task, robot: str = PAPER) -> dict[str, str]:
     """What an ONNX file says of its policy: task, layouts and units of input and output, rate, and where it comes from."""
     described, params = read_description(policy), named_robot(robot)
+    if described["spec"].get("informed"):
+        raise PolicyError(
+            f"{policy} is informed of its robot by a filter, which cannot be exported; export another policy"
+        )
     learner = described.get("training", {}).get("learner", "unknown")
     return {
         "task": task.id,

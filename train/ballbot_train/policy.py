@@ -17,6 +17,7 @@ from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
@@ -38,6 +39,8 @@ try:
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
+_TOLD = len(ROBOT_FACTORS)
+_TOLD_SCALE = 0.3  # of what informed policies are told, less 1
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}
 
 
@@ -50,7 +53,8 @@ class PolicyNetwork(torch.nn.Module):
     and adds the action that keeps it: so it rests at its goal, or orbits on the circle, and not beside it. With routes, a
     network of its own decides on which sides obstacles are passed.
 
-    With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in.
+    With a history, earlier observations and actions follow in the observation; each is seen in the frame that it is in. An
+    informed policy takes what it is told of the robot behind the observation, and its forces are those of the nominal motors.
     """
 
     def __init__(self, spec: PolicySpec, device: str = "cpu"):
@@ -58,13 +62,14 @@ class PolicyNetwork(torch.nn.Module):
         self.spec = spec
         own: dict[str, Any] = {"device": device, "dtype": torch.float32}  # whatever torch's defaults are
         self._frame = None if spec.frame is None else FRAMES[spec.frame]
+        told, none = [1] * _TOLD * spec.informed, ((-1,) * spec.observations, (-1,) * spec.actions)
         self._mirrors = [
-            (torch.tensor([*signs, *(spec.history * (*signs, *action))], **own), torch.tensor(action, **own))
-            for signs, action in spec.mirrors
+            (torch.tensor([*signs, *(spec.history * (*signs, *action)), *told], **own), torch.tensor(action, **own))
+            for signs, action in (*spec.mirrors, *[none] * (spec.odd and spec.informed))
         ]
         self.routes = Routes(spec.frame, spec.routes, device) if spec.frame is not None and spec.routes else None
         inputs = spec.observations if self._frame is None else self._frame.size
-        inputs += spec.history * (inputs + spec.actions)
+        inputs += spec.history * (inputs + spec.actions) + _TOLD * spec.informed
         self._steady = self._frame.steady if self._frame is not None and spec.centred else None
         self.linear = torch.nn.Linear(inputs, spec.actions, bias=not spec.odd, **own) if spec.linear else None
         widths = (inputs, *spec.hidden)
@@ -81,21 +86,35 @@ class PolicyNetwork(torch.nn.Module):
         raw = self.raw(observation)
         return torch.tanh(raw) if self.spec.squash == "tanh" else raw.clamp(-1.0, 1.0)
 
+    def knowing(self, observation: torch.Tensor, drawn: torch.Tensor) -> torch.Tensor:
+        """Actions (B, 2) for observations (B, no) without what an informed policy is told of the robots: that is in what a
+        randomization drew for them (n, B).
+        """
+        if not self.spec.informed:
+            return self(observation)
+        told = drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T.to(observation.dtype)
+        return self(torch.cat([observation, told], -1)) / told[:, -1:]
+
     def raw(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., 2) before it is squashed; with "tanh_in_frame" before it is clipped, which alone is left to do then."""
+        told = observation[..., :0]
+        if self.spec.informed:
+            observation, told = observation[..., :-_TOLD], (observation[..., -_TOLD:] - 1.0) / _TOLD_SCALE
         if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
             # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
             seen = tuple(observation.tolist())
             features, back = self.features(seen if self.routes is None else seen + self.routes.alone(seen))
-            output = self._in_frame(features, observation.new_tensor)
+            output = self._in_frame((*features, *told.tolist()), observation.new_tensor)
             forwards, sideways = output.tolist()
             return observation.new_tensor(back((forwards, sideways)))
         if self.routes is not None:
             observation = self.routes.behind(observation)
         if self._frame is not None:
             features, back = self.features(observation.unbind(-1))
-            action = self._in_frame(features, lambda values: torch.stack(values, -1))
+            action = self._in_frame((*features, *told.unbind(-1)), lambda values: torch.stack(values, -1))
             return torch.stack(back((action[..., 0], action[..., 1])), -1)
+        if self.spec.informed:
+            observation = torch.cat([observation, told], -1)
         total = self._sum(observation)
         for signs, action_signs in self._mirrors:
             total = total + action_signs * self._sum(signs * observation)
@@ -129,7 +148,8 @@ class PolicyNetwork(torch.nn.Module):
         assert self._steady is not None
         assert self._frame is not None
         kept, action = self._steady(features[: self._frame.size])
-        return (*kept, *(self.spec.history * (*kept, *action))), action
+        told = features[self._frame.size :] if self.spec.informed else ()
+        return (*kept, *(self.spec.history * (*kept, *action)), *told), action
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
@@ -173,6 +193,8 @@ class PolicyController(ActionController):
         history = network.spec.history if isinstance(network, PolicyNetwork) else 0
         super().__init__(task, params, lambda observation, begins: self.predict(observation)[0], history)
         self.network = network.eval()
+        if isinstance(network, PolicyNetwork) and network.spec.informed:
+            self.told = np.ones(_TOLD)
 
     def predict(
         self,

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from ballbot_gym import files
 from ballbot_gym.checks import check_history
-from ballbot_gym.randomization import TRACKS
+from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS
 from ballbot_gym.robots import PAPER, ROBOTS, file_name, named_robot
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.symmetry import FRAMES
@@ -75,6 +75,9 @@ class PolicySpec:
     """Name in `ROBOTS` of the robot it was trained on."""
     history: int = 0
     """How many earlier observations and actions it sees; `history` of its env."""
+    informed: bool = False
+    """Whether it is told the robot, what `ROBOT_FACTORS` names, behind the observation. It runs behind a filter, which finds
+    that out, as in Yu et al., "Preparing for the unknown" (2017)."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.task, str):
@@ -86,8 +89,8 @@ class PolicySpec:
         for name in ("observations", "observation_version"):
             _check_count(name, getattr(self, name))
         check_history(self.history)
-        if self.history and self.routes:
-            raise ValueError("routes know no history")
+        if self.history and (self.routes or self.informed):
+            raise ValueError("routes and informed policies know no history")
         for name in ("hidden", "routes"):
             layers = getattr(self, name)
             if not isinstance(layers, tuple) or len(layers) > _MOST_LAYERS:
@@ -98,7 +101,7 @@ class PolicySpec:
             known = get_args(get_type_hints(PolicySpec)[name])
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
-        for name in ("linear", "odd", "centred"):
+        for name in ("linear", "odd", "centred", "informed"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be true or false, not {getattr(self, name)!r}")
         if len(self.mirrors) > _MOST_MIRRORS:
@@ -124,8 +127,9 @@ class PolicySpec:
 
     @property
     def seen(self) -> int:
-        """Numbers that the policy takes: an observation, and the past behind it."""
-        return self.observations + self.history * (self.observations + self.actions)
+        """Numbers that the policy takes: an observation, and behind it the past, or what it is told of the robot."""
+        told = len(ROBOT_FACTORS) if self.informed else 0
+        return self.observations + self.history * (self.observations + self.actions) + told
 
     @classmethod
     def read(cls, described: Mapping[str, Any]) -> "PolicySpec":

@@ -43,6 +43,8 @@ class Run:
     """Track: unknown, late, noisy or real; not sac."""
     history: int = 0
     """Earlier observations and actions that are seen."""
+    informed: bool = False
+    """The policy is told each robot, and runs behind a filter."""
     threads: int = 1
     """Threads of torch."""
     test_episodes: int = certified.EPISODES
@@ -104,7 +106,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
     optima.known(problem, run.robot, workers=Workers(), randomization=varied)
     start = None if run.start is None else load_network(run.start, problem, robot=None)
     world = None if run.randomization is None else varied
-    given = settings, run.seed, run.demos, start, world, run.history
+    given = settings, run.seed, run.demos, start, world, run.history, run.informed
     made = LEARNERS[learner].make(problem, named_robot(run.robot), *given)
     physics = physics_or_default(None, run.robot)
     row = training.train(made, problem, config, out, run.resume, run.test_episodes)
@@ -140,6 +142,7 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
         **robot_setting(run.robot),
         **({} if run.randomization is None else {"randomization": run.randomization}),
         **({"history": run.history} if run.history else {}),
+        **({"informed": True} if run.informed else {}),
         **({} if more == VALIDATION_EPISODES else {"validation_episodes": more}),
     }
 

@@ -176,11 +176,20 @@ def make_controller(name: str, task: Task, params: BallbotParams) -> Controller:
         ValueError: nothing of that name.
         PolicyError: a policy file that is damaged or of another task.
     """
+    if name in VARIANTS and params.wheels is None:
+        return VARIANTS[name](task, params)
     ending = _filter_of(name)
-    if ending and (name not in VARIANTS or params.wheels is not None):
-        from ballbot_baselines.adaptive import behind_filter  # it imports CasADi
+    controller = _unfiltered(name.removesuffix(ending), task, params)
+    if getattr(controller, "told", None) is not None:  # it wants to be told the robot
+        ending = ending or "-adaptive"
+    if not ending:
+        return controller
+    from ballbot_baselines.adaptive import behind_filter  # it imports CasADi
 
-        return behind_filter(task, params, ending, make_controller(name.removesuffix(ending), task, params))
+    return behind_filter(task, params, ending, controller)
+
+
+def _unfiltered(name: str, task: Task, params: BallbotParams) -> Controller:
     if name in CONTROLLERS | VARIANTS:
         return (CONTROLLERS | VARIANTS)[name](task, params)
     robot = robot_name(params)

@@ -20,7 +20,7 @@ import numpy as np
 
 from ballbot_baselines.adaptive import BehindTrackFilter
 from ballbot_gym import files
-from ballbot_gym.batch import BallbotBatch
+from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
@@ -35,7 +35,7 @@ from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
-from ballbot_train.policy import PolicyController
+from ballbot_train.policy import PolicyController, PolicyNetwork
 from ballbot_train.weights import own_precision
 
 try:
@@ -279,6 +279,8 @@ def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> Bat
         return lambda observation: torch.as_tensor(
             predictor(observation.float().numpy(), next(begins)), device=observation.device
         )
+    if isinstance(policy, PolicyNetwork) and policy.spec.informed:
+        return lambda observation: policy.knowing(observation.float(), cast(BatchState, batch.state).drawn)
     if callable(policy):
         function: Any = policy
         return lambda observation: function(observation.float())

@@ -31,6 +31,7 @@ def spec_for(
     linear: bool = False,
     history: int = 0,
     robot: str = PAPER,
+    informed: bool = False,
 ) -> PolicySpec:
     """The shape of a policy; with a linear part, which can start as LQR, its output is squashed smoothly, else clipped.
 
@@ -40,7 +41,7 @@ def spec_for(
         ValueError: the task does not have the symmetry that the settings ask for.
     """
     fields: dict[str, Any] = {"hidden": hidden, "linear": linear, "squash": "tanh" if linear else "clip"}
-    fields["history"] = history
+    fields |= {"history": history, "informed": informed}
     frame, missing = None, ""
     symmetry = "none" if named_robot(robot).wheels is not None else symmetry
     if symmetry == "odd":
@@ -68,18 +69,22 @@ def spec_for(
 
 def retargeted(start: PolicySpec, mine: PolicySpec) -> PolicySpec:
     """The shape of a policy to start from, perhaps of another robot and its episodes, for the task and robot of `mine`."""
-    return replace(start, task=mine.task, robot=mine.robot, history=mine.history)
+    return replace(
+        start, task=mine.task, robot=mine.robot, history=mine.history, informed=start.informed or mine.informed
+    )
 
 
 def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
-    """A policy to start from, with the history of `mine`: it sees more of the past, and at first makes nothing of it.
+    """A policy to start from, with the history of `mine`: what it sees or is told more it makes nothing of at first.
 
     Raises:
-        ValueError: it sees a longer past than `mine`, or commands another number of motors.
+        ValueError: it sees a longer past than `mine`, or is told more, or commands another number of motors.
     """
     spec = retargeted(network.spec, mine)
     if network.spec.history > mine.history:
         raise ValueError(f"the policy to start from sees {network.spec.history} earlier observations; give --history")
+    if spec.informed != mine.informed:
+        raise ValueError("the policy to start from is told the robot; give --informed")
     if (spec.actions, spec.observations) != (network.spec.actions, network.spec.observations):
         raise ValueError(f"a policy of {network.spec.robot} cannot start one of {mine.robot}, which has other motors")
     made = PolicyNetwork(spec)

@@ -51,13 +51,14 @@ from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.randomization import Randomization, checked_randomization
-from ballbot_gym.robots import PAPER, named_robot
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bar
 from ballbot_train.evaluation import evaluate, fresh
+from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.learning import VALIDATION_EPISODES
-from ballbot_train.policy import PolicyController, PolicyNetwork, load_network, save_policy
+from ballbot_train.policy import PolicyNetwork, load_network, save_policy
 from ballbot_train.provenance import provenance
 from ballbot_train.weights import own_defaults, saved_by_torch
 
@@ -339,7 +340,7 @@ class _Run:
         """Measures the best policy on the first certified episodes in PyBullet, and adds the result to its JSON file."""
         network = load_network(self.out / "policy", self.task, self.robot)
         env = BallbotEnv(self.task, robot=self.robot, randomization=self.randomization)
-        controller = PolicyController(self.task, named_robot(self.robot), network)
+        controller = make_controller(str(self.out / "policy.json"), self.task, env.params)
         results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()
         row = evaluate.summarize(results)

@@ -79,6 +79,7 @@ class WholeEpisodes:
         seed: int = 0,
         randomization: Randomization | None = None,
         history: int = 0,
+        informed: bool = False,
     ):
         torch.manual_seed(seed)  # for the network's first weights
         self.config, self.iteration = config, 0
@@ -88,7 +89,9 @@ class WholeEpisodes:
         self._wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
         self._batch = BallbotBatch(self.task, config.num_envs, compile=self._wheels and long, params=params, **world)
         self._batch.reset(seed=spawned(seed))
-        network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
+        network = PolicyNetwork(
+            spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params), informed)
+        )
         start_as_lqr(network, task, params)
         self._make(network)
 
@@ -176,7 +179,7 @@ class WholeEpisodes:
     def _one_step(self, state: BatchState) -> _Step:
         """One control step of every episode; compiled."""
         config, task = self.config, self.task
-        new, result = self._batch.transition(state, self._trained(self._batch.observe(state)))
+        new, result = self._batch.transition(state, self._trained.knowing(self._batch.observe(state), state.drawn))
         before, force = state.x.unbind(0), result.force.unbind(0)
         x, time = result.final_x.unbind(0), state.steps * task.control_dt
         cost = task.cost(before, force, task.at(state.c.unbind(0), time)) * task.control_dt

@@ -72,6 +72,7 @@ class Algorithm:
         start: "PolicyNetwork | None" = None,
         randomization: "Randomization | None" = None,
         history: int = 0,
+        informed: bool = False,
     ) -> "Learner":
         """Makes the learner.
 
@@ -84,6 +85,7 @@ class Algorithm:
             start: a policy to train on from, or None; it may be of another robot.
             randomization: what varies in training, for dagger, ppo and shac.
             history: how many earlier observations and actions the policy sees, for dagger, ppo and shac.
+            informed: whether the policy is told each robot, for shac with horizon 0.
 
         Returns:
             The learner before its first iteration.
@@ -106,6 +108,10 @@ class Algorithm:
             if self.name == "sac":
                 raise ValueError("sac knows no randomization and no history; train dagger, ppo or shac")
             given |= {"randomization": randomization, "history": history}
+        if informed:
+            if self.name != "shac" or settings.horizon or randomization is None or not randomization.varies_robot:
+                raise ValueError("only shac with --horizon 0 trains informed policies, with --randomization unknown")
+            given["informed"] = True
         with load("ballbot_train.weights:own_defaults")():
             return load(f"{self.module}:make")(task, params, settings, seed, **given)
 
