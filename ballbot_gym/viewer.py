@@ -6,7 +6,6 @@ render_mode="human" shows itself here.
 
 import contextlib
 import io
-import json
 import logging
 import math
 import socket
@@ -39,41 +38,6 @@ _FOLLOW = 0.15  # share of the distance by which the camera follows in each draw
 _JUMP = 4.0  # m, of a distance that it follows at once
 _LABEL_HEIGHT = 0.16  # m, between the labels of robots that are in one place
 _GRAB_REACH = 3.0  # m, the farthest that a drag counts
-
-# viser's page connects again only where it has the focus: it asks for the focus whenever it has no connection. It also begins
-# another attempt every second. After some failures Chromium delays attempts by more than that, so that none lasts.
-# Here the page waits until the server answers, and then has viser begin one attempt, by a moment of focus.
-#
-# On a phone viser covers the scene with its controls until somebody folds them.
-_CONNECT_AGAIN = """
-if (window.connectsAgain) return;
-window.connectsAgain = true;
-const narrow = "(max-width: 36em)";
-const folding = setInterval(() => {
-  const heads = [...document.querySelectorAll("div")].filter((e) => !e.children.length && e.textContent === LABEL);
-  if (heads.length || !matchMedia(narrow).matches) clearInterval(folding);
-  if (matchMedia(narrow).matches) heads.at(-1)?.click();
-}, 100);
-let focus = false, busy = false;
-async function connectAgain() {
-  busy = true;
-  for (let answered = false; !answered; ) {
-    await new Promise((resolve) => setTimeout(resolve, 1000));
-    const request = new AbortController();
-    const asked = fetch(location.href, {cache: "no-store", signal: request.signal});
-    const status = await asked.then((answer) => answer.status, () => 0);
-    request.abort();
-    if (status === 401) location.reload();  // another token is needed, and the answer says so
-    answered = status === 200;
-  }
-  for (focus of [true, false]) window.dispatchEvent(new Event(focus ? "focus" : "blur"));
-  busy = false;
-}
-document.hasFocus = () => {
-  if (!busy) connectAgain();
-  return focus;
-};
-"""
 
 Grab = Callable[[int, str, np.ndarray], None]
 """Gets the id of the client who drags the robot, "start", "update" or "end", and how far (2,) on the floor, m."""
@@ -118,8 +82,6 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()), guard(self._gate):
             self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
-        script = f"const LABEL = {json.dumps(label)};{_CONNECT_AGAIN}"
-        self.server.gui._websock_interface.queue_message(viser._messages.RunJavascriptMessage(source=script))
         self.on_grab: Grab | None = None
         self._host = host
         self._nodes: dict[str, list[Any]] = {}

@@ -101,3 +101,14 @@ def test_maps_are_written_and_drawn(bounds, tmp_path):
     ]
     assert len((tmp_path / "basins.csv").read_text().splitlines()) == 1 + 2 * 25
     assert figures.save(figures.basin_figure(maps), tmp_path / "basins.png").exists()
+
+
+def test_the_command_maps_what_is_recoverable(tmp_path, typed, monkeypatch):
+    monkeypatch.setattr("ballbot_baselines.recovery.largest_leans", lambda *problem: np.full(31, math.radians(40)))
+    ended, printed = typed("basins", "--controllers", "lqr", "--points", 3, "--physics", "rk4", "--workers", 1)
+    assert (ended, "Share of the recoverable states, 3 × 3 a map" in printed) == (0, True), printed
+    assert {path.name for path in (tmp_path / "runs" / "basins").iterdir()} == {
+        "basins.csv",
+        "basins.json",
+        "basins.png",
+    }

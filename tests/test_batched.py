@@ -16,7 +16,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.orbit import Orbit
 from ballbot_gym.tasks.stabilize import Stabilize
 
-COUNT = 12
+COUNT, ALONE = 12, 6  # drawn episodes, and how many of them are searched one by one too
 NO_CONSTANTS = np.zeros(0)
 FALLEN = np.array([0, 0, 1.3, 0, 0, 0, 5.0, 0])
 
@@ -36,7 +36,7 @@ TASK_KINDS = (*TASKS.values(), Eight)
 
 @dataclass(frozen=True)
 class Drawn:
-    """Fresh episodes of a task, with their optima found at once and one by one."""
+    """Fresh episodes of a task, with their optima found at once, and the costs of the first ones that are found alone."""
 
     task: object
     c: np.ndarray
@@ -48,7 +48,7 @@ class Drawn:
 def drawn(request, params):
     task, rng = request.param(), np.random.default_rng(3)
     x0, c = (np.array(part) for part in zip(*(task.sample(rng, params) for _ in range(COUNT)), strict=True))
-    found = [find_optimum(task, params, x, constants) for x, constants in zip(x0, c, strict=True)]
+    found = [find_optimum(task, params, *problem) for problem in zip(x0[:ALONE], c, strict=False)]
     costs = np.array([optimum.cost if optimum.is_optimal else math.nan for optimum in found])
     return Drawn(task, c, batched.find_optima(task, params, x0, c), costs)
 
@@ -78,7 +78,8 @@ def tracking(optima, i):
 
 def test_they_cost_what_optima_one_by_one_cost_or_less(drawn):
     assert drawn.optima.solved.mean() > 0.95
-    excess = (drawn.optima.costs / drawn.costs - 1)[drawn.optima.solved & np.isfinite(drawn.costs)]
+    both = drawn.optima.solved[:ALONE] & np.isfinite(drawn.costs)
+    excess = (drawn.optima.costs[:ALONE] / drawn.costs - 1)[both]
     assert (excess < 1e-4).mean() > 0.9  # the others are other local optima
     assert excess.max() < 0.1
 
@@ -86,8 +87,8 @@ def test_they_cost_what_optima_one_by_one_cost_or_less(drawn):
 @pytest.mark.parametrize("name", TASKS)
 def test_no_certified_optimum_costs_more(name, params):
     known, task = certified.load(name, "paper"), TASKS[name]()
-    found = batched.find_optima(task, params, known.states, known.constants)
-    assert (found.costs[found.solved] > known.costs[found.solved] * (1 - 1e-4)).all()
+    found = batched.find_optima(task, params, known.states[::2], known.constants[::2])
+    assert (found.costs[found.solved] > known.costs[::2][found.solved] * (1 - 1e-4)).all()
 
 
 @pytest.mark.parametrize(("name", "episode"), [("stabilize", 79), ("turn", 37)])

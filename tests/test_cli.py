@@ -79,7 +79,10 @@ def test_the_commands_that_continue_are_those_that_do_much_work():
 @pytest.mark.parametrize(
     ("arguments", "how"),
     [
-        (("basins", "--controllers", "lqr", "--points", 3, "--workers", 1, "--out", "a folder"), "continues"),
+        (
+            ("robustness", "--tasks", "turn", "--stresses", "delay", "--controllers", "lqr", "--episodes", 1),
+            "continues",
+        ),
         (("optimize", "stabilize", "--duration", 1), "starts again"),
     ],
 )

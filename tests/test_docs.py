@@ -12,13 +12,15 @@ from pathlib import Path
 import pytest
 from builders import measured
 
-from ballbot_gym import BallbotEnv, named_robot
+from ballbot_gym import BallbotEnv, files, named_robot
 from ballbot_gym.tasks import TASKS
+from ballbot_train.evaluation import fresh
 from ballbot_train.evaluation.submissions import read_entries
 from ballbot_train.executors import Workers
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import model_free
 from ballbot_train.policy_files import SHIPPED
+from ballbot_train.report import figures
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -63,11 +65,14 @@ def test_the_task_that_is_added_can_be_certified(interpreted):
 
 @pytest.mark.parametrize("page", pages_with("sh").values(), ids=pages_with("sh"))
 def test_commands_run(page, typed, monkeypatch):
+    real = fresh.evaluate_fresh
     monkeypatch.setattr(Workers, "here", 1)  # and so in this process; other tests start workers
     monkeypatch.setattr(training, "score_and_validate", lambda *policy: MEASURED_AS)
     monkeypatch.setattr(model_free, "_CLONE_ITERATIONS", 1)
     monkeypatch.setattr("ballbot_train.commands.benchmark.playground_page", lambda: "")  # a second per report
     monkeypatch.setattr("ballbot_train.commands.benchmark.checked_episodes", lambda episodes: 2)
+    monkeypatch.setattr(figures, "save", lambda figure, path: files.write(path, b"a figure"))  # half a second each
+    monkeypatch.setattr(fresh, "evaluate_fresh", lambda policy, task, count, *more: real(policy, task, 20, *more))
     makefile = (ROOT / "Makefile").read_text()
     for line in "\n".join(blocks(page, "sh")).splitlines():
         command = shlex.split(line, comments=True)

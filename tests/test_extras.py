@@ -27,7 +27,7 @@ MISSING = [  # in an order in which nothing imports what is missing later
     ),
     ("from ballbot_train.commands.play import play; play('turn', controller='lqr')", "viser", "play"),
     (
-        "from ballbot_train.executors import Workers, open_pool; open_pool(Workers(ray='local')).__enter__()",
+        "from ballbot_train.executors import Workers, completed; list(completed([(0, int, ())], Workers(ray='local')))",
         *("ray", "ray"),
     ),
     ("import ballbot_train.rllib", "ray", "rllib"),

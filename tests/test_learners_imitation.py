@@ -98,6 +98,7 @@ def test_dagger_labels_what_it_meets(name, monkeypatch):
         "batch_size",
         "hidden",
         "max_guesses",
+        "backoff",
     )
     config = replace(LEARNERS["dagger"].settings(name), **{field: getattr(TINY_DAGGER, field) for field in settings})
     learner = dagger.Dagger(task, default_params(), config)
@@ -174,9 +175,9 @@ def test_dagger_falls_far_less_than_lqr_after_two_rounds():
         "hidden": (64,),
     }
     learner = dagger.Dagger(task, params, replace(dagger.DaggerConfig(), **small))
-    before = training.score_and_validate(learner.network, task)
+    before = training.score_and_validate(learner.network, task, episodes=1)
     for _ in range(small["iterations"]):
         learner.iterate()
-    after = training.score_and_validate(learner.network, task)
+    after = training.score_and_validate(learner.network, task, episodes=1)
     for name in ("certified/failures", "certified/cost_ratio"):
         assert after[name] < 0.6 * before[name]

@@ -79,37 +79,29 @@ def test_frame_routes_mirrors_and_oddness_are_inside_the_graph(task, fields, tmp
         )
 
 
-def test_the_file_says_what_it_takes_and_gives(tmp_path, capsys, monkeypatch):
+def test_the_file_says_what_it_takes_and_gives_and_names_its_robot(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    export("dagger", task="turn")
-    assert "runs/export/turn-dagger.onnx" in capsys.readouterr().out
-    path = tmp_path / "runs" / "export" / "turn-dagger.onnx"
+    task = make_task("turn", "kugle")
+    policy = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))), {})
+    with pytest.raises(ValueError, match="was made for the robot kugle; give --robot kugle"):
+        export(str(policy))
+    with pytest.raises(ValueError, match="was trained on"):
+        export(str(policy), task="turn")
+    export(str(policy), robot="kugle")
+    assert "runs/export/turn-kugle-mine.onnx" in capsys.readouterr().out
+    path = tmp_path / "runs" / "export" / "turn-kugle-mine.onnx"
     runtime = session(path)
     (takes,), (gives,) = runtime.get_inputs(), runtime.get_outputs()
     assert (takes.name, takes.type, takes.shape[1]) == ("observation", "tensor(float)", 9)
     assert (gives.name, gives.type, gives.shape[1]) == ("action", "tensor(float)", 2)
     about = runtime.get_modelmeta().custom_metadata_map
-    assert about["task"] == "BallbotTurn-v0"
-    assert about["force_limit_newton"] == "350.0"
+    assert (about["task"], about["robot"]) == ("BallbotTurn-v0", "kugle")
+    assert float(about["force_limit_newton"]) == pytest.approx(48.5, abs=0.1)
     assert about["control_dt_seconds"] == "0.02"
-    assert json.loads(about["observation_scale"]) == list(make_task("turn").observation_scale)
+    assert json.loads(about["observation_scale"]) == list(task.observation_scale)
     assert "| 8 | speed v | 5 | m/s |" in about["observation"]
     assert str(tmp_path).encode() not in path.read_bytes()
     assert b"policy.py" not in path.read_bytes()  # of the machine that wrote it
     model = onnx.load(path)
     assert model.ir_version <= 7  # onnxruntime 1.16 reads up to 9
     assert max(each.version for each in model.opset_import) <= 14  # and up to 19
-
-
-def test_the_file_of_another_robot_names_it_and_its_force_limit(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    task = make_task("turn", "kugle")
-    policy = save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(task, robot="kugle", hidden=(4,))), {})
-    with pytest.raises(ValueError, match="was made for the robot kugle; give --robot kugle"):
-        export(str(policy))
-    export(str(policy), robot="kugle")
-    about = session(tmp_path / "runs" / "export" / "turn-kugle-mine.onnx").get_modelmeta().custom_metadata_map
-    assert about["robot"] == "kugle"
-    assert float(about["force_limit_newton"]) == pytest.approx(48.5, abs=0.1)
-    with pytest.raises(ValueError, match="was trained on"):
-        export(str(policy), task="turn")

@@ -77,7 +77,7 @@ def test_the_optimum_costs_what_is_certified(play):
     assert 0 < early < playground.optimum_cost_so_far < playground.optimum_cost
 
 
-def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shipped_policy(play):
+def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shipped_policy(play, no_optimum):
     playground = play(controller=None, ghosts=["lqr"], episode="rest")
     assert playground.main.name == BEST["stabilize"]
     for _ in range(2):  # once more after a restart
@@ -92,7 +92,7 @@ def test_an_episode_at_rest_begins_with_a_push_that_fells_lqr_and_not_the_shippe
 
 
 @pytest.mark.parametrize("physics", ["rk4", "bullet"])
-def test_a_push_is_an_impulse_on_the_centre_of_mass(play, params, physics):
+def test_a_push_is_an_impulse_on_the_centre_of_mass(play, no_optimum, params, physics):
     if physics == "bullet":
         pytest.importorskip("pybullet")
     playground = play(episode="rest", controller="lqr", physics=physics)
@@ -204,7 +204,7 @@ def test_another_task_or_robot_keeps_the_controllers_that_it_has(play, no_optimu
     )
 
 
-def test_no_push_harms(play):
+def test_no_push_harms(play, no_optimum):
     playground = play()
     for push in ((math.nan, 0.0), (math.inf, 1.0), (1e300, 1e300), (-1e9, 0.0), (0.0, 0.0)):
         playground.restart()
@@ -342,7 +342,7 @@ def test_a_job_of_another_process_does_not_hold_up_the_end():
     assert job.done()
 
 
-def test_every_episode_of_a_track_has_a_robot_of_its_own(play):
+def test_every_episode_of_a_track_has_a_robot_of_its_own(play, no_optimum):
     playground = play("turn", episode=0, randomization="unknown")
     masses = []
     for episode in range(3):

@@ -80,7 +80,7 @@ def test_policy_of_a_track_is_what_its_file_says(name, learner, track):
     described = read_description(path)
     assert described["training"]["randomization"] == track
     assert learner not in shipped_policies(make_task(name))
-    row = evaluate(learner, name, 10, "rk4", randomization=track)
+    row = evaluate(learner, name, 4, "rk4", randomization=track)
     assert row.success >= described["measured"]["success"] - 0.3
     most = 95_000 if name == "weave" else 50_000  # as Weave's policies of the known robot
     assert sum(part.numel() for part in load_network(path, make_task(name)).parameters()) <= most
@@ -116,7 +116,7 @@ def test_fresh_episodes_of_a_track_draw_robots_and_say_what_each_costs():
     [("stabilize", "noisy", "shac", "shac-ekf"), ("turn", "late", "shac", "shac-adaptive")],
 )
 def test_a_policy_behind_a_filter_succeeds_on_a_track_that_it_never_saw(task, track, policy, filtered):
-    alone, behind = (evaluate(name, task, 12, "rk4", randomization=track) for name in (policy, filtered))
+    alone, behind = (evaluate(name, task, 6, "rk4", randomization=track) for name in (policy, filtered))
     assert alone.success < behind.success
     assert behind.success > 0.9
     assert controllers_of([task], [filtered]) == {task: [filtered]}

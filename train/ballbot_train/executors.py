@@ -1,37 +1,40 @@
 """Where work is done: in this process, in processes of this machine, or on the nodes of a Ray cluster.
 
-Each of the three has the `submit` of `concurrent.futures`. A task gets its arguments and nothing else, so a worker needs no
-file of this machine. Jobs of `jobs` and trials of `learning.tuning` are tasks.
+A task gets its arguments and nothing else, so a worker needs no file of this machine. Jobs of `jobs`, trials of
+`learning.tuning` and missing optima are tasks.
 """
 
+import itertools
 import os
 import pickle
 import shutil
 import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
+from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Thread
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
 from ballbot_gym import registry
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import Robot
 from ballbot_train.console import console
 
-NODE_SECONDS = 5.0
-"""How often the nodes of a cluster are counted."""
+_NODE_SECONDS = 5.0  # between two counts of the nodes of a cluster
 _RETRIES = 5  # of a task on a cluster whose worker or node dies
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
 _PER_CORE = 2  # tasks in flight for every core of a cluster, so that no core waits for its next one
+
+
+Key = TypeVar("Key")
 
 
 class WorkerError(RuntimeError):
@@ -71,16 +74,40 @@ class Workers:
         return (self.workers or os.cpu_count() or 1) if self.ray is None else 0
 
 
-class Pool(Protocol):
-    """Runs tasks. Of its futures `result_of` gives the results."""
+Task = tuple[Key, Callable[..., Any], tuple[Any, ...]]
+"""What tells a task from others, and a function of a module with its arguments."""
 
-    def most(self) -> int:
-        """How many tasks to have in flight at most. Who submits no more keeps few in memory."""
-        ...
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
-        """Calls a function of a module on a worker."""
-        ...
+def completed(tasks: Iterable[Task[Key]], workers: int | Workers, serial: bool = False) -> Iterator[tuple[Key, Any]]:
+    """Does tasks on workers, and gives the result of each when it is there, with the task's key.
+
+    Args:
+        tasks: what there is to do. They are taken when workers have room for them, so that few are in memory.
+        workers: a number of processes of this machine, or `Workers`. Where there is nothing to do, none starts. With
+            $BALLBOT_IN_PROCESS set, 1 process is this one, for debuggers and tests.
+        serial: 1 process is this one in any case.
+
+    Raises:
+        WorkerError: a worker died, or there is no cluster.
+        Exception: what a task raised, once the results are given that came with it.
+    """
+    workers, tasks = Workers.of(workers), iter(tasks)
+    if workers.here == 1 and (serial or os.environ.get("BALLBOT_IN_PROCESS")):
+        for key, function, arguments in tasks:
+            yield key, function(*arguments)
+        return
+    if (first := next(tasks, None)) is None:
+        return
+    tasks, running = itertools.chain([first], tasks), dict[Future, Key]()
+    with _local(workers) if workers.ray is None else _cluster(workers) as pool:
+        while True:
+            for key, function, arguments in itertools.islice(tasks, max(0, pool.most() - len(running))):
+                running[pool.submit(function, *arguments)] = key
+            if not running:
+                return
+            ended = wait(running, _NODE_SECONDS, FIRST_COMPLETED).done
+            for future in sorted(ended, key=lambda future: future.exception() is not None):
+                yield running.pop(future), result_of(future)
 
 
 def result_of(future: Future) -> Any:
@@ -115,38 +142,14 @@ def _attempt(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[
 
 
 @contextmanager
-def open_pool(workers: int | Workers, serial: bool = False) -> Iterator[Pool]:
-    """The pool of some workers. At the end of the block whatever still runs is stopped.
-
-    Args:
-        workers: a number of processes of this machine, or `Workers`.
-        serial: do everything in this process.
-    """
-    workers = Workers.of(workers)
-    if serial:
-        yield _Serial()
-    elif workers.ray is None:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
-        pool = Processes(workers.here)
-        try:
-            yield pool
-        finally:
-            end_processes(pool)
-    else:
-        with _cluster(workers) as pool:
-            yield pool
-
-
-class _Serial:
-    """The calling process, which does a task when it is submitted."""
-
-    def most(self) -> int:
-        return 1
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
-        future: Future = Future()
-        future.set_result(_attempt(function, arguments))
-        return future
+def _local(workers: Workers) -> Iterator["Processes"]:
+    """Processes of this machine. At the end of the block whatever still runs is stopped."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
+    pool = Processes(workers.here)
+    try:
+        yield pool
+    finally:
+        end_processes(pool)
 
 
 class Processes(ProcessPoolExecutor):
@@ -161,6 +164,7 @@ class Processes(ProcessPoolExecutor):
         self._count = count
 
     def most(self) -> int:
+        """How many tasks to have in flight at most."""
         return self._count
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
@@ -184,12 +188,12 @@ def _end_with_the_run() -> None:
     """Ends this worker as soon as the run is killed. Else it would finish its task, which can take minutes, for nobody."""
     run = parent_process()
     if run is not None:
-        wait([run.sentinel])
+        wait_for([run.sentinel])
         os._exit(1)
 
 
 @contextmanager
-def _cluster(workers: Workers) -> Iterator[Pool]:
+def _cluster(workers: Workers) -> Iterator["_Ray"]:
     """A pool of tasks on a Ray cluster. Connects to the cluster, unless this process is connected to one already.
 
     Raises:
@@ -262,7 +266,7 @@ class _Ray:
 
     def most(self) -> int:
         """Counts nodes and cores now and then, and says when they change."""
-        if time.monotonic() - self._counted > NODE_SECONDS:
+        if time.monotonic() - self._counted > _NODE_SECONDS:
             self._counted = time.monotonic()
             nodes = [node for node in self._ray.nodes() if node["Alive"]]
             self._cores = int(sum(node["Resources"].get("CPU", 0) for node in nodes))

@@ -6,10 +6,8 @@ jobs that have no file. A folder belongs to one configuration until it is releas
 """
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +15,7 @@ from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
-from ballbot_train.executors import NODE_SECONDS, Pool, Workers, open_pool, result_of
+from ballbot_train.executors import Workers, completed
 
 try:
     import filelock
@@ -211,7 +209,7 @@ def stream(
         jobs: what there is to do. They are taken when workers have room for them.
         out: folder of the results; unfinished ones are in a folder within.
         workers: a number of processes, or `Workers`. The calling process does no job itself, so that it outlives any of
-            them; but with 1 process and $BALLBOT_IN_PROCESS set, it does them all, for debuggers and tests.
+            them; see `completed`.
         on_progress: called with a job's group and a number of its items that are there.
 
     Yields:
@@ -221,34 +219,28 @@ def stream(
         WorkerError: a worker died.
         ValueError: another process is using the folder, or there are no workers.
     """
-    workers = Workers.of(workers)
-    serial = workers.here == 1 and bool(os.environ.get("BALLBOT_IN_PROCESS"))
-    waiting, running = enumerate(jobs), dict[Future, tuple[int, Job]]()
+    kept: list[tuple[int, list[Entry]]] = []  # that were finished before, and are still to be given
+
+    def tasks() -> Iterator[Any]:
+        for number, job in enumerate(jobs):
+            if (done := _read(_path_of(out, job.name), len(job.items))) is None:
+                yield (number, job), _result, (job,)
+            else:
+                on_progress(job.group, len(job.items))
+                kept.append((number, done))
+
     with _locked(out), ExitStack() as stack:
         stack.push(lambda error, *_: release(out) if error and out.resolve() in _new else None)
         unfinished(out).mkdir(parents=True, exist_ok=True)
-        pool: Pool | None = None  # a cluster takes seconds to start, and there may be nothing to do
-        while True:
-            while pool is None or len(running) < pool.most():
-                if (following := next(waiting, None)) is None:
-                    break
-                number, job = following
-                if (done := _read(_path_of(out, job.name), len(job.items))) is not None:
-                    on_progress(job.group, len(job.items))
-                    yield number, done
-                    continue
-                pool = pool or stack.enter_context(open_pool(workers, serial))
-                running[pool.submit(_result, job)] = following
-            if not running:
-                return
-            ended = wait(running, NODE_SECONDS, FIRST_COMPLETED).done
-            for future in sorted(ended, key=lambda future: future.exception() is not None):
-                number, job = running.pop(future)
-                text = result_of(future)
-                files.write(_path_of(out, job.name), text)
-                _new.discard(out.resolve())
-                on_progress(job.group, len(job.items))
-                yield number, json.loads(text)
+        for (number, job), text in completed(tasks(), workers):
+            files.write(_path_of(out, job.name), text)
+            _new.discard(out.resolve())
+            on_progress(job.group, len(job.items))
+            while kept:
+                yield kept.pop()
+            yield number, json.loads(text)
+        while kept:
+            yield kept.pop()
 
 
 def _result(job: Job) -> str:

@@ -6,7 +6,6 @@ Importing this module is light: CasADi is imported when an optimum is computed.
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs
 from ballbot_train.console import console, progress_bars
-from ballbot_train.executors import Workers
+from ballbot_train.executors import Workers, completed
 
 try:
     import filelock
@@ -30,7 +29,7 @@ except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
 
-_JOBS = 32  # at least, so that many workers have something to do
+_TASKS = 32  # at least, so that many workers have something to do
 _Solver = Callable[[Task, Sequence[int]], Iterator[jobs.Entry]]
 
 
@@ -107,9 +106,10 @@ def compute(
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as advance:
-            solve = _solver(params, randomization)
-            some = solve if workers is None else partial(_elsewhere, folder, workers, solve)
-            for entry in some(task, missing):
+            from ballbot_baselines.certification import entries
+
+            solve = partial(entries, robot=params, randomization=randomization)
+            for entry in solve(task, missing) if workers is None else _elsewhere(workers, solve, task, missing):
                 advance(name, 1)
                 if "error" in entry:
                     failures.append(f"episode {entry['episode']}: {entry['error']}")
@@ -156,22 +156,15 @@ def _missing(task: Task, params: BallbotParams, episodes: list[int], randomizati
     return [index for index in episodes if index not in found]
 
 
-def _elsewhere(
-    folder: Path, workers: int | Workers, solve: _Solver, task: Task, missing: list[int]
-) -> Iterator[jobs.Entry]:
-    """In other processes, in the order in which they finish. Any episode may be missing, so the first of a job names it."""
+def _elsewhere(workers: int | Workers, solve: _Solver, task: Task, missing: list[int]) -> Iterator[jobs.Entry]:
+    """In other processes, in the order in which they finish."""
     from ballbot_baselines.certification import AT_ONCE
 
-    each = min(AT_ONCE, -(-len(missing) // _JOBS))
-    parts = [tuple(missing[k : k + each]) for k in range(0, len(missing), each)]
-    work = [jobs.Job(f"{part[0]:06d}-{len(part)}", solve, (task,), part) for part in parts]
-    for number, entries in jobs.stream(work, folder, workers, lambda *_: None):
+    each = min(AT_ONCE, -(-len(missing) // _TASKS))
+    parts = (missing[k : k + each] for k in range(0, len(missing), each))
+    for _, entries in completed(((None, _solved, (solve, task, part)) for part in parts), workers):
         yield from entries
-        jobs.forget(folder, work[number].name)
-    jobs.release(folder)
 
 
-def _solver(params: BallbotParams, randomization: Randomization) -> _Solver:
-    from ballbot_baselines.certification import entries
-
-    return partial(entries, robot=params, randomization=randomization)
+def _solved(solve: _Solver, task: Task, part: list[int]) -> list[jobs.Entry]:
+    return list(solve(task, part))

@@ -28,7 +28,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,8 +39,8 @@ from ballbot_gym.env import make_task
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
-from ballbot_train import jobs
-from ballbot_train.executors import NODE_SECONDS, Pool, Workers, open_pool, result_of
+from ballbot_train import executors, jobs
+from ballbot_train.executors import Workers
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
 
@@ -136,12 +135,22 @@ def run(
     """
     if search.learner not in SPACES:
         raise ValueError(f"there is no search space for {search.learner}; there is one for {', '.join(SPACES)}")
-    workers = Workers.of(workers)
+    workers = Workers.of(workers)  # refused before anything is written
     jobs.claim(out, asdict(search), "config.json")
     try:
         study = open_study(search, out)
-        with open_pool(workers, serial=workers.here == 1) as pool:
-            _search(study, search, trials, out, pool, on_trial)
+        on_trial(begun := len(_ended(study)))
+
+        def tasks() -> Iterator[Any]:
+            for _ in range(begun, trials):
+                trial = study.ask(SPACES[search.learner])
+                completed = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
+                yield trial, _attempt, (search, settings_of(search, trial.params), completed)
+
+        for trial, reached in executors.completed(tasks(), workers, serial=True):
+            _end(study, trial, reached)
+            write_tables(study, search, out)
+            on_trial(len(_ended(study)))
         return write_tables(study, search, out)
     except (sqlalchemy.exc.DBAPIError, optuna.exceptions.StorageInternalError) as error:
         cause = error.__cause__ or error
@@ -190,25 +199,6 @@ def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
     settings = replace(LEARNERS[search.learner].settings(search.task), **decoded)
     iterations = max(1, round(search.env_steps / (settings.num_envs * settings.num_steps)))
     return replace(settings, evaluations=search.evaluations, iterations=iterations)
-
-
-def _search(
-    study: "optuna.Study", search: Search, trials: int, out: Path, pool: Pool, on_trial: Callable[[int], None]
-) -> None:
-    """Runs trials on the workers of a pool."""
-    running: dict[Future, optuna.Trial] = {}
-    while True:
-        ended = len(_ended(study))
-        on_trial(ended)
-        while ended + len(running) < trials and len(running) < pool.most():
-            trial = study.ask(SPACES[search.learner])
-            completed = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
-            running[pool.submit(_attempt, search, settings_of(search, trial.params), completed)] = trial
-        if not running:
-            return
-        for future in wait(running, NODE_SECONDS, FIRST_COMPLETED).done:
-            _end(study, running.pop(future), result_of(future))
-            write_tables(study, search, out)
 
 
 def _end(study: "optuna.Study", trial: "optuna.Trial", reached: dict[str, Any]) -> None:

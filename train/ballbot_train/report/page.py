@@ -41,7 +41,7 @@ def write_report(
         path: of the file.
         title: heading of the page.
         header: names of the table's columns.
-        rows: of the table, which the reader can sort by any column, and filter by the words of its first column.
+        rows: of the table, which the reader can sort by any column.
         replays: episodes in 3D, one scene for each take, with play, pause and scrubbing.
         playground: a page that is shown within this one.
         pictures: PNGs by the title above them, captioned with their names.

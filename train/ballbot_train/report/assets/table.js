@@ -1,4 +1,4 @@
-// Tables whose columns sort when their heads are pressed, and whose first column filters.
+// Tables whose columns sort when their heads are pressed.
 "use strict";
 
 function cellValue(row, column) {
@@ -23,41 +23,13 @@ function sortTable(table, column, descending) {
   }
 }
 
-function addFilter(table) {
-  const rows = [...table.tBodies[0].rows];
-  const values = [...new Set(rows.map((row) => row.cells[0].textContent))];
-  if (values.length < 2 || values.length === rows.length) return;
-  const bar = document.createElement("div");
-  bar.className = "filter";
-  for (const value of ["all", ...values]) {
-    const chip = document.createElement("button");
-    chip.className = "chip";
-    chip.textContent = value;
-    chip.setAttribute("aria-pressed", value === "all");
-    chip.onclick = () => {
-      for (const row of rows) row.hidden = value !== "all" && row.cells[0].textContent !== value;
-      for (const other of bar.children) other.setAttribute("aria-pressed", other === chip);
-    };
-    bar.append(chip);
-  }
-  table.parentElement.before(bar);
-}
-
-function makeSortable(table) {
+// those of the report, and of the documentation's site
+for (const table of document.querySelectorAll("table.sortable, .md-typeset table")) {
   for (const [column, head] of [...table.tHead.rows[0].cells].entries()) {
-    let button = head.querySelector("button");
-    if (!button) {
-      button = document.createElement("button");
-      button.type = "button";
-      button.append(...head.childNodes);
-      head.append(button);
-    }
+    const button = document.createElement("button");
+    button.type = "button";
+    button.append(...head.childNodes);
+    head.append(button);
     button.onclick = () => sortTable(table, column, head.getAttribute("aria-sort") === "ascending");
   }
 }
-
-for (const table of document.querySelectorAll("table.sortable")) {
-  addFilter(table);
-  makeSortable(table);
-}
-for (const table of document.querySelectorAll(".md-typeset table")) makeSortable(table); // of the documentation's site
