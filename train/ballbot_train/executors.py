@@ -107,10 +107,10 @@ def completed(tasks: Iterable[Task[Key]], workers: int | Workers, serial: bool =
                 return
             ended = wait(running, _NODE_SECONDS, FIRST_COMPLETED).done
             for future in sorted(ended, key=lambda future: future.exception() is not None):
-                yield running.pop(future), result_of(future)
+                yield running.pop(future), _result_of(future)
 
 
-def result_of(future: Future) -> Any:
+def _result_of(future: Future) -> Any:
     """What the function of a task returned.
 
     Raises:
@@ -142,17 +142,19 @@ def _attempt(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[
 
 
 @contextmanager
-def _local(workers: Workers) -> Iterator["Processes"]:
+def _local(workers: Workers) -> Iterator["_Processes"]:
     """Processes of this machine. At the end of the block whatever still runs is stopped."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
-    pool = Processes(workers.here)
+    pool = _Processes(workers.here)
     try:
         yield pool
     finally:
-        end_processes(pool)
+        for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
 
 
-class Processes(ProcessPoolExecutor):
+class _Processes(ProcessPoolExecutor):
     """Processes of this machine, with what users registered in this one. They end with this one.
 
     One that dies ends the others' work too.
@@ -169,13 +171,6 @@ class Processes(ProcessPoolExecutor):
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         return super().submit(_attempt, function, arguments)
-
-
-def end_processes(pool: Processes) -> None:
-    """Ends processes at once, whatever they do."""
-    for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
-        process.terminate()
-    pool.shutdown(cancel_futures=True)
 
 
 def _prepare(modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
