@@ -4,10 +4,10 @@
 
 NMPC runs beside a ghost, is pushed every few seconds, and a page that somebody watches is drawn 30 times per second. Run it
 on a quiet machine. Controllers are made, and solvers compiled, before time counts. A thread plans the next episode every 8 s,
-and that counts. Beside it, a loop that does nothing but wait counts how often the machine itself is late. Memory grows from
-the first minute on, because traces are full by then. Exit status 1 says that the real-time factor is below 0.99, that more
-than 0.1 % of the steps began
-later than 20 ms after their time, or that memory grew by more than `--growth` MiB.
+and that counts. Beside it, a loop that does nothing but wait counts how often the machine itself is late. The growth of
+memory is counted from the first minute on, because traces are full by then. Exit status 1 says that the real-time factor is
+below 0.99, that more than 0.1 % of the steps began later than 20 ms after their time, or that memory grew by more than
+`--growth` MiB.
 """
 
 import math
@@ -17,7 +17,6 @@ import resource
 import sys
 import time
 from array import array
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path

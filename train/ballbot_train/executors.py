@@ -9,7 +9,6 @@ import os
 import pickle
 import shutil
 import signal
-import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -26,9 +25,8 @@ from typing import Any, TypeVar
 from ballbot_gym import registry
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import Robot
-from ballbot_train.console import console
 
-_NODE_SECONDS = 5.0  # between two counts of the nodes of a cluster
+_NODE_SECONDS = 5.0  # between two looks whether a cluster has more cores
 _RETRIES = 5  # of a task on a cluster whose worker or node dies
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
 _PER_CORE = 2  # tasks in flight for every core of a cluster, so that no core waits for its next one
@@ -257,19 +255,10 @@ class _Ray:
         # a name with a module, so that nodes import the function rather than unpickle it
         self._task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_on_node)
         self._running: set[Future] = set()
-        self._counted, self._cores, self._said = 0.0, 0, ""
 
     def most(self) -> int:
-        """Counts nodes and cores now and then, and says when they change."""
-        if time.monotonic() - self._counted > _NODE_SECONDS:
-            self._counted = time.monotonic()
-            nodes = [node for node in self._ray.nodes() if node["Alive"]]
-            self._cores = int(sum(node["Resources"].get("CPU", 0) for node in nodes))
-            said = f"Ray: {len(nodes)} nodes with {self._cores} cores"
-            if said != self._said:
-                console.print(said)
-            self._said = said
-        return self._workers or max(1, _PER_CORE * self._cores)
+        """How many tasks to have in flight at most; nodes come and go."""
+        return self._workers or max(1, _PER_CORE * int(self._ray.cluster_resources().get("CPU", 0)))
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         future = self._task.remote(function, arguments, *registry.registered()).future()
