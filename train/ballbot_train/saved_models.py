@@ -196,7 +196,7 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         raise PolicyError(f"{path} takes {size} observations, its statistics are of {len(normalization['mean'])}")
     widths = (size, *(len(bias) for _, bias in found))
     network = linear_layers(widths, getattr(torch.nn, _ACTIVATIONS[activation]), device="cpu", dtype=torch.float32)
-    for linear, (weight, bias) in zip(network[::2], found, strict=True):
+    for linear, (weight, bias) in zip(list(network)[::2], found, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
     return SavedActor(network, squashed, normalization).eval()
 
