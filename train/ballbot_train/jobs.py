@@ -136,11 +136,6 @@ def release(out: Path, marker: str = MARKER) -> None:
     unlock(out)
 
 
-def forget(out: Path, name: str) -> None:
-    """Deletes the result of a job, which is kept elsewhere now."""
-    _path_of(out, name).unlink(missing_ok=True)
-
-
 def unlock(out: Path) -> None:
     """Lets other processes use a folder; its configuration stays. Without effect where this process holds no lock."""
     lock = _held.pop(out.resolve(), None)
