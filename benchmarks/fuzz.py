@@ -180,8 +180,9 @@ def _results(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, .
 def _marker(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:
     from ballbot_train import jobs
 
-    jobs.claim(folder, {"episodes": 3, "policies": {"a": "b"}})
-    return [folder / jobs.MARKER], lambda: jobs.claim(folder, {"episodes": 3, "policies": {"a": "b"}}), (ValueError,)
+    config, name = {"episodes": 3, "policies": {"a": "b"}}, "config.json"
+    jobs.claim(folder, config, name)
+    return [folder / name], lambda: jobs.claim(folder, config, name), (ValueError,)
 
 
 def _entries(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...]]:

@@ -3,11 +3,11 @@
     python benchmarks/playground.py --minutes 10
 
 NMPC runs beside a ghost, is pushed every few seconds, and a page that somebody watches is drawn 30 times per second. Run it
-on a quiet machine. Controllers are made, and solvers compiled, before time counts. As in `ballbot play` another process plans
-the next episode every 8 s, and that counts. Beside it, a loop that does nothing but wait counts how often the machine itself
-is late. Memory is that of both processes of the playground. Its growth is counted from the first minute on, because traces
-are full by then. Exit status 1 says that the real-time factor is below 0.99, that more than 0.1 % of the steps began
-later than 20 ms after their time, or that memory grew by more than `--growth` MiB.
+on a quiet machine. Controllers are made, and solvers compiled, before time counts. A thread plans the next episode every 8 s,
+and that counts. Beside it, a loop that does nothing but wait counts how often the machine itself is late. The growth of
+memory is counted from the first minute on, because traces are full by then. Exit status 1 says that the real-time factor is
+below 0.99, that more than 0.1 % of the steps began later than 20 ms after their time, or that memory grew by more than
+`--growth` MiB.
 """
 
 import math
@@ -17,7 +17,6 @@ import resource
 import sys
 import time
 from array import array
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -73,11 +72,9 @@ class TimedClock(Clock):
         return late
 
 
-def memory(planners: Sequence[multiprocessing.process.BaseProcess]) -> float:
-    """Memory that the simulation and the processes that plan take now, MiB."""
-    processes = ("self", *(planner.pid for planner in planners))
-    pages = sum(int(Path(f"/proc/{process}/statm").read_text().split()[1]) for process in processes)
-    return pages * resource.getpagesize() / 2**20
+def memory() -> float:
+    """Memory that this process takes now, MiB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
 
 
 def watch(port: int) -> None:
@@ -119,8 +116,7 @@ def measure(
         growth: MiB that memory may grow after the first minute.
         out: folder of the tables.
     """
-    playground = Playground(task, controller, ghosts, physics, episode=0, other_process=True)
-    planners = multiprocessing.active_children()
+    playground = Playground(task, controller, ghosts, physics, episode=0)
     viewer = Viewer(port=0)
     page = PlayPage(playground, viewer)
     clock = page.clock = TimedClock(page.clock.dt)
@@ -136,16 +132,16 @@ def measure(
     )
     waiter.start()
     began, cpu = time.perf_counter(), time.process_time()
-    end, count, sizes = began + 60 * minutes, 0, [memory(planners)]
+    end, count, sizes = began + 60 * minutes, 0, [memory()]
     while (left := end - time.perf_counter()) > 0:
         page.run(min(_PUSH_EVERY, left))
         count += 1
         playground.push(_PUSH * math.cos(count), _PUSH * math.sin(count))
         if time.perf_counter() - began > _MINUTE * len(sizes):
-            sizes.append(memory(planners))
+            sizes.append(memory())
             steps = int(np.sum(np.array(clock.late) > _LATE))
             print(f"minute {len(sizes) - 1}: {sizes[-1]:.0f} MiB, {steps} late steps", flush=True)
-    sizes.append(memory(planners))
+    sizes.append(memory())
     seconds, late = time.perf_counter() - began, np.array(clock.late)
     here.send(None)
     waited: np.ndarray = here.recv()

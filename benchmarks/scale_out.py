@@ -32,10 +32,11 @@ from ray.cluster_utils import Cluster
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_train import jobs
+from ballbot_train import jobs, shards
 from ballbot_train.commands.certify import certify
+from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.benchmark import benchmark
-from ballbot_train.executors import Workers
+from ballbot_train.executors import Workers, completed
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
@@ -230,26 +231,28 @@ def _equal(a: np.ndarray, b: np.ndarray) -> bool:
 
 def _with_a_kill(
     made: Callable[..., dict[str, np.ndarray]], folder: Path, nodes: Cluster, episodes: int
-) -> tuple[dict[str, np.ndarray], dict[tuple[int, int], float], float]:
+) -> tuple[dict[str, np.ndarray], dict[tuple[str, int], float], float]:
     """What it makes, when every item was written, and the time that it took."""
-    written: dict[tuple[int, int], float] = {}
-    stream = jobs.stream
+    written: dict[tuple[str, int], float] = {}
 
-    def stream_and_kill(*arguments: Any) -> Iterator[tuple[int, list[jobs.Entry]]]:
-        for number, entries in stream(*arguments):
-            for i in range(len(entries)):
-                assert (number, i) not in written, "an item arrived twice"
-                written[number, i] = time.perf_counter()
+    def completed_and_kill(*arguments: Any) -> Iterator[tuple[Any, Any]]:
+        for key, result in completed(*arguments):
+            name, items = (key[1].name, key[1].items) if isinstance(key[-1], jobs.Job) else ("part", key)
+            for item in items:
+                assert (name, item) not in written, "an item arrived twice"
+                written[name, item] = time.perf_counter()
             if nodes.worker_nodes and len(written) >= episodes // 4:
                 nodes.remove_node(next(iter(nodes.worker_nodes)), allow_graceful=False)
-            yield number, entries
+            yield key, result
 
-    jobs.stream = stream_and_kill
-    began = time.perf_counter()
+    began, modules = time.perf_counter(), (jobs, shards, optima)
+    for module in modules:
+        module.completed = completed_and_kill
     try:
         found = made(folder / f"{made.__name__}-nodes", Workers(ray=nodes.address), episodes)
     finally:
-        jobs.stream = stream
+        for module in modules:
+            module.completed = completed
     return found, written, time.perf_counter() - began
 
 

@@ -20,31 +20,17 @@ from ballbot_train.commands.certify import certify
 
 def test_benchmark_prints_a_leaderboard_and_writes_table_figures_and_report(tmp_path, typed):
     arguments = ("--tasks", "stabilize", "--controllers", "lqr", "trajopt", "--episodes", 3, "--workers", 1)
-    ended, printed = typed("benchmark", *arguments, "--physics", "rk4")
+    ended, printed = typed("benchmark", *arguments, "--physics", "rk4", "--out", "runs/[red]x[/b]:smile:")
     assert ended == 0, printed
     assert "regret mean" in printed
-    out = tmp_path / "runs" / "benchmark"
+    assert "report: runs/[red]x[/b]:smile:/report.html" in printed  # as it is
+    out = tmp_path / "runs" / "[red]x[/b]:smile:"
     rows = {row["controller"]: row for row in json.loads((out / "leaderboard.json").read_text())["rows"]}
     assert rows["trajopt"]["falls"] == 0
     assert rows["trajopt"]["cost_mean"] < rows["lqr"]["cost_mean"]
     assert {path.name for path in (out / "figures").iterdir()} == {"regret.png", "stabilize.png"}
     assert "data:image/png;base64" in (out / "report.html").read_text()
     assert not (out / "unfinished").exists()  # it only serves an interrupted run
-
-
-def test_robustness_writes_tables_and_curves(tmp_path, typed):
-    arguments = ("--tasks", "turn", "--controllers", "lqr", "--episodes", 2, "--workers", 1)
-    ended, printed = typed("robustness", *arguments, "--stresses", "delay")
-    assert ended == 0, printed
-    assert "0 · 20 · 40 · 60" in printed
-    out = tmp_path / "runs" / "robustness"
-    assert {path.name for path in out.iterdir()} == {
-        "episodes.csv",
-        "figures",
-        "robustness.csv",
-        "robustness.json",
-        "robustness.md",
-    }
 
 
 def test_paper_writes_plans_and_figures(tmp_path, typed, interpreted):
@@ -76,17 +62,32 @@ def test_the_commands_that_continue_are_those_that_do_much_work():
     assert set(RESUMABLE) == long | {"train"}
 
 
+WRITTEN = {"episodes.csv", "figures", "robustness.csv", "robustness.json", "robustness.md"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "how"),
     [
         (
-            ("robustness", "--tasks", "turn", "--stresses", "delay", "--controllers", "lqr", "--episodes", 1),
+            (
+                "robustness",
+                "--tasks",
+                "turn",
+                "--stresses",
+                "delay",
+                "--controllers",
+                "lqr",
+                "--episodes",
+                1,
+                "--out",
+                "a run",
+            ),
             "continues",
         ),
         (("optimize", "stabilize", "--duration", 1), "starts again"),
     ],
 )
-def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, how, typed, monkeypatch):
+def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, how, tmp_path, typed, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
@@ -97,7 +98,11 @@ def test_an_interruption_is_answered_with_the_command_that_goes_on(arguments, ho
     assert (ended, how in printed) == (130, True), printed
     program, *words = shlex.split(printed.rpartition(": ")[2])
     assert (program, words) == ("ballbot", [str(word) for word in arguments])
-    assert typed(*words)[0] == 0
+    ended, printed = typed(*words)
+    assert ended == 0, printed
+    if how == "continues":
+        assert "0 · 20 · 40 · 60" in printed
+        assert {path.name for path in (tmp_path / "a run").iterdir()} == WRITTEN
 
 
 @pytest.mark.parametrize(
@@ -163,15 +168,6 @@ def test_only_the_command_that_is_called_is_imported():
 def test_what_is_no_command_is_answered_with_what_there_is(arguments, status, message, typed):
     ended, printed = typed(*arguments)
     assert (ended, message in printed) == (status, True), printed
-
-
-def test_paths_are_printed_as_they_are(tmp_path, typed):
-    runs = tmp_path / "runs"
-    arguments = ("benchmark", "--tasks", "stabilize", "--controllers", "lqr", "--episodes", 1, "--physics", "rk4")
-    ended, printed = typed(*arguments, "--workers", 1, "--out", "runs/[red]x[/b]:smile:")
-    assert ended == 0, printed
-    assert "report: runs/[red]x[/b]:smile:/report.html" in printed
-    assert (runs / "[red]x[/b]:smile:" / "leaderboard.csv").exists()
 
 
 def test_certify_resumes_and_makes_the_same_sets_as_before(tmp_path, monkeypatch):

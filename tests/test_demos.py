@@ -172,13 +172,13 @@ def test_killed_at_any_time_it_resumes_to_the_identical_dataset(tmp_path, typed)
     command = ["demos", "--expert", "lqr", "--physics", "rk4", "--episodes", "20"]
     killed, whole = tmp_path / "killed-v0", tmp_path / "whole-v0"
     assert typed(*command, "--workers", 1, "--out", whole)[0] == 0
-    done = tmp_path / ".killed-v0.unfinished" / "unfinished"
+    unfinished = tmp_path / ".killed-v0.unfinished"
     process = subprocess.Popen(
         [sys.executable, "-m", "ballbot_train.cli", *command, "--workers", "2", "--out", killed],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    while process.poll() is None and not any(done.glob("*.json")):
+    while process.poll() is None and not any(unfinished.rglob("*.npz")):
         time.sleep(0.01)
     time.sleep(random.uniform(0, 0.3))
     process.kill()
@@ -187,7 +187,7 @@ def test_killed_at_any_time_it_resumes_to_the_identical_dataset(tmp_path, typed)
     assert content(killed) == content(whole)
     seeds = [json.loads(str(m["seed"])) for m in _metadata(killed)]
     assert seeds == [1_000_000 + i for i in range(20)]
-    assert not done.parent.exists()
+    assert not unfinished.exists()
 
 
 def _metadata(folder):

@@ -144,13 +144,6 @@ def test_without_names_every_expert_and_shipped_policy_is_benchmarked():
         assert names == [*CONTROLLERS, *shipped_policies(make_task(task))]
 
 
-def test_a_policy_given_by_both_of_its_files_is_given_twice(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    save_policy(tmp_path / "mine", PolicyNetwork(PolicySpec.of(make_task("turn"), hidden=(8,))), {})
-    with pytest.raises(ValueError, match=r"controller ./mine.safetensors is given more than once"):
-        benchmark.controllers_of(["turn"], ["mine.json", "./mine.safetensors"])
-
-
 IMPORTS = [
     ("import ballbot_baselines", []),
     ("import ballbot_train.evaluation.benchmark, ballbot_train.evaluation.comparison", []),

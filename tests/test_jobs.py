@@ -85,15 +85,6 @@ def test_workers_end_with_a_run_that_is_killed(tmp_path):
     assert not any(map(lives, workers))
 
 
-def test_a_folder_belongs_to_one_run_until_it_is_released(tmp_path):
-    jobs.claim(tmp_path, {"episodes": 3, "policies": {}})
-    jobs.claim(tmp_path, {"episodes": 3, "policies": {}})
-    with pytest.raises(ValueError, match="unfinished run of episodes 3, not 4"):
-        jobs.claim(tmp_path, {"episodes": 4, "policies": {}})
-    jobs.release(tmp_path)
-    jobs.claim(tmp_path, {"episodes": 4, "policies": {}})
-
-
 def failing(items):
     for item in items:
         if item == 1:
@@ -101,20 +92,20 @@ def failing(items):
         yield {"value": item}
 
 
-def test_a_run_that_ends_before_anything_is_finished_leaves_its_folder_to_others(tmp_path):
-    jobs.claim(tmp_path, {"episodes": 3})
+def test_a_folder_belongs_to_a_run_from_its_first_result_until_it_is_released(tmp_path):
+    work = [jobs.Job(f"{i}", failing, (), (i,)) for i in (1, 0)]
+    for episodes in (3, 4):
+        jobs.claim(tmp_path, {"episodes": episodes})
+        with pytest.raises(ValueError, match="no episode 1"):
+            jobs.run(work, tmp_path, 1, ignore)
     with pytest.raises(ValueError, match="no episode 1"):
-        jobs.run([jobs.Job("job", failing, (), (1, 2))], tmp_path, 1, ignore)
-    assert not any(tmp_path.iterdir())
+        jobs.run(work[::-1], tmp_path, 1, ignore)
     jobs.claim(tmp_path, {"episodes": 4})
-    work = [jobs.Job(f"{i}", failing, (), (i,)) for i in range(2)]
-    with pytest.raises(ValueError, match="no episode 1"):
-        jobs.run(work, tmp_path, 1, ignore)
-    with pytest.raises(ValueError, match="unfinished run of episodes 4, not 3"):  # a job is finished
+    with pytest.raises(ValueError, match="unfinished run of episodes 4, not 3"):
         jobs.claim(tmp_path, {"episodes": 3})
-    with pytest.raises(ValueError, match="no episode 1"):
-        jobs.run(work, tmp_path, 1, ignore)
-    assert (tmp_path / jobs.MARKER).exists()
+    jobs.release(tmp_path)
+    assert not any(tmp_path.iterdir())
+    jobs.claim(tmp_path, {"episodes": 3})
     jobs.release(tmp_path)
 
 

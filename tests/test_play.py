@@ -1,8 +1,6 @@
 """The playground's simulation, which knows nothing of pages."""
 
 import math
-import os
-import time
 
 import gymnasium
 import numpy as np
@@ -16,9 +14,7 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.executors import WorkerError
 from ballbot_train.play import background, views
-from ballbot_train.play.background import Background
 from ballbot_train.play.clock import Clock
 from ballbot_train.play.simulation import LARGEST_PUSH, Playground
 from ballbot_train.policy_files import BEST
@@ -318,28 +314,6 @@ def test_a_short_hold_up_is_caught_up_and_a_long_one_is_given_up():
     assert late() == pytest.approx([0.08, 0.06, 0.04, 0.02, 0.0])
     watch.now += 10.0
     assert late() == pytest.approx([9.98])
-
-
-def test_another_process_computes_and_is_started_anew_after_it_was_killed():
-    background = Background(other_process=True)
-    try:
-        first = background.compute(os.getpid)
-        assert background.compute(os.getpid) == first != os.getpid()
-        with pytest.raises(ValueError, match="math domain"):
-            background.compute(math.sqrt, -1.0)
-        with pytest.raises(WorkerError):
-            background.compute(os._exit, 1)
-        assert background.compute(math.sqrt, 4.0) == 2.0
-    finally:
-        background.close()
-        background.close()
-
-
-def test_a_job_of_another_process_does_not_hold_up_the_end():
-    background = Background(other_process=True)
-    job = background.submit(lambda: background.compute(time.sleep, 60.0))
-    background.close()
-    assert job.done()
 
 
 def test_every_episode_of_a_track_has_a_robot_of_its_own(play, no_optimum):

@@ -1,15 +1,12 @@
 """The page of the live playground: its controls, and who may open it."""
 
-import contextlib
 import http.client
-import os
 import re
 import signal
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -194,7 +191,7 @@ def test_who_leaves_while_something_is_saved_or_dragged_harms_nothing(quiet, ope
 
 
 @pytest.mark.slow
-def test_the_server_and_its_processes_end_when_they_are_told_to(tmp_path):
+def test_the_server_ends_when_it_is_told_to(tmp_path):
     code = "from ballbot_train.commands.play import play; play('stabilize', 'lqr', (), port=0, physics='rk4')"
     server = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     try:
@@ -202,27 +199,11 @@ def test_the_server_and_its_processes_end_when_they_are_told_to(tmp_path):
         port = int(re.search(r":(\d+)", server.stdout.readline()).group(1))
         with Visitor(port) as visitor:
             wait_for(lambda: "LQR, " in visitor.text().replace("\\", ""), 60)
-            mine = children(server.pid)
-            assert mine  # that plans
         server.send_signal(signal.SIGTERM)
         assert server.wait(20) == 0
-        wait_for(lambda: not any(map(runs, mine)))
     finally:
         server.kill()
         server.wait()
-
-
-def children(pid):
-    """The processes that a process has started."""
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
-
-
-def runs(pid):
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, 0)
-        return True
-    return False
 
 
 def asked(port, path="/", **headers):

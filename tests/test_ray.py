@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from ballbot_gym.env import make_task
-from ballbot_train import jobs
+from ballbot_train import jobs, shards
 from ballbot_train.commands.certify import certify
 from ballbot_train.evaluation.benchmark import benchmark
-from ballbot_train.executors import Workers
+from ballbot_train.executors import Workers, completed
 from ballbot_train.learning import tuning
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
-from ballbot_train.shards import Shards
 
 ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.slow
@@ -46,7 +45,7 @@ def cluster(head):
 
 def certified_shards(out, workers):
     certify(("stabilize",), 24, shards=str(out / "set"), out=out / "unfinished", workers=workers)
-    (arrays,) = Shards(out / "set" / "stabilize")
+    (arrays,) = shards.Shards(out / "set" / "stabilize")
     return arrays
 
 
@@ -69,18 +68,18 @@ def test_every_job_arrives_once_and_unchanged_when_a_node_is_killed(made, cluste
     head, node = cluster
     expected = made(tmp_path / "serial", 1)
     written = []
-    stream = jobs.stream
 
-    def stream_and_kill(*arguments):
-        for number, entries in stream(*arguments):
-            written.append(number)
+    def completed_and_kill(*arguments):
+        for key, result in completed(*arguments):
+            written.append(key if isinstance(key, range) else key[0])
             if node in head.worker_nodes:
                 head.remove_node(node, allow_graceful=False)
-            yield number, entries
+            yield key, result
 
-    monkeypatch.setattr(jobs, "stream", stream_and_kill)
+    for module in (jobs, shards):
+        monkeypatch.setattr(module, "completed", completed_and_kill)
     found = made(tmp_path / "cluster", Workers(ray=head.address))
-    assert sorted(written) == list(range(len(written)))
+    assert 0 < len(written) == len(set(written))
     assert found.keys() == expected.keys()
     for name, array in expected.items():
         assert np.array_equal(found[name], array, equal_nan=array.dtype.kind == "f"), name

@@ -46,7 +46,7 @@ def page(tmp_path_factory):
     curve = figures.Curve("a", leaning(0.3, 1.0), "#1f6fb2")
     picture = figures.save(figures.trajectory_figure("a figure", [curve]), folder / "pictures" / "some-figure.png")
     pictures = {"Pictures": [picture], "Nothing": []}
-    return write_report(folder / "report.html", "A <title>", HEADER, ROWS, replays, "", pictures, {"commit": "abc"})
+    return write_report(folder / "report.html", "A <title>", HEADER, ROWS, replays, pictures, {"commit": "abc"})
 
 
 def test_the_page_holds_everything_it_shows(page):
@@ -59,10 +59,8 @@ def test_the_page_holds_everything_it_shows(page):
 
 def test_what_has_no_data_has_no_section(page, tmp_path):
     assert "Nothing" not in page.read_text()
-    assert "Push them" not in page.read_text()
-    empty = write_report(tmp_path / "report.html", "t", HEADER, ROWS, [Replay("r", ())], "<p>", {}, {}).read_text()
+    empty = write_report(tmp_path / "report.html", "t", HEADER, ROWS, [Replay("r", ())], {}, {}).read_text()
     assert "Watch an episode" not in empty
-    assert 'srcdoc="&lt;p&gt;"' in empty
 
 
 def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
@@ -72,7 +70,7 @@ def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
     )
     replays = [Replay(name, (Take(name, leaning(0.1, 0.1), "red", note=name),))]
     table, pictures = ([name], [[name, name]]), {name: [picture]}
-    path = write_report(tmp_path / "r.html", name, *table, replays, name, pictures, {name: name})
+    path = write_report(tmp_path / "r.html", name, *table, replays, pictures, {name: name})
     text = path.read_text()
     assert "alert" in text
     assert "<script>alert" not in text

@@ -163,11 +163,8 @@ class NmpcController:
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         c = np.asarray(c, np.float64)
-        self.start(t, c, prepared_plan(self._task, self._params, x, c, self.backoff, t))
-
-    def start(self, t: float, c: np.ndarray, prepared: PreparedPlan) -> None:
-        """As `reset`, with a plan that `prepared_plan` has made before, for instance in another process."""
-        self._c, self._lost = np.asarray(c, np.float64), False
+        prepared = prepared_plan(self._task, self._params, x, c, self.backoff, t)
+        self._c, self._lost = c, False
         self.disturbance = DisturbanceEstimator(self._params.force_limit) if self._offset_free else None
         self._before: tuple[np.ndarray, np.ndarray] | None = None
         self._follow(t, prepared)

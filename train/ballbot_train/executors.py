@@ -9,12 +9,12 @@ import os
 import pickle
 import shutil
 import signal
-import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
@@ -26,9 +26,8 @@ from typing import Any, TypeVar
 from ballbot_gym import registry
 from ballbot_gym.lazy import missing
 from ballbot_gym.robots import Robot
-from ballbot_train.console import console
 
-_NODE_SECONDS = 5.0  # between two counts of the nodes of a cluster
+_NODE_SECONDS = 5.0  # between two looks whether a cluster has more cores
 _RETRIES = 5  # of a task on a cluster whose worker or node dies
 _OBJECT_STORE = 200 * 2**20  # bytes of a cluster started here: results are small and go to this process at once
 _PER_CORE = 2  # tasks in flight for every core of a cluster, so that no core waits for its next one
@@ -99,18 +98,18 @@ def completed(tasks: Iterable[Task[Key]], workers: int | Workers, serial: bool =
     if (first := next(tasks, None)) is None:
         return
     tasks, running = itertools.chain([first], tasks), dict[Future, Key]()
-    with _local(workers) if workers.ray is None else _cluster(workers) as pool:
+    with _local(workers) if workers.ray is None else _cluster(workers) as (submit, most):
         while True:
-            for key, function, arguments in itertools.islice(tasks, max(0, pool.most() - len(running))):
-                running[pool.submit(function, *arguments)] = key
+            for key, function, arguments in itertools.islice(tasks, max(0, most() - len(running))):
+                running[submit(function, *arguments)] = key
             if not running:
                 return
             ended = wait(running, _NODE_SECONDS, FIRST_COMPLETED).done
             for future in sorted(ended, key=lambda future: future.exception() is not None):
-                yield running.pop(future), result_of(future)
+                yield running.pop(future), _result_of(future)
 
 
-def result_of(future: Future) -> Any:
+def _result_of(future: Future) -> Any:
     """What the function of a task returned.
 
     Raises:
@@ -129,7 +128,7 @@ def result_of(future: Future) -> Any:
     return value
 
 
-def _attempt(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, Exception | None, str]:
+def _attempt(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None, str]:
     """What a task returned; or what it raised, and where. An error that cannot be pickled becomes a RuntimeError."""
     try:
         return function(*arguments), None, ""
@@ -141,41 +140,24 @@ def _attempt(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[
         return None, error, traceback.format_exc()
 
 
+Pool = tuple[Callable[..., Future], Callable[[], int]]
+"""What submits a function with its arguments, and what says how many tasks to have in flight at most."""
+
+
 @contextmanager
-def _local(workers: Workers) -> Iterator["Processes"]:
-    """Processes of this machine. At the end of the block whatever still runs is stopped."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
-    pool = Processes(workers.here)
-    try:
-        yield pool
-    finally:
-        end_processes(pool)
-
-
-class Processes(ProcessPoolExecutor):
-    """Processes of this machine, with what users registered in this one. They end with this one.
-
-    One that dies ends the others' work too.
+def _local(workers: Workers) -> Iterator[Pool]:
+    """Processes of this machine, with what users registered in this one. At the end of the block whatever still runs is
+    stopped. One that dies ends the others' work too.
     """
-
-    def __init__(self, count: int):
-        # a forked child would share PyBullet's clients and CasADi's state
-        super().__init__(count, get_context("spawn"), _prepare, registry.registered())
-        self._count = count
-
-    def most(self) -> int:
-        """How many tasks to have in flight at most."""
-        return self._count
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
-        return super().submit(_attempt, function, arguments)
-
-
-def end_processes(pool: Processes) -> None:
-    """Ends processes at once, whatever they do."""
-    for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
-        process.terminate()
-    pool.shutdown(cancel_futures=True)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
+    # a forked child would share PyBullet's clients and CasADi's state
+    pool = ProcessPoolExecutor(workers.here, get_context("spawn"), _prepare, registry.registered())
+    try:
+        yield partial(pool.submit, _attempt), lambda: workers.here
+    finally:
+        for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
 
 
 def _prepare(modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
@@ -193,8 +175,8 @@ def _end_with_the_run() -> None:
 
 
 @contextmanager
-def _cluster(workers: Workers) -> Iterator["_Ray"]:
-    """A pool of tasks on a Ray cluster. Connects to the cluster, unless this process is connected to one already.
+def _cluster(workers: Workers) -> Iterator[Pool]:
+    """Tasks of one core each on a Ray cluster. Connects to the cluster, unless this process is connected to one already.
 
     Raises:
         ModuleNotFoundError: Ray is not installed.
@@ -204,32 +186,46 @@ def _cluster(workers: Workers) -> Iterator["_Ray"]:
         import ray  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
         raise missing("--ray", error.name, "ray") from error
-    connected = ray.is_initialized()
+    connected, running = ray.is_initialized(), set[Future]()
     with TemporaryDirectory() as folder:
         if not connected:
-            quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
-            try:
-                if workers.ray == "local":
-                    count = workers.workers or os.cpu_count() or 1
-                    ray.init(
-                        "local", num_cpus=count, object_store_memory=_OBJECT_STORE, include_dashboard=False, **quiet
-                    )
-                else:
-                    environment = {"py_modules": _code(Path(folder)), "env_vars": {"OMP_NUM_THREADS": "1"}}
-                    ray.init(workers.ray, runtime_env=environment, **quiet)
-            except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
-                raise WorkerError(
-                    f"no Ray cluster can be used at {workers.ray} ({error}); `ray start --head` starts one, and --ray local "
-                    "starts one for this run alone"
-                ) from error
-        pool = _Ray(ray, workers.workers)
+            _connect(ray, workers, Path(folder))
+        # a name with a module, so that nodes import the function rather than unpickle it
+        task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_on_node)
+
+        def submit(function: Callable[..., Any], *arguments: Any) -> Future:
+            future = task.remote(function, arguments, *registry.registered()).future()
+            running.add(future)
+            future.add_done_callback(running.discard)
+            return future
+
+        def most() -> int:  # nodes come and go
+            return workers.workers or max(1, _PER_CORE * int(ray.cluster_resources().get("CPU", 0)))
+
         try:
-            yield pool
+            yield submit, most
         finally:
-            if connected:
-                pool.close()
-            else:
+            if not connected:
                 ray.shutdown()  # which ends the tasks too
+            for future in list(running) if connected else ():
+                ray.cancel(future.object_ref, force=True)  # pyright: ignore[reportAttributeAccessIssue] Ray's own
+
+
+def _connect(ray: Any, workers: Workers, folder: Path) -> None:
+    """Starts a cluster for this run, or joins one, whose nodes get our code by way of the folder."""
+    quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    try:
+        if workers.ray == "local":
+            count = workers.workers or os.cpu_count() or 1
+            ray.init("local", num_cpus=count, object_store_memory=_OBJECT_STORE, include_dashboard=False, **quiet)
+        else:
+            environment = {"py_modules": _code(folder), "env_vars": {"OMP_NUM_THREADS": "1"}}
+            ray.init(workers.ray, runtime_env=environment, **quiet)
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        raise WorkerError(
+            f"no Ray cluster can be used at {workers.ray} ({error}); `ray start --head` starts one, and --ray local "
+            "starts one for this run alone"
+        ) from error
 
 
 def _code(folder: Path) -> list[str]:
@@ -254,39 +250,6 @@ def _code(folder: Path) -> list[str]:
     return found
 
 
-class _Ray:
-    """Tasks of one core each on the nodes of the cluster to which this process is connected."""
-
-    def __init__(self, ray: Any, workers: int | None):
-        self._ray, self._workers = ray, workers
-        # a name with a module, so that nodes import the function rather than unpickle it
-        self._task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_on_node)
-        self._running: set[Future] = set()
-        self._counted, self._cores, self._said = 0.0, 0, ""
-
-    def most(self) -> int:
-        """Counts nodes and cores now and then, and says when they change."""
-        if time.monotonic() - self._counted > _NODE_SECONDS:
-            self._counted = time.monotonic()
-            nodes = [node for node in self._ray.nodes() if node["Alive"]]
-            self._cores = int(sum(node["Resources"].get("CPU", 0) for node in nodes))
-            said = f"Ray: {len(nodes)} nodes with {self._cores} cores"
-            if said != self._said:
-                console.print(said)
-            self._said = said
-        return self._workers or max(1, _PER_CORE * self._cores)
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
-        future = self._task.remote(function, arguments, *registry.registered()).future()
-        self._running.add(future)
-        future.add_done_callback(self._running.discard)
-        return future
-
-    def close(self) -> None:
-        for future in list(self._running):
-            self._ray.cancel(future.object_ref, force=True)  # pyright: ignore[reportAttributeAccessIssue] Ray's own
-
-
 def _on_node(
     function: Callable[..., Any], arguments: tuple[Any, ...], modules: tuple[str, ...], robots: dict[str, Robot]
 ) -> tuple[Any, Exception | None, str]:
@@ -294,4 +257,4 @@ def _on_node(
         registry.restore(modules, robots)
         return function(*given)
 
-    return _attempt(call, arguments)
+    return _attempt(call, *arguments)

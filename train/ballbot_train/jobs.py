@@ -8,7 +8,7 @@ jobs that have no file. A folder belongs to one configuration until it is releas
 import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ _FOLDER = "unfinished"
 _LOCK = ".lock"
 _LIMIT = 2**32  # bytes of a job's file
 _held: dict[Path, filelock.BaseFileLock] = {}
-_new: set[Path] = set()  # folders that this process claimed first, and in which no job is finished yet
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,8 @@ def _path_of(out: Path, name: str) -> Path:
 def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Mapping[str, Any] | None = None) -> None:
     """Marks a folder as belonging to one configuration, and locks it for this process until `release` or `unlock`.
 
-    The same configuration may claim the folder again, and so continues in it.
+    The same configuration may claim the folder again, and so continues in it. Another one may where no job of an unfinished
+    run has come to its end.
 
     Args:
         out: the folder; made if missing.
@@ -93,9 +93,7 @@ def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Map
     locked_before = _holds(out)
     _lock(out)
     try:
-        if not path.exists() and marker == MARKER:
-            _new.add(out.resolve())
-        if path.exists():
+        if path.exists() and (marker != MARKER or any(unfinished(out).glob("*.json"))):
             held = {key: value for key, value in _read_marker(path).items() if key not in facts}
             check_same(held, wanted, out, "an unfinished run" if marker == MARKER else "a run")
         files.write(path, json.dumps({**wanted, **facts}, indent=1) + "\n")
@@ -135,13 +133,7 @@ def release(out: Path, marker: str = MARKER) -> None:
     """Ends a run whose results are written: deletes what only served to continue it, and unlocks the folder."""
     shutil.rmtree(unfinished(out), ignore_errors=True)
     (out / marker).unlink(missing_ok=True)
-    _new.discard(out.resolve())
     unlock(out)
-
-
-def forget(out: Path, name: str) -> None:
-    """Deletes the result of a job, which is kept elsewhere now."""
-    _path_of(out, name).unlink(missing_ok=True)
 
 
 def unlock(out: Path) -> None:
@@ -202,8 +194,7 @@ def stream(
 ) -> Iterator[tuple[int, list[Entry]]]:
     """Does what is not done yet, and gives each job when it is done.
 
-    The calling process writes every result when it comes, whoever computed it. A run that ends before its first job is
-    finished leaves no claim of the folder, because there is nothing to continue.
+    The calling process writes every result when it comes, whoever computed it.
 
     Args:
         jobs: what there is to do. They are taken when workers have room for them.
@@ -229,12 +220,10 @@ def stream(
                 on_progress(job.group, len(job.items))
                 kept.append((number, done))
 
-    with _locked(out), ExitStack() as stack:
-        stack.push(lambda error, *_: release(out) if error and out.resolve() in _new else None)
+    with _locked(out):
         unfinished(out).mkdir(parents=True, exist_ok=True)
         for (number, job), text in completed(tasks(), workers):
             files.write(_path_of(out, job.name), text)
-            _new.discard(out.resolve())
             on_progress(job.group, len(job.items))
             while kept:
                 yield kept.pop()

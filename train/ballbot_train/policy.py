@@ -4,7 +4,6 @@ A policy is two files: weights in `NAME.safetensors` and their description in `N
 This module imports torch; `policy_files` reads descriptions without it.
 """
 
-import itertools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -30,7 +29,7 @@ from ballbot_train.policy_files import (
     read_description,
 )
 from ballbot_train.routes import Routes
-from ballbot_train.weights import checked, own_precision
+from ballbot_train.weights import checked, linear_layers, own_precision
 
 try:
     import safetensors
@@ -72,15 +71,11 @@ class PolicyNetwork(torch.nn.Module):
         inputs += spec.history * (inputs + spec.actions) + _TOLD * spec.informed
         self._steady = self._frame.steady if self._frame is not None and spec.centred else None
         self.linear = torch.nn.Linear(inputs, spec.actions, bias=not spec.odd, **own) if spec.linear else None
-        widths = (inputs, *spec.hidden)
-        layers: list[torch.nn.Module] = []
-        for fan_in, fan_out in itertools.pairwise(widths):
-            layers += [torch.nn.Linear(fan_in, fan_out, bias=not spec.odd, **own), _ACTIVATIONS[spec.activation]()]
-        last = torch.nn.Linear(widths[-1], spec.actions, bias=not spec.odd, **own)
+        widths = (inputs, *spec.hidden, spec.actions)
+        self.mlp = linear_layers(widths, _ACTIVATIONS[spec.activation], bias=not spec.odd, **own)
         if spec.linear:  # so that the policy starts as its linear part
-            for part in last.parameters():
+            for part in self.mlp[-1].parameters():
                 torch.nn.init.zeros_(part)
-        self.mlp = torch.nn.Sequential(*layers, last)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         raw = self.raw(observation)

@@ -11,6 +11,7 @@ from typing import Any
 
 from ballbot_gym.lazy import missing
 from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_train.weights import linear_layers
 
 try:
     import torch
@@ -31,11 +32,7 @@ class Routes(torch.nn.Module):
         route = FRAMES[frame].route
         assert route is not None
         self.route = route
-        layers: list[torch.nn.Module] = []
-        for fan_in, fan_out in itertools.pairwise((3 * route.obstacles, *hidden)):
-            layers += [torch.nn.Linear(fan_in, fan_out, **own), torch.nn.Tanh()]
-        last = (3 * route.obstacles, *hidden)[-1]
-        self.mlp = torch.nn.Sequential(*layers, torch.nn.Linear(last, 2**route.obstacles, **own))
+        self.mlp = linear_layers((3 * route.obstacles, *hidden, 2**route.obstacles), torch.nn.Tanh, **own)
         self._choices: torch.Tensor
         self.register_buffer("_choices", torch.tensor(farther_choices(route.obstacles), **own), persistent=False)
 

@@ -25,7 +25,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.sensors import observation_space
 from ballbot_gym.tasks import Task
 from ballbot_train.policy_files import PolicyError
-from ballbot_train.weights import checked, saved_by_torch
+from ballbot_train.weights import checked, linear_layers, saved_by_torch
 
 try:
     import torch
@@ -187,19 +187,18 @@ def load_actor(path: str | Path, task: Task, params: BallbotParams) -> SavedActo
         PolicyError: the file is missing, damaged or of a kind that is not read; or its observations or actions are not the
             env's.
     """
-    layers, activation, squashed, normalization, trained = _read(path)
-    size = layers[0][0].shape[1]
+    found, activation, squashed, normalization, trained = _read(path)
+    size = found[0][0].shape[1]
     if size != len(task.observation_scale):
         raise PolicyError(f"{path} takes {size} observations, {task.id} has {len(task.observation_scale)}")
     check_spaces(str(path), trained, task, params)
     if normalization is not None and len(normalization["mean"]) != size:
         raise PolicyError(f"{path} takes {size} observations, its statistics are of {len(normalization['mean'])}")
-    parts: list[torch.nn.Module] = []
-    for weight, bias in layers:
-        linear = torch.nn.Linear(weight.shape[1], weight.shape[0], device="cpu", dtype=torch.float32)
+    widths = (size, *(len(bias) for _, bias in found))
+    network = linear_layers(widths, getattr(torch.nn, _ACTIVATIONS[activation]), device="cpu", dtype=torch.float32)
+    for linear, (weight, bias) in zip(list(network)[::2], found, strict=True):
         linear.load_state_dict({"weight": weight, "bias": bias})
-        parts += [linear, getattr(torch.nn, _ACTIVATIONS[activation])()]
-    return SavedActor(torch.nn.Sequential(*parts[:-1]), squashed, normalization).eval()
+    return SavedActor(network, squashed, normalization).eval()
 
 
 def _read(path: str | Path) -> tuple[list[Any], str, bool, dict[str, Any] | None, Spaces]:

@@ -11,7 +11,6 @@ The manifest names a shard after its file is there. So whoever reads the manifes
 killed makes those that it does not name. A reader holds one shard in memory, and checks its digest.
 """
 
-import base64
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +22,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
 from ballbot_train import jobs
-from ballbot_train.executors import Workers
+from ballbot_train.executors import Workers, completed
 
 try:
     import fsspec
@@ -35,8 +34,7 @@ EPISODES = 500
 """Episodes of a shard."""
 
 MANIFEST = "manifest.json"
-_CHUNK = 5  # episodes of a job, and of its only item: workers send arrays, so that little is left to do here
-_ARRAYS = "npz"
+_CHUNK = 5  # episodes that a worker makes at a time
 _LIMIT = 2**32  # bytes of a shard, unpacked
 _VERSION = 1
 
@@ -198,42 +196,46 @@ def make(
     """
     shards = Shards(url)
     about = {**about, "per_shard": per_shard}
-    jobs.claim(out, {"shards": url, **about})
+    jobs.claim(out, {"shards": url, **about}, "set.json")
     shards.begin(about)
-    kept = set(shards.numbers)
-    parts: dict[int, dict[int, Arrays]] = {}  # by shard and first episode
+    folder = jobs.unfinished(out)
+    folder.mkdir(exist_ok=True)
 
-    def ranges(shard: int) -> list[range]:
+    def parts_of(shard: int) -> dict[range, Path]:
+        """The parts of a shard, and the files in which those are kept that are there."""
         last = min((shard + 1) * per_shard, episodes)
-        return [range(start, min(start + _CHUNK, last)) for start in range(shard * per_shard, last, _CHUNK)]
+        parts = (range(start, min(start + _CHUNK, last)) for start in range(shard * per_shard, last, _CHUNK))
+        return {part: folder / f"{part.start:09d}-{part.stop:09d}.npz" for part in parts}
 
-    def is_kept(shard: int) -> bool:
-        return shard in kept and shards.episodes_of(shard) == sum(map(len, ranges(shard)))
-
-    def work() -> Iterator[jobs.Job]:
+    def missing() -> Iterator[Any]:
         for shard in range(-(-episodes // per_shard)):
-            if is_kept(shard):
-                on_progress(sum(map(len, ranges(shard))))
+            parts = parts_of(shard)
+            if shard in shards.numbers and shards.episodes_of(shard) == sum(map(len, parts)):
+                on_progress(sum(map(len, parts)))
                 continue
-            for part in ranges(shard):
-                item = part.start, part.stop
-                yield jobs.Job(_job_name(part.start), _made, (function, arguments, arrays_of), (item,))
+            for part, path in parts.items():
+                if path.exists():
+                    on_progress(len(part))
+                else:
+                    yield part, _made, (function, arguments, arrays_of, part)
+            join(shard)  # a killed run may have had all of it
 
-    for _, (entry,) in jobs.stream(work(), out, workers, lambda group, count: None):
-        start = entry["start"]
-        shard = start // per_shard
-        parts.setdefault(shard, {})[start] = files.arrays_of(base64.b64decode(entry[_ARRAYS]), "what a worker sent")
-        wanted = ranges(shard)
-        on_progress(next(len(part) for part in wanted if part.start == start))
-        if len(parts[shard]) == len(wanted):
-            made = parts.pop(shard)
-            in_order = [made[part.start] for part in wanted if made[part.start]]
-            names = in_order[0] if in_order else ()
-            joined = {name: np.concatenate([each[name] for each in in_order]) for name in names}
-            shards.write(shard, joined, sum(map(len, wanted)))
-            for part in wanted:
-                jobs.forget(out, _job_name(part.start))
-    jobs.release(out)
+    def join(shard: int) -> None:
+        """Writes a shard if all of it is there."""
+        parts = parts_of(shard)
+        if not all(path.exists() for path in parts.values()):
+            return
+        read = [arrays for path in parts.values() if (arrays := files.read_npz(path))]
+        joined = {name: np.concatenate([each[name] for each in read]) for name in (read[0] if read else ())}
+        shards.write(shard, joined, sum(map(len, parts)))
+        for path in parts.values():
+            path.unlink()
+
+    for part, arrays in completed(missing(), workers):
+        files.write(parts_of(part.start // per_shard)[part], files.npz(arrays, compressed=False))
+        on_progress(len(part))
+        join(part.start // per_shard)
+    jobs.release(out, "set.json")
     return shards
 
 
@@ -241,13 +243,7 @@ def _made(
     function: Callable[..., Iterator[jobs.Entry]],
     arguments: tuple[Any, ...],
     arrays_of: Callable[[Sequence[jobs.Entry]], Arrays],
-    items: Sequence[tuple[int, int]],
-) -> Iterator[jobs.Entry]:
-    """The arrays of some ranges of episodes, on a worker."""
-    for start, stop in items:
-        arrays = arrays_of(list(function(*arguments, range(start, stop))))
-        yield {"start": start, _ARRAYS: base64.b64encode(files.npz(arrays, compressed=False)).decode()}
-
-
-def _job_name(start: int) -> str:
-    return f"{start:09d}"
+    part: range,
+) -> Arrays:
+    """The arrays of some episodes, on a worker."""
+    return arrays_of(list(function(*arguments, part)))

@@ -4,8 +4,9 @@ Nothing in a file is executed, nothing grows beyond it, and all weights are fini
 """
 
 import io
+import itertools
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,16 @@ def own_defaults() -> Iterator[None]:
             yield
     finally:
         torch.set_default_dtype(kind)
+
+
+def linear_layers(
+    widths: Sequence[int], activation: Callable[[], torch.nn.Module], **options: Any
+) -> torch.nn.Sequential:
+    """Linear layers from width to width, with an activation between them; options are torch's of a linear layer."""
+    made: list[torch.nn.Module] = []
+    for fan_in, fan_out in itertools.pairwise(widths):
+        made += [torch.nn.Linear(fan_in, fan_out, **options), activation()]
+    return torch.nn.Sequential(*made[:-1])
 
 
 def saved_by_torch(content: bytes, path: str | Path, limit: int = files.READ_LIMIT) -> dict[str, Any]:

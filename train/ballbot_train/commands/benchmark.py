@@ -23,7 +23,6 @@ from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_l
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
-from ballbot_train.report.playground import playground_page
 from ballbot_train.report.replay import certified_replay, replay_of
 
 
@@ -70,7 +69,7 @@ def benchmark(
     replays = [replay_of(task, names, done, physics, robot) for task, names in chosen.items()]
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    page = write_report(out / "report.html", title, HEADER, table, replays, playground_page(), shown, facts)
+    page = write_report(out / "report.html", title, HEADER, table, replays, shown, facts)
     publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
     for result in done:
         if result.note:

@@ -46,7 +46,7 @@ def play(
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"
     start = None if episode == "random" else episode
-    playground = Playground(task, controller, ghosts, physics, start, seed, robot, True, randomization)
+    playground = Playground(task, controller, ghosts, physics, start, seed, robot, randomization)
     viewer = Viewer(host, port, "ballbot play")
     page = PlayPage(playground, viewer)
     signal.signal(signal.SIGTERM, lambda *_: page.stop())

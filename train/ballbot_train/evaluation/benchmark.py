@@ -23,7 +23,6 @@ from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import iterate_episodes, shown_to
 from ballbot_train.evaluation.results import Result, columns
 from ballbot_train.executors import Workers
-from ballbot_train.policy_files import paths_of
 from ballbot_train.provenance import provenance
 
 CHUNK = 5
@@ -49,10 +48,7 @@ def controllers_of(
         return known
     behind = ("", *registry.filters(named_robot(robot)))
     known = {task: [*VARIANTS, *(name + each for name in group for each in behind)] for task, group in known.items()}
-    # two spellings of one path are one policy
-    identities = [_identity(name) for name in names]
-    repeated = [name for i, name in enumerate(names) if identities[i] in identities[:i]]
-    if repeated:
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
     from_files = {name: registry.made_for(name) for name in names if registry.is_file(name)}
     chosen = {
@@ -71,14 +67,6 @@ def controllers_of(
             raise ValueError(f"{unused[0]} was made for {from_files[unused[0]]}, which is none of {', '.join(tasks)}")
         check_names("controller", unused, dict.fromkeys(name for group in known.values() for name in group))
     return {task: group for task, group in chosen.items() if group}
-
-
-def _identity(name: str) -> str:
-    """The path of a policy's file, whichever of its files is named, and its filter; of anything else the name."""
-    if not registry.is_file(name):
-        return name
-    path = registry.plain(name)
-    return str((Path(path) if registry.is_saved_model(name) else paths_of(path)[1]).resolve()) + name.removeprefix(path)
 
 
 def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:

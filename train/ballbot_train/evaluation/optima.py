@@ -162,7 +162,7 @@ def _elsewhere(workers: int | Workers, solve: _Solver, task: Task, missing: list
 
     each = min(AT_ONCE, -(-len(missing) // _TASKS))
     parts = (missing[k : k + each] for k in range(0, len(missing), each))
-    for _, entries in completed(((None, _solved, (solve, task, part)) for part in parts), workers):
+    for _, entries in completed(((part, _solved, (solve, task, part)) for part in parts), workers):
         yield from entries
 
 

@@ -4,7 +4,6 @@ The value of a control problem is nearly a quadratic form. A tanh network alone 
 rests beside the goal. A linear path over the products of all pairs of observed quantities fits it exactly.
 """
 
-import itertools
 from collections.abc import Sequence
 from typing import cast
 
@@ -13,6 +12,7 @@ import torch
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES
 from ballbot_train.routes import Routes
+from ballbot_train.weights import linear_layers
 
 _LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
 
@@ -69,10 +69,7 @@ class QuadraticCritic(torch.nn.Module):
         """Args: hidden: units of the network's hidden layers; value: of every state at the start, about."""
         super().__init__()
         self._inputs = inputs
-        layers: list[torch.nn.Module] = []
-        for fan_in, fan_out in itertools.pairwise((inputs.size, *hidden)):
-            layers += [torch.nn.Linear(fan_in, fan_out), activation()]
-        self.mlp = torch.nn.Sequential(*layers, torch.nn.Linear((inputs.size, *hidden)[-1], 1))
+        self.mlp = linear_layers((inputs.size, *hidden, 1), activation)
         self.linear = torch.nn.Linear(inputs.size, 1)
         self.start_at(value)
 

@@ -17,7 +17,6 @@ dataset shows recoveries too.
 reads them one by one.
 """
 
-import base64
 import importlib.metadata
 import inspect
 import json
@@ -25,8 +24,8 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
@@ -39,7 +38,7 @@ from minari.dataset.minari_dataset import parse_dataset_id
 from ballbot_baselines import CONTROLLERS
 from ballbot_baselines.optimum import Backoff, Optimum
 from ballbot_baselines.trajopt import EXECUTED
-from ballbot_gym import files, seeding
+from ballbot_gym import seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
@@ -53,8 +52,8 @@ from ballbot_train.executors import Workers
 from ballbot_train.learning.datasets import metadata_of
 from ballbot_train.policy_files import OBSERVATION_VERSION
 
-_CHUNK = 5  # episodes of a job
-_ARRAYS = "npz"  # where an entry holds the arrays of its episode
+_RECORDING = "recording"  # where an entry holds that of its episode
+_LONGER = ("observations", "states")  # than the others by one, of an episode
 _MOST_EPISODES = 1_000_000
 
 
@@ -251,14 +250,10 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progre
         on_progress(config.episodes)
         return out
     Workers.of(workers)
-    jobs.claim(unfinished, described)
+    jobs.claim(unfinished, described, "dataset.json")
     try:
-        every = range(config.episodes)
-        chunks = [tuple(every[start : start + _CHUNK]) for start in every[::_CHUNK]]
-        work = [jobs.Job(f"{chunk[0]:06d}", _record_episodes, (config,), chunk) for chunk in chunks]
-        done = jobs.run(work, unfinished, workers, lambda group, count: on_progress(count))
-        _assemble(config, [entry for entries in done for entry in entries], unfinished, out)
-        jobs.release(unfinished)
+        made = write_shards(config, str(unfinished / "set"), unfinished / "episodes", workers, on_progress)
+        _assemble(config, made, unfinished, out)
         shutil.rmtree(unfinished, ignore_errors=True)
     finally:
         jobs.unlock(unfinished)
@@ -297,13 +292,13 @@ def write_shards(
 def _arrays_of(entries: Sequence[jobs.Entry]) -> dict[str, np.ndarray]:
     """Episodes as arrays of a shard: those of their recordings, one after another, with lengths and metadata (JSON)."""
     made = [entry for entry in entries if "note" not in entry]
-    recorded = [files.arrays_of(base64.b64decode(entry[_ARRAYS]), "an episode") for entry in made]
+    recorded: list[Recording] = [entry.pop(_RECORDING) for entry in made]
     if not recorded:
         return {}
     return {
-        **{name: np.concatenate([arrays[name] for arrays in recorded]) for name in recorded[0]},
-        "lengths": np.array([len(arrays["actions"]) for arrays in recorded], np.int64),
-        "about": np.array([json.dumps(_about(entry)) for entry in made], str),
+        **{each.name: np.concatenate([getattr(part, each.name) for part in recorded]) for each in fields(Recording)},
+        "lengths": np.array([len(part.actions) for part in recorded], np.int64),
+        "about": np.array([json.dumps(entry) for entry in made], str),
     }
 
 
@@ -322,7 +317,7 @@ def dataset_folder(out: Path) -> Path:
 
 
 def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
-    """Yields the metadata of each episode, and its arrays as an .npz in base64."""
+    """Yields the metadata of each episode, and its recording."""
     env = BallbotEnv(config.task, physics=config.physics, robot=config.robot)
     expert = Expert(config.expert, env.task, env.params, config.backoff)
     for i in episodes:
@@ -341,16 +336,17 @@ def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jo
             "failure": bool(info["failure"]),
             "plans": expert.plans,
             "plans_failed": expert.plans_failed,
-            _ARRAYS: base64.b64encode(files.npz(asdict(recording))).decode(),
+            _RECORDING: recording,
         }
     env.close()
 
 
-def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, out: Path) -> None:
+def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Path) -> None:
     """Writes the dataset under a temporary name, and renames it."""
-    made = [i for i, entry in enumerate(entries) if "note" not in entry]
-    if not made:
-        raise PlanError(f"the expert found no plan in any of {len(entries)} episodes: {entries[0]['note']}")
+    parts = [arrays for arrays in made if arrays]
+    if not parts:
+        raise PlanError(f"{config.expert} found no plan in any of {config.episodes} episodes; give another expert")
+    about = [json.loads(text) for arrays in parts for text in arrays["about"].tolist()]
     root = unfinished / "datasets"
     shutil.rmtree(root, ignore_errors=True)
     task = make_task(config.task, config.robot)
@@ -362,7 +358,7 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
             warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
             dataset = minari.create_dataset_from_buffers(
                 dataset_id=out.name,
-                buffer=[_buffer(entries[i]) for i in made],
+                buffer=[each for arrays in parts for each in _buffers(arrays)],
                 env=env,
                 algorithm_name=config.expert,
                 description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
@@ -375,20 +371,23 @@ def _assemble(config: DemoConfig, entries: list[jobs.Entry], unfinished: Path, o
         else:
             os.environ["MINARI_DATASETS_PATH"] = before
         env.close()
-    dataset.storage.update_episode_metadata([_about(entries[i]) for i in made])
+    dataset.storage.update_episode_metadata(about)
     dataset.storage.update_metadata(
         {"task": repr(task), "observation_version": OBSERVATION_VERSION, "demos": asdict(config)}
     )
     (root / out.name).rename(out)
 
 
-def _about(entry: jobs.Entry) -> dict[str, Any]:
-    """The metadata of an episode."""
-    return {name: value for name, value in entry.items() if name != _ARRAYS}
-
-
-def _buffer(entry: jobs.Entry) -> EpisodeBuffer:
-    content = base64.b64decode(entry[_ARRAYS])
-    arrays: dict[str, Any] = files.arrays_of(content, "an episode")  # Minari's annotations say lists
-    infos = {"expert_action": arrays.pop("labels"), "state": arrays.pop("states")}
-    return EpisodeBuffer(seed=entry["seed"], infos=infos, **arrays)
+def _buffers(arrays: Mapping[str, np.ndarray]) -> Iterator[EpisodeBuffer]:
+    """The episodes of a shard's arrays."""
+    end = 0
+    for k, length in enumerate(arrays["lengths"].tolist()):
+        start, end = end, end + length
+        cut: dict[str, Any] = {  # Minari's annotations say lists
+            each.name: arrays[each.name][start + k : end + k + 1]
+            if each.name in _LONGER
+            else arrays[each.name][start:end]
+            for each in fields(Recording)
+        }
+        infos = {"expert_action": cut.pop("labels"), "state": cut.pop("states")}
+        yield EpisodeBuffer(seed=json.loads(arrays["about"][k])["seed"], infos=infos, **cut)

@@ -17,7 +17,7 @@ from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.controllers import is_file
-from ballbot_train.play.background import Background
+from ballbot_train.play import background
 from ballbot_train.play.runner import Runner, failure_word
 from ballbot_train.play.world import PLANT, World, randomization, severity
 from ballbot_train.report import labels
@@ -75,7 +75,6 @@ class Playground:
         episode: int | Literal["rest"] | None = 0,
         seed: int = 0,
         robot: str = PAPER,
-        other_process: bool = False,
         randomization: str | None = None,
     ):
         """Begins an episode.
@@ -89,8 +88,6 @@ class Playground:
             episode: index of a certified episode; "rest" for standing at the origin; None for a random start.
             seed: of random starts, sensor noise and random pushes.
             robot: name in `robots.ROBOTS`.
-            other_process: whether another process plans, so that planning takes no time from a simulation in real time. A
-                script that asks for it needs the guard `if __name__ == "__main__":`.
             randomization: name of a track: every episode has a robot of it, which the controllers are not told.
 
         Raises:
@@ -112,7 +109,7 @@ class Playground:
         self._rng = np.random.default_rng(seed)
         self._track = checked_randomization(randomization)
         self._physics = default_physics() if physics is None else physics
-        self._background = Background(other_process)
+        self._background = background.Background()
         self._optimum: Future | None = None
         self._open(world, controller, ghosts, episode)
 
@@ -342,16 +339,16 @@ class Playground:
         if self._optimum is not None:
             self._optimum.cancel()
         self._optimum = self._background.submit(
-            self._background.optimum, self.world.task, self.world.params, *map(np.array, start)
+            background.optimum_costs, self.world.task, self.world.params, *map(np.array, start)
         )
 
     def _order(self, runner: Runner) -> None:
         """Asks for the controller that a robot wants, from now on."""
-        name, step, made = runner.wanted, self.steps, self._background.controller
+        name, step = runner.wanted, self.steps
         problem = self.world.task, self.world.params, np.array(runner.x), np.array(self.start[1])
         if runner.making is not None:
             runner.making.cancel()
-        runner.making = self._background.submit(lambda: (name, step, made(name, *problem)))
+        runner.making = self._background.submit(lambda: (name, step, background.begun(name, *problem)))
 
     def _hand_out(self) -> None:
         """Hands out the controllers that are made."""

@@ -31,7 +31,6 @@ def write_report(
     header: Sequence[str],
     rows: Sequence[Sequence[str]],
     replays: Sequence[Replay],
-    playground: str,
     pictures: Mapping[str, Sequence[Path]],
     facts: Mapping[str, object],
 ) -> Path:
@@ -43,7 +42,6 @@ def write_report(
         header: names of the table's columns.
         rows: of the table, which the reader can sort by any column.
         replays: episodes in 3D, one scene for each take, with play, pause and scrubbing.
-        playground: a page that is shown within this one.
         pictures: PNGs by the title above them, captioned with their names.
         facts: what the results depend on, such as versions; shown at the foot of the page.
     """
@@ -58,7 +56,6 @@ def write_report(
         rows=rows,
         word_columns=_WORD_COLUMNS,
         data=_replay_data(replays),
-        playground=playground,
         pictures=shown,
         facts=facts,
         style=asset("style.css"),
