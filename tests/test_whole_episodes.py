@@ -8,7 +8,7 @@ import torch
 from resuming import goes_on_as_if_never_stopped
 
 from ballbot_gym.env import make_task
-from ballbot_gym.params import default_params
+from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import whole_episodes
 from ballbot_train.learning.learners import LEARNERS
@@ -16,10 +16,10 @@ from ballbot_train.policy import load_network
 from ballbot_train.policy_files import shipped_policies
 
 
-def made(name, seed=0, **settings):
+def made(name, seed=0, robot="paper", **settings):
     small = {"horizon": 0, "iterations": 4, "num_envs": 4, "episode_seconds": 0.2, "hidden": (8,), "symmetry": "none"}
     settings = replace(LEARNERS["shac"].settings(name), **(small | settings))
-    return LEARNERS["shac"].make(make_task(name), default_params(), settings, seed, None)
+    return LEARNERS["shac"].make(make_task(name, robot), named_robot(robot), settings, seed, None)
 
 
 def test_it_goes_on_from_its_state_as_if_never_stopped():
@@ -73,3 +73,15 @@ def test_an_episode_that_fails_has_a_price_and_finite_gradients():
     figures = learner.iterate()
     assert figures["train/failure_rate"] == 1
     assert np.isfinite(figures["train/gradient"])
+
+
+def test_a_ball_that_slips_has_a_price_and_does_not_end_its_episode():
+    learner = made("stabilize", robot="rolling", symmetry="odd", num_envs=32, episode_seconds=0.1)
+    gentle, fine = learner._episodes()
+    learner._batch.reset(seed=0)
+    with torch.no_grad():
+        learner._trained.linear.weight.mul_(-3)  # asks for more friction than there is
+    slipping, still_fine = learner._episodes()
+    assert fine.all()
+    assert still_fine.all()
+    assert slipping.mean() > 2 * gentle.mean()

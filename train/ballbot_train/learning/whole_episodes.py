@@ -7,8 +7,9 @@ is relative.
 
 Two parts of a task have no gradient and get one here. A first exit lies at the control step at which the cost so far, plus a
 penalty on what the state still lacks of the goal, is least. A penalty on coming closer to a margin than `margin_clearance`
-stands for failures, and one on a ball that nearly slips where friction is limited. An episode of full length, or with noise,
-pays in its last half second for what it lacks of the goal, because the cost hardly tells rest at the goal from rest near it.
+stands for failures, and one on a ball that slips or nearly does, whose episode goes on as if it gripped. An episode of full
+length, or with noise, pays in its last half second for what it lacks of the goal, because the cost hardly tells rest at the
+goal from rest near it.
 """
 
 import math
@@ -62,7 +63,7 @@ class _Step(NamedTuple):
     inside: torch.Tensor
     """(B,) bool: in the goal."""
     failed: torch.Tensor
-    """(B,) bool."""
+    """(B,) bool. A ball that slips goes on as if it gripped: the penalty on slipping has a gradient then."""
     actuator: torch.Tensor
     past: torch.Tensor
     """As of `BatchState`."""
@@ -153,6 +154,7 @@ class WholeEpisodes:
         noisy = self._batch.randomization.is_noisy
         rests = not task.first_exit and (noisy or task.steps >= self._own_steps)
         ends, patience = [], _PATIENCE
+        last = torch.full_like(total, _FAILURE_PENALTY)
         ahead = int(noisy or task.clock)  # what noise and clock give changes with the steps
         for k in range(task.steps):
             step = self._step(state)
@@ -161,7 +163,9 @@ class WholeEpisodes:
                 total = total + torch.where(alive, _GOAL_PENALTY / _RESTING * step.lacking, 0.0)
             alive, standing = alive & ~(step.failed & ~reached), standing & ~step.failed
             if task.first_exit:
-                ends.append(torch.where(alive & standing, total + _GOAL_PENALTY * step.lacking, math.inf))
+                ended = total + _GOAL_PENALTY * step.lacking
+                ends.append(torch.where(alive & standing, ended, math.inf))
+                last = torch.where(alive & standing, ended, last)
                 reached = reached | (alive & step.inside)
                 patience -= bool((reached | ~alive).all())
                 if not patience:
@@ -173,8 +177,8 @@ class WholeEpisodes:
             state = state._replace(x=x, actuator=step.actuator, past=step.past, steps=state.steps + ahead)
         if not task.first_exit:
             return total + _FAILURE_PENALTY * ~alive, alive
-        least = torch.stack(ends).amin(0)
-        return torch.where(torch.isfinite(least), least, _FAILURE_PENALTY), reached
+        # one that fails ends where it failed, and not at its best moment before
+        return torch.where(alive, torch.stack(ends).amin(0), last), reached
 
     def _one_step(self, state: BatchState) -> _Step:
         """One control step of every episode; compiled."""
@@ -194,7 +198,8 @@ class WholeEpisodes:
         goal = torch.stack(task.goal(x, c))
         lacking = (goal + _GOAL_CLEARANCE).clamp(min=0).sum(0)
         inside = (goal <= 0).all(0)
-        return _Step(result.final_x, cost, lacking, inside, result.failure, new.actuator, new.past)
+        failed = result.failure & (result.violated != len(task.limit_names))  # that number is grip's
+        return _Step(result.final_x, cost, lacking, inside, failed, new.actuator, new.past)
 
 
 def grip_penalty(params: Any, x: tuple[Any, ...], force: tuple[Any, ...], dt: float) -> Any:
