@@ -92,7 +92,7 @@ python-%: .venv-pythons/uv/bin/uv
 	.venv-pythons/uv/bin/uv venv --clear --seed --python $* .venv-pythons/$*
 	.venv-pythons/$*/bin/pip install --no-compile -e ".[mujoco]" pytest
 	.venv-pythons/$*/bin/python -m pytest tests/test_extras.py -k without_a_warning
-	.venv-pythons/$*/bin/pip install --no-compile -e ".[mujoco,baselines]" filelock hypothesis pytest rich tyro
+	.venv-pythons/$*/bin/pip install --no-compile -e ".[mujoco,baselines]" filelock pytest rich tyro
 	.venv-pythons/$*/bin/python -m pytest -m "not slow" -k "not spec_of_an_env and not vector and not display" $(APPLY)
 	sed '1,/^```python/d; /^```/,$$d' README.md | .venv-pythons/$*/bin/python -
 	.venv-pythons/$*/bin/pip install --dry-run --quiet --only-binary=:all: -e ".[train]"

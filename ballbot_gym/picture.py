@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFilter
 
-from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, Robot, arrow, body_axis, push_arrow, ring
+from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, Robot, arrow, body_axis, pose, push_arrow, ring
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 
@@ -276,10 +276,8 @@ def _grown(box: Sequence[float], by: float, size: tuple[int, int]) -> tuple[int,
 
 def _parts(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The ball's centre, and the two ends of the body's axis."""
-    ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
-    axis = body_axis(robot.x)
-    middle, half = ball + params.com_height * axis, params.body_length / 2 * axis
-    return ball, middle - half, middle + half
+    place = pose(params, robot.x)
+    return place.ball, 2 * place.body - place.top, place.top
 
 
 def _foot(marker: Marker) -> np.ndarray:

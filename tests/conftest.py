@@ -77,6 +77,15 @@ def interpreted(monkeypatch):
         monkeypatch.setattr(shooting, name, functools.cache(getattr(shooting, name).__wrapped__))
 
 
+@pytest.fixture(scope="session")
+def demos(tmp_path_factory):
+    """Four episodes of Stabilize under LQR, as a dataset."""
+    from ballbot_train.learning.demonstrations import DemoConfig, write_demos
+
+    config = DemoConfig("stabilize", "lqr", episodes=4, physics="rk4")
+    return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1, lambda count: None)
+
+
 @pytest.fixture
 def make_env():
     """Makes environments that are closed after the test."""

@@ -17,7 +17,6 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import TASKS
 from ballbot_train.learning import routing, training
 from ballbot_train.learning.datasets import load_demos
-from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.learners import LEARNERS, dagger
 
 CLONING = dagger.DaggerConfig(iterations=4, gathering_iterations=0, gradient_steps=20, batch_size=128, hidden=(16,))
@@ -33,12 +32,6 @@ TINY_DAGGER = dagger.DaggerConfig(
     hidden=(8,),
     max_guesses=1,
 )
-
-
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory):
-    config = DemoConfig("stabilize", "lqr", episodes=4, physics="rk4")
-    return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1, lambda count: None)
 
 
 def test_cloning_lowers_the_loss_and_comes_near_its_expert(demos):

@@ -13,7 +13,6 @@ from ballbot_gym.tasks import TASKS
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.learning.actors import spec_for
 from ballbot_train.learning.datasets import Demos, load_demos
-from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners import LEARNERS, model_free, ppo, sac
 from ballbot_train.policy import PolicyNetwork, load_network, save_policy
@@ -42,12 +41,6 @@ def little_imitation(monkeypatch):
         monkeypatch.setattr(model_free, f"_{constant}", value)
     monkeypatch.setattr(sac, "_CONTROL_DT", None)  # as in the task
     monkeypatch.setattr(ppo, "UPDATE_EPOCHS", 2)
-
-
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory):
-    config = DemoConfig("stabilize", "lqr", episodes=4, physics="rk4")
-    return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1, lambda count: None)
 
 
 @pytest.fixture(params=["ppo", "sac"])

@@ -7,8 +7,7 @@ jobs that have no file. A folder belongs to one configuration until it is releas
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -164,53 +163,26 @@ def _lock(out: Path) -> None:
         _held[out.resolve()] = lock
 
 
-@contextmanager
-def _locked(out: Path) -> Iterator[None]:
-    """Locks a folder within the block, unless this process has claimed it already."""
-    if _holds(out):
-        yield
-        return
-    _lock(out)
-    try:
-        yield
-    finally:
-        unlock(out)
-
-
 def run(
     jobs: Sequence[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]
 ) -> list[list[Entry]]:
-    """Does what is not done yet, as `stream` does.
-
-    Returns:
-        The entries of each job, in the order of its items; every item has one.
-    """
-    done = dict(stream(jobs, out, workers, on_progress))
-    return [done[i] for i in range(len(jobs))]
-
-
-def stream(
-    jobs: Iterable[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]
-) -> Iterator[tuple[int, list[Entry]]]:
-    """Does what is not done yet, and gives each job when it is done.
-
-    The calling process writes every result when it comes, whoever computed it.
+    """Does what is not done yet. The calling process writes every result when it comes, whoever computed it.
 
     Args:
-        jobs: what there is to do. They are taken when workers have room for them.
-        out: folder of the results; unfinished ones are in a folder within.
+        jobs: what there is to do.
+        out: folder of the results, which the caller has claimed; unfinished ones are in a folder within.
         workers: a number of processes, or `Workers`. The calling process does no job itself, so that it outlives any of
             them; see `completed`.
         on_progress: called with a job's group and a number of its items that are there.
 
-    Yields:
-        The number of a job that is done, and its entries in the order of its items.
+    Returns:
+        The entries of each job, in the order of its items; every item has one.
 
     Raises:
         WorkerError: a worker died.
-        ValueError: another process is using the folder, or there are no workers.
+        ValueError: there are no workers.
     """
-    kept: list[tuple[int, list[Entry]]] = []  # that were finished before, and are still to be given
+    results: dict[int, list[Entry]] = {}
 
     def tasks() -> Iterator[Any]:
         for number, job in enumerate(jobs):
@@ -218,18 +190,13 @@ def stream(
                 yield (number, job), _result, (job,)
             else:
                 on_progress(job.group, len(job.items))
-                kept.append((number, done))
+                results[number] = done
 
-    with _locked(out):
-        unfinished(out).mkdir(parents=True, exist_ok=True)
-        for (number, job), text in completed(tasks(), workers):
-            files.write(_path_of(out, job.name), text)
-            on_progress(job.group, len(job.items))
-            while kept:
-                yield kept.pop()
-            yield number, json.loads(text)
-        while kept:
-            yield kept.pop()
+    for (number, job), text in completed(tasks(), workers):
+        files.write(_path_of(out, job.name), text)
+        on_progress(job.group, len(job.items))
+        results[number] = json.loads(text)
+    return [results[i] for i in range(len(jobs))]
 
 
 def _result(job: Job) -> str:

@@ -199,7 +199,6 @@ def make(
     jobs.claim(out, {"shards": url, **about}, "set.json")
     shards.begin(about)
     folder = jobs.unfinished(out)
-    folder.mkdir(exist_ok=True)
 
     def parts_of(shard: int) -> dict[range, Path]:
         """The parts of a shard, and the files in which those are kept that are there."""

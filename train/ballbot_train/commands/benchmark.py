@@ -110,5 +110,5 @@ def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Pa
     optimum = certified.load(task, robot, episodes=[0]).trajectories[0]
     curves = [figures.Curve("optimum", optimum, "0.35", "--")]
     curves += [figures.Curve(f"{take.label}, {take.note}", take.trajectory, take.color) for take in replay.takes]
-    figure = figures.trajectory_figure(replay.title, curves, figures.marker_circles(replay.markers))
+    figure = figures.trajectory_figure(replay.title, curves, replay.markers)
     return figures.save(figure, out / "figures" / f"{task}.png")

@@ -49,9 +49,9 @@ def optimize(
     optimum = find_optimum(env.task, env.params, info["state"], info["constants"], twice=True)
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
-    circles = figures.marker_circles(env.task.markers(info["constants"]))
     curve = figures.Curve("optimum", trajectory, figures.COLORS["trajopt"])
-    picture = figures.save(figures.trajectory_figure(env.task.id, [curve], circles), out / "figure.png")
+    figure = figures.trajectory_figure(env.task.id, [curve], env.task.markers(info["constants"]))
+    picture = figures.save(figure, out / "figure.png")
     rows = [
         ["cost", f"{optimum.cost:.6f}"],
         ["duration, s", f"{trajectory.duration:.2f}"],

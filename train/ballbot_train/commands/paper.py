@@ -10,8 +10,11 @@ from ballbot_baselines.paper_experiments import TRACKING_DT, compare_stabilizati
 from ballbot_baselines.paper_problems import PAPER_PROBLEMS, PaperProblem
 from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.params import default_params
+from ballbot_gym.tasks.marker import Marker
 from ballbot_train.console import check_names, console, physics_or_default, print_rows
 from ballbot_train.report import figures
+
+_GREY = (0.75, 0.75, 0.75, 1.0)
 
 
 def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
@@ -33,7 +36,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
             figures.Curve("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", "--"),
             figures.Curve(f"{simulator} under TVLQR", tracked.executed, figures.COLORS["trajopt"]),
         ]
-        figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", curves, _paper_circles(entry, plan))
+        figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", curves, _paper_markers(entry, plan))
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}.png")
         tilt = math.degrees(np.abs(plan.trajectory.x[:, 2:4]).max())
         rows.append(
@@ -85,11 +88,11 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
     print_rows(f"Stabilization in {simulator}, both with Stabilize's weights", rows)
 
 
-def _paper_circles(entry: PaperProblem, plan: Plan) -> list[figures.Circle]:
+def _paper_markers(entry: PaperProblem, plan: Plan) -> list[Marker]:
     if entry.problem.periodic:
-        return [figures.Circle(0, 0, float(plan.q[0]), filled=False)]
+        return [Marker((0.0, 0.0), float(plan.q[0]), 0.0, _GREY, ring=True)]
     ball = default_params().ball_radius
-    return [figures.Circle(x, y, distance - ball) for x, y, distance in entry.obstacles]
+    return [Marker((x, y), distance - ball, 0.0, _GREY) for x, y, distance in entry.obstacles]
 
 
 def _slug(text: str) -> str:

@@ -88,11 +88,9 @@ class RegretCallback(BaseCallback):
                 f"{self.num_timesteps} steps: regret {figures['certified/regret_mean']:.2%} (worst "
                 f"{figures['certified/regret_worst']:.2%}), success {figures['certified/success']:.1%}"
             )
-        is_best = self.best is None or _order(figures) < _order(self.best)
-        if is_best:
-            self.best = figures
+        self.best = min(self.evaluations, key=_order)
         if self.save_path is not None:
-            self._write(self.save_path, is_best)
+            self._write(self.save_path, self.best is figures)
 
     def _write(self, folder: Path, is_best: bool) -> None:
         files.write_csv(folder / "evaluations.csv", self.evaluations)

@@ -27,7 +27,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Literal, cast
 
 import gymnasium
 import minari
@@ -36,14 +36,14 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 
 from ballbot_baselines import CONTROLLERS
-from ballbot_baselines.optimum import Backoff, Optimum
+from ballbot_baselines.optimum import Backoff
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_gym import seeding
 from ballbot_gym.engines import check_installed, default_physics
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER
-from ballbot_gym.rollout import Controller, PlanError
+from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train import jobs, shards
 from ballbot_train.console import check_names
@@ -123,21 +123,14 @@ class Recording:
     truncations: np.ndarray
 
 
-@runtime_checkable
-class Planner(Controller, Protocol):
-    """A controller that plans at `reset`, and follows `plan` afterwards."""
-
-    plan: Optimum | None
-
-
 class Expert:
     """A controller as a teacher: it gives its action in states of an episode that others control, and replans if told to."""
 
     def __init__(self, name: str, task: Task, params: BallbotParams, backoff: Backoff = EXECUTED):
         """Args: name: as in `DemoConfig`; backoff: given to a controller whose constructor takes one."""
-        controller = controllers.make_controller(name, task, params)
+        controller: Any = controllers.make_controller(name, task, params)
         if "backoff" in inspect.signature(type(controller)).parameters:
-            controller = cast(Callable[..., Controller], CONTROLLERS[name])(task, params, backoff=backoff)
+            controller = cast(Any, CONTROLLERS[name])(task, params, backoff=backoff)
         self._task, self._params, self._controller = task, params, controller
         self.plans = self.plans_failed = 0
 
@@ -150,7 +143,7 @@ class Expert:
     def replan(self, t: float, x: np.ndarray) -> None:
         """Plans anew from state x (8,); keeps the old plan if there is no new one. Experts without plans do nothing."""
         controller = self._controller
-        if not isinstance(controller, Planner):
+        if not hasattr(controller, "plan"):
             return
         plan = controller.plan
         try:
@@ -169,7 +162,7 @@ class Expert:
 
     def _over(self, t: float) -> bool:
         """Whether the plan has ended without reaching a first-exit goal."""
-        plan = self._controller.plan if isinstance(self._controller, Planner) else None
+        plan = getattr(self._controller, "plan", None)
         return self._task.first_exit and plan is not None and t - self._start > plan.trajectory.duration - 1e-9
 
 

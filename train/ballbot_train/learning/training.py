@@ -232,17 +232,13 @@ def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any], test_episod
     return run.measure(test_episodes)
 
 
-_WORST = math.inf, math.inf
-"""Cost and mean cost that every policy goes below."""
-
-
 class _Run:
     """The folder of a run."""
 
     def __init__(self, learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool):
         self.learner, self.task, self.config, self.out = learner, task, dict(config), out
         self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
-        self.best, self.rows = _WORST, []
+        self.rows: list[dict[str, Any]] = []
         self.robot = self.config.get("robot", PAPER)
         self.randomization = checked_randomization(self.config.get("randomization"))
         self.validation_episodes = self.config.get("validation_episodes", VALIDATION_EPISODES)
@@ -269,8 +265,6 @@ class _Run:
             self.seconds = float(state["seconds"])
             self.rows = [{name: row[name] for name in _COLUMNS} for row in state["rows"]]
             self.cpu_seconds = float(state["cpu_seconds"])
-            cost, mean_cost = state["best_validation"]
-            self.best = float(cost), float(mean_cost)
         except MemoryError:
             raise
         except Exception as error:  # torch and the learners have dozens of ways to refuse a damaged state
@@ -295,12 +289,7 @@ class _Run:
         named = {name.removeprefix("certified/").replace("/", "_"): value for name, value in figures.items()}
         self.rows.append(row | named)
         self._write_rows()
-        before = [row["iteration"] for row in self.rows[:-1]]
-        if self._preparation and max(before, default=0) <= self._preparation < self.learner.iteration:
-            self.best = _WORST
-        cost = figures["validation/cost"], figures["validation/mean_cost"]
-        if cost < self.best:
-            self.best = cost
+        if self._chosen is self.rows[-1]:
             self._save_policy(network)
         return figures
 
@@ -328,7 +317,6 @@ class _Run:
             "learner": self.learner.state_dict(),
             "seconds": self.seconds,
             "cpu_seconds": self.cpu_seconds,
-            "best_validation": self.best,
             "rows": self.rows,
             "policy": load_network(self.out / "policy", self.task, self.robot).state_dict(),
         }
@@ -369,7 +357,10 @@ class _Run:
         reached = getattr(self.learner, "difficulty", {})
         return {
             "training": self.config,
-            "chosen_by": {"episodes": f"{self.validation_episodes} fresh, for validation", "cost": self.best[0]},
+            "chosen_by": {
+                "episodes": f"{self.validation_episodes} fresh, for validation",
+                "cost": self._chosen["validation_cost"],
+            },
             "iteration": self._chosen["iteration"],
             "training_seconds": round(self.cpu_seconds, 1),
             **({"curriculum_reached": reached} if reached else {}),

@@ -38,23 +38,7 @@ class Curve:
     style: str = "-"
 
 
-@dataclass(frozen=True)
-class Circle:
-    """A circle on the ground path, m: an obstacle if filled, else a line to follow."""
-
-    x: float
-    y: float
-    radius: float
-    filled: bool = True
-    color: tuple[float, ...] | str = "0.75"
-
-
-def marker_circles(markers: Sequence[Marker]) -> list[Circle]:
-    """The markers of a task as circles, seen from above."""
-    return [Circle(*marker.position, marker.radius, not marker.ring, marker.color[:3]) for marker in markers]
-
-
-def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Circle] = ()) -> Figure:
+def trajectory_figure(title: str, curves: Sequence[Curve], markers: Sequence[Marker] = ()) -> Figure:
     """The paper's form: position, velocity and lean over time, forces over time, and the ground path."""
     figure = Figure(figsize=(12, 6.2), layout="constrained")
     figure.suptitle(title, fontsize=13)
@@ -85,7 +69,7 @@ def trajectory_figure(title: str, curves: Sequence[Curve], circles: Sequence[Cir
         axes["path"].plot(*curve.trajectory.x[:, :2].T, curve.style, color=curve.color, lw=2, label=curve.label)
     for key in ("lean", "force"):
         axes[key].set_xlabel("time, s")
-    _finish_path(axes["path"], curves, circles)
+    _finish_path(axes["path"], curves, markers)
     return figure
 
 
@@ -195,13 +179,10 @@ def _folded(text: str) -> str:
     return "\n".join(textwrap.wrap(text, 28))
 
 
-def _finish_path(axis: Axes, curves: Sequence[Curve], circles: Sequence[Circle]) -> None:
-    for circle in circles:
-        line = "-" if circle.filled else "--"
-        shape = patches.Circle(
-            (circle.x, circle.y), circle.radius, fill=circle.filled, color=circle.color, ls=line, alpha=0.4
-        )
-        axis.add_patch(shape).set_zorder(0)
+def _finish_path(axis: Axes, curves: Sequence[Curve], markers: Sequence[Marker]) -> None:
+    for marker in markers:
+        look = {"fill": not marker.ring, "ls": "--" if marker.ring else "-", "color": marker.color[:3]}
+        axis.add_patch(patches.Circle(marker.position, marker.radius, **look, alpha=0.4)).set_zorder(0)
     start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
     axis.plot(*start[:2], "o", color="k", ms=5)
     axis.plot(*end[:2], "s", color="k", ms=5)

@@ -45,7 +45,7 @@ def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
         figures.Curve(name, one.motion, labels.color(name.lower(), i))
         for i, (name, one) in enumerate(zip(names, shown, strict=True))
     ]
-    return _figure(figures.trajectory_figure("", curves, figures.marker_circles(_markers(shown))))
+    return _figure(figures.trajectory_figure("", curves, _markers(shown)))
 
 
 def plot_rows(rows: "Sequence[Row]") -> Figure:
