@@ -137,8 +137,9 @@ def test_the_documentation_says_of_every_shipped_policy_what_its_file_says():
         measured, training = about["measured"], about["training"]
         seconds = about["training_seconds"]
         kind = ", ".join(training[name] for name in ("task", "robot", "randomization") if name in training)
+        informed = "informed: " * bool(about["spec"].get("informed"))
         row = (
-            f"| {kind} | {training['learner']} | {seconds / 60:.0f} min | {measured['success']:.1%} | "
+            f"| {informed}{kind} | {training['learner']} | {seconds / 60:.0f} min | {measured['success']:.1%} | "
             f"{measured['falls']} | {measured['regret_mean']:.2%} | {measured['regret_median']:.2%} |"
         )
         assert row in text, row
