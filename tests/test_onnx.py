@@ -17,7 +17,9 @@ from ballbot_train.policy_files import SHIPPED, PolicySpec, read_description, tr
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
 
 CLOSE = 5e-6  # of actions in [−1, 1], in float32: where a policy turns into a frame and back, rounding grows
-SHIPPED_NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
+SHIPPED_NAMES = sorted(  # the filter in front of informed policies is not exported
+    path.stem for path in SHIPPED.glob("*.json") if "-informed-" not in path.stem
+)
 
 
 def session(path):
