@@ -220,7 +220,8 @@ class BallbotParams:
         for name, places in _PLACES.items():
             value = getattr(self, name)
             if name == "ball_inertia" and not self.rolls:
-                value = 0.4 * self.ball_mass * self.ball_radius**2  # a solid sphere's, which has no effect
+                # a solid sphere's, which has no effect; a power would raise an OverflowError where a product is inf
+                value = 0.4 * self.ball_mass * self.ball_radius * self.ball_radius
             for query, attribute in places:
                 if (element := root.find(query)) is not None:  # only a ball that rolls collides
                     element.set(attribute, f"0 0 {value!r}" if attribute == "xyz" else repr(value))

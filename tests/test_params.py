@@ -46,6 +46,12 @@ def test_written_urdf_reads_back_bit_by_bit(robot, tmp_path):
     assert BallbotParams.from_urdf(path, gravity=changed.gravity) == changed
 
 
+def test_a_ball_whose_inertia_is_beyond_all_numbers_has_a_urdf_too(params, tmp_path):
+    huge = dataclasses.replace(params, ball_radius=1e200)
+    (tmp_path / "huge.urdf").write_text(huge.to_urdf())
+    assert BallbotParams.from_urdf(tmp_path / "huge.urdf", gravity=huge.gravity) == huge
+
+
 def test_gravity_is_the_callers_and_defaults_to_the_earths():
     assert BallbotParams.from_urdf().gravity == 9.81
     assert BallbotParams.from_urdf(gravity=1.62).gravity == 1.62
