@@ -565,6 +565,7 @@ TYPED = [
     ("evaluate shac --fresh 10 --optima 11", "optima must be at most the 10 fresh episodes, not 11"),
     ("evaluate shac --fresh 10 --out /dev/null", "/dev/null cannot be a folder, because a file is in its place"),
     ("evaluate lqr --fresh 10", "lqr is an expert"),
+    ("evaluate shac-ekf --robot omni_strong --fresh 10", "shac-ekf is behind the filter of sensors"),
     ("train ppo --task stabilize --symmetry frame", "has no frame"),
     ("train ppo --episode-seconds 0.013", "is not a whole number of control steps"),
     ("benchmark --controllers mine.json", "mine.json is not a policy"),

@@ -207,8 +207,9 @@ def _cluster(workers: Workers) -> Iterator[Pool]:
         finally:
             if not connected:
                 ray.shutdown()  # which ends the tasks too
-            for future in list(running) if connected else ():
-                ray.cancel(future.object_ref, force=True)  # pyright: ignore[reportAttributeAccessIssue] Ray's own
+            else:
+                for future in list(running):
+                    ray.cancel(future.object_ref, force=True)  # pyright: ignore[reportAttributeAccessIssue] Ray's own
 
 
 def _connect(ray: Any, workers: Workers, folder: Path) -> None:

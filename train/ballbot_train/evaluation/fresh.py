@@ -18,7 +18,6 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from ballbot_baselines.adaptive import BehindTrackFilter
 from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
@@ -264,9 +263,9 @@ def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> Bat
     """
     if isinstance(policy, str | Path):
         controller = _controller(str(policy), batch.task, robot)
-        if isinstance(controller, BehindTrackFilter):
+        if not isinstance(controller, PolicyController):
             return _behind_filter(controller, batch)
-        network = cast(PolicyController, controller).network
+        network = controller.network
 
         def act(observation: torch.Tensor) -> torch.Tensor:
             with own_precision():
@@ -289,21 +288,23 @@ def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> Bat
 
 def _controller(policy: str, task: Task, robot: str) -> Controller:
     """The controller of that name, which acts in many episodes at once."""
-    if is_expert(policy):
+    controller = None if is_expert(policy) else make_controller(policy, task, named_robot(robot))
+    if controller is None or getattr(controller, "senses", False):
+        what = "an expert" if controller is None else "behind the filter of sensors"
         raise ValueError(
-            f"{policy} is an expert, which acts in one episode at a time, and fresh episodes run all at once; give a "
+            f"{policy} is {what}, which acts in one episode at a time, and fresh episodes run all at once; give a "
             "policy, or run it on certified episodes with ballbot benchmark"
         )
-    return make_controller(policy, task, named_robot(robot))
+    return controller
 
 
-def _behind_filter(controller: BehindTrackFilter, batch: BallbotBatch) -> BatchPolicy:
+def _behind_filter(controller: Controller, batch: BallbotBatch) -> BatchPolicy:
     """The controller as a function of observations, in place of which it takes what sensors report of states."""
-    times = itertools.count(0.0, batch.task.control_dt)
+    steps = itertools.count()
 
     def act(observation: torch.Tensor) -> torch.Tensor:
         assert batch.state is not None
-        x, t = batch.sensed(batch.state).T.double().numpy(), next(times)
+        x, t = batch.sensed(batch.state).T.double().numpy(), next(steps) * batch.task.control_dt
         if t == 0:
             controller.reset(t, x, batch.state.c.T.double().numpy())
         return torch.from_numpy(controller.act(t, x) / batch.params.force_limit)
