@@ -15,9 +15,9 @@ from ballbot_train.play.live_page import PlayPage
 from ballbot_train.play.simulation import Playground
 from ballbot_train.policy_files import SHIPPED
 
-viser = pytest.importorskip("viser")
+pytest.importorskip("viser")
 
-from visitor import Visitor, wait_for  # noqa: E402 it needs what comes with viser
+from visitor import Visitor, wait_for
 
 STANDING = 3  # a certified episode of Stabilize in which LQR comes to rest
 
@@ -150,19 +150,6 @@ def test_what_cannot_be_done_is_said_and_goes_back(opened, visitor):
     opened.goes_on()
 
 
-def test_who_leaves_while_something_is_saved_or_dragged_harms_nothing(opened, visitor, capfd):
-    opened.goes_on()
-    with Visitor(opened.port) as other:
-        other.drag("start", 0.5)
-        for label in ("Save the episode so far", "Push"):
-            other.change(label)
-        other.connection.close()
-    wait_for(lambda: len(opened.viewer.server.get_clients()) == 1)
-    opened.goes_on()
-    said = capfd.readouterr()
-    assert "Traceback" not in said.out + said.err
-
-
 @pytest.mark.slow
 def test_the_server_ends_when_it_is_told_to(tmp_path):
     code = "from ballbot_train.commands.play import play; play('stabilize', 'lqr', (), port=0, physics='rk4')"
@@ -183,43 +170,29 @@ def asked(port, **headers):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
     connection.request("GET", "/", headers=headers)
     answer = connection.getresponse()
-    text = answer.read()
+    text = answer.read().decode()
     connection.close()
     return answer, text
 
 
-FOREIGN = [
-    ({"Origin": "http://evil.example"}, "another page"),
-    ({"Origin": "null"}, "another page"),
-    ({"Origin": "http://localhost:1"}, "another page"),
-    ({"Host": "evil.example"}, "no other name"),
-    ({"Host": "localhost.evil.example", "Origin": "http://localhost.evil.example"}, "no other name"),
-    ({"Host": "192.168.0.1"}, "no other name"),
-    ({"Host": "["}, "no other name"),
-    ({"Host": ""}, "no other name"),
-]
-
-
 def test_pages_of_others_and_names_of_others_are_refused(opened):
-    upgrade = {
-        "Upgrade": "websocket",
-        "Connection": "Upgrade",
-        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
-        "Sec-WebSocket-Version": "13",
-        "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
-    }
-    for headers, message in FOREIGN:
-        for live in ({}, upgrade):
-            answer, text = asked(opened.port, **headers, **live)
-            assert answer.status == 403, headers
-            assert message in text.decode()
+    from websockets.exceptions import InvalidStatus
+
+    for origin in ("http://evil.example", "null", "http://localhost:1"):
+        answer, text = asked(opened.port, Origin=origin)
+        assert (answer.status, text) == (403, "another page may not connect")
+        with pytest.raises(InvalidStatus, match="403"):
+            Visitor(opened.port, Origin=origin)
+    for host in ("evil.example", "localhost.evil.example", "192.168.0.1", "[", ""):
+        answer, text = asked(opened.port, Host=host, Origin=f"http://{host}")
+        assert (answer.status, "no other name" in text) == (403, True), host
 
 
 def test_its_own_page_may_connect_and_no_other_may_frame_it(opened):
     port = opened.port
     for host in (f"localhost:{port}", f"127.0.0.1:{port}", "localhost:9000", "[::1]:8080"):  # tunnels have other ports
         answer, text = asked(port, Host=host, Origin=f"http://{host}")
-        assert (answer.status, b"<html" in text) == (200, True)
+        assert (answer.status, "<html" in text) == (200, True)
         assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'self'"
     with Visitor(port, Origin=f"http://127.0.0.1:{port}") as visitor:
         assert visitor.value("Speed") == 1.0

@@ -86,11 +86,11 @@ class World:
 class Runner:
     """A ballbot under one controller, and its episode so far."""
 
-    def __init__(self, name: str, controller: Controller, world: World, physics: str):
+    def __init__(self, name: str, controller: Controller, world: World, physics: str, hidden: Randomization):
+        """`hidden` is what the controller does not know: the true robot, its actuator, sensors and pushes."""
         self.name, self.controller = name, controller
         self._world, self._physics = world, physics
-        self.env = self._env_with(Randomization())
-        """Its randomization is what the controller does not know: the true robot, its actuator, sensors and pushes."""
+        self.env = self._env_with(hidden)
 
     @property
     def x(self) -> State:
@@ -107,18 +107,13 @@ class Runner:
         """Whether its episode is over."""
         return self.violated != "" or self.arrived
 
-    def begin(self, start: tuple[np.ndarray, np.ndarray], hidden: Randomization, seed: int) -> None:
+    def begin(self, start: tuple[np.ndarray, np.ndarray], seed: int) -> None:
         """Begins an episode in a state (8,) with constants (nc,). The seed is of all that is drawn in it."""
-        if hidden != self.env.randomization:
-            self.env.close()
-            self.env = self._env_with(hidden)
         self.env.reset(seed=seed, options={"state": start[0], "constants": start[1]})
         self._go_from(tuple(start[0].tolist()))
 
     def join(self, other: "Runner") -> None:
         """Takes the place of another robot in its episode, and all that is drawn for it."""
-        self.env.close()
-        self.env = self._env_with(other.env.randomization)
         self.env.reset()
         self.env.set_state(other.env.get_state())
         self._go_from(other.x)
@@ -393,7 +388,7 @@ class Playground:
                 runner.env.close()
                 self.runners.remove(runner)
         for name, controller in ready.items():
-            self.runners.append(Runner(name, controller, self.world, self._physics))
+            self.runners.append(Runner(name, controller, self.world, self._physics, self._hidden()))
             self.runners[-1].join(self.main)
 
     def set_plant(self, stress: str, value: float) -> None:
@@ -441,7 +436,7 @@ class Playground:
         made = {name: self._made(name, world) for name in dict.fromkeys(controllers)}
         self.close()
         self.world = world
-        self.runners = [Runner(name, controller, world, self._physics) for name, controller in made.items()]
+        self.runners = [Runner(*each, world, self._physics, self._hidden()) for each in made.items()]
         if episode == "rest":
             self.start_at_rest()
         elif episode is None or world.certified is None:
@@ -472,7 +467,7 @@ class Playground:
         self._pending_push = self._push = np.zeros(2)
         seed = int(self._rng.integers(2**32))  # the same for all, so that they meet the same robot, noise and pushes
         for runner in self.runners:
-            runner.begin(start, self._hidden(), seed)
+            runner.begin(start, seed)
             self.announce(f"preparing {labels.label(runner.name)} …")
             try:
                 runner.controller.reset(0.0, *map(np.array, start))
