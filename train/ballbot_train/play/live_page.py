@@ -50,7 +50,7 @@ class PlayPage:
         self._bound: list[tuple[Any, Callable[[], Any]]] = []
         self._ghosts: dict[str, Any] = {}
         playground.announce = self._announce
-        viewer.on_grab = lambda vector: self.request(lambda: playground.push(*(vector / PUSH_SCALE).tolist()))
+        viewer.on_grab = lambda vector: self._requests.put(lambda: playground.push(*(vector / PUSH_SCALE).tolist()))
         self._build()
 
     # --- the loop ---
@@ -91,10 +91,6 @@ class PlayPage:
     def stop(self) -> None:
         """Ends `run`; from any thread."""
         self._stopped = True
-
-    def request(self, action: Callable[[], object]) -> None:
-        """Has the loop do something between two steps; from any thread."""
-        self._requests.put(action)
 
     def _do_requests(self) -> None:
         """Does what was asked for until now. What cannot be done is said, and the simulation goes on."""
@@ -195,7 +191,7 @@ class PlayPage:
         async def asked(event: Any) -> None:
             client, value = event.client, getattr(event.target, "value", None)
             if event.client_id is not None:  # not set by this program
-                self.request(lambda: action(client, value))
+                self._requests.put(lambda: action(client, value))
 
         return asked
 
@@ -242,7 +238,6 @@ class PlayPage:
     def _announce(self, text: str) -> None:
         """Says what is about to be done, before it is done."""
         self._status.content = f"**{markdown_text(text)}**"
-        self.viewer.server.flush()
         self._next_text = 0.0
 
     def _text(self) -> str:
