@@ -8,11 +8,10 @@ import contextlib
 import io
 import logging
 import math
-import socket
+import re
 import sys
-import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -25,9 +24,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import rgb
 from ballbot_gym.tasks.marker import Marker
 
-HOST, PORT = "127.0.0.1", 8080
-_TRIED_PORTS = 100
-
+PORT = 8080
 _EYE, _AIM = (-2.6, -1.8, 1.5), (0.0, 0.0, 0.5)  # m: from behind a robot that moves along x
 _SQUARE = 1.0  # m, of the floor
 _LINE_HEIGHT = 0.008  # m, so that lines on the floor do not flicker
@@ -38,9 +35,7 @@ _FOLLOW = 0.15  # share of the distance by which the camera follows in each draw
 _JUMP = 4.0  # m, of a distance that it follows at once
 _LABEL_HEIGHT = 0.16  # m, between the labels of robots that are in one place
 _GRAB_REACH = 3.0  # m, the farthest that a drag counts
-
-Grab = Callable[[int, str, np.ndarray], None]
-"""Gets the id of the client who drags the robot, "start", "update" or "end", and how far (2,) on the floor, m."""
+_LOCAL = r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"  # names that no website can have; tunnels have other ports
 
 
 def has_viser() -> bool:
@@ -58,37 +53,35 @@ def import_viser() -> Any:
 
 
 class Viewer:
-    """A server whose page shows the last drawing. `server` is viser's. Every browser that opens `address` sees the same."""
+    """A server whose page shows the last drawing. `server` is viser's. Every browser that opens `address` sees the same.
 
-    def __init__(self, host: str = HOST, port: int = PORT, label: str = "ballbot"):
+    It listens on this machine alone.
+    """
+
+    def __init__(self, port: int = PORT, label: str = "ballbot"):
         """Starts the server.
 
         Args:
-            host: address to bind. If others than this machine reach it, the page asks for the token in `address`.
-            port: where to listen; the next free one, if it is taken.
+            port: where to listen, or the next free one if it is taken; 0 is any free one.
             label: title of the page.
 
         Raises:
             ImportError: viser is missing.
-            OSError: nothing can listen there.
+            ValueError: no such port.
         """
         viser = import_viser()
-        from ballbot_gym.gate import Gate, guard  # it imports what comes with viser
-
-        port, self._gate = _free_port(host, port), Gate(host)
-        # Whoever sends garbage, or leaves while the server stops, would get a traceback onto the user's terminal.
+        if not 0 <= port < 2**16:  # viser would wait for ever
+            raise ValueError(f"port must be 0 to {2**16 - 1}, not {port}")
+        # Whoever leaves while the server stops would get a traceback onto the user's terminal.
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-        # viser prints an address that may not be the one to open.
-        with contextlib.redirect_stdout(io.StringIO()), guard(self._gate):
-            self.server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()), _guarded():  # viser greets with an address
+            self.server = viser.ViserServer(host="127.0.0.1", port=port, label=label, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self.on_grab: Grab | None = None
-        self._host = host
-        self._nodes: dict[str, list[Any]] = {}
-        self._looks: dict[str, Any] = {}
+        self.on_grab: Callable[[np.ndarray], object] | None = None
+        """Gets how far (2,) on the floor somebody has dragged the robot, m, when the drag ends."""
+        self._shown: dict[str, tuple[Hashable, list[Any]]] = {}
+        self._before: dict[str, tuple[Hashable, list[Any]]] = {}
         self._shift = np.zeros(2)
-        self._lock = threading.Lock()
-        self._closed = False
         scene = self.server.scene
         scene.set_up_direction("+z")
         scene.configure_default_lights(cast_shadow=False)  # shadows of light are slow without a graphics card
@@ -107,171 +100,106 @@ class Viewer:
         )
 
     @property
-    def port(self) -> int:
-        """Where the server listens."""
-        return self.server.get_port()
-
-    @property
     def address(self) -> str:
-        """What to open in a browser, with the token if it takes one."""
-        host = {HOST: "localhost", "0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(
-            self._host, self._host
-        )
-        token = f"/?token={self._gate.token}" if self._gate.token else ""
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}{token}"
+        """What to open in a browser."""
+        return f"http://localhost:{self.server.get_port()}"
 
     def draw(self, drawing: Drawing) -> None:
         """Shows a moment. What is the same as before is not sent again."""
-        with self._lock:
-            if self._closed:
-                return
-            with self.server.atomic():
-                self._draw(drawing)
-
-    def centre_on(self, point: np.ndarray) -> None:
-        """Moves the scene at once so that a point of the floor (2,), m, is in the middle."""
-        self._shift = np.asarray(point, np.float64).copy()
-
-    def aim(self) -> None:
-        """Turns every browser's camera to where it was first."""
-        for client in self.server.get_clients().values():
-            client.camera.position, client.camera.look_at = _EYE, _AIM
+        with self.server.atomic():
+            self._follow(drawing.robots[-1].x[:2] if drawing.robots else np.zeros(2))
+            self._before, self._shown = self._shown, {}
+            for i, robot in enumerate(reversed(drawing.robots)):
+                self._draw_robot(i, drawing.params, robot)
+            for i, path in enumerate(drawing.paths):
+                segments, width = _segments(path), 0.02 if path.dashed else 0.015
+                self._draw_lines(f"path{i}", (path.color, path.dashed), segments, rgb(path.color), width)
+            for i, marker in enumerate(drawing.markers):
+                self._draw_marker(f"marker{i}", marker)
+            for _, nodes in self._before.values():
+                nodes[0].remove()
 
     def close(self) -> None:
         """Stops the server; may be called again."""
-        with self._lock:
-            if not self._closed:
-                self._closed = True
-                self.server.stop()
+        self.server.stop()
 
-    def _draw(self, drawing: Drawing) -> None:
-        goal = drawing.robots[-1].x[:2] if drawing.robots else np.zeros(2)
-        self._shift += (_FOLLOW if np.hypot(*(goal - self._shift)) < _JUMP else 1.0) * (goal - self._shift)
+    def _follow(self, goal: np.ndarray) -> None:
+        """Moves the scene so that a point of the floor (2,), m, comes to the middle."""
+        at_once = not self._shown or np.hypot(*(goal - self._shift)) > _JUMP
+        self._shift = self._shift + (1.0 if at_once else _FOLLOW) * (goal - self._shift)
         self._world.position = (-self._shift[0], -self._shift[1], 0.0)
-        shown = {"markers"}
-        self._draw_markers(drawing.markers)
-        for i, robot in enumerate(reversed(drawing.robots)):
-            shown |= self._draw_robot(drawing.params, robot, grab=i == 0)
-            if robot.label:
-                top = pose(drawing.params, robot.x).top + (0.0, 0.0, _LABEL_HEIGHT * (i + 1))
-                shown.add(self._draw_label(f"label {robot.name}", robot.label, top))
-        for path in drawing.paths:
-            shown.add(self._draw_path(path))
-        for key in set(self._nodes) - shown:
-            self._remove(key)
 
-    def _draw_robot(self, params: BallbotParams, robot: Robot, grab: bool) -> set[str]:
-        """Moves a robot and its arrows; returns their keys."""
-        key = f"robot {robot.name}"
-        if self._looks.get(key) != (look := (params, robot.color, robot.alpha, grab)):
-            self._remove(key)
-            self._nodes[key], self._looks[key] = self._add_robot(params, robot, grab), look
-        ball, body, _ = self._nodes[key]
+    def _nodes(self, key: str, look: Hashable, make: Callable[[str], list[Any]]) -> list[Any]:
+        """viser's nodes of what is drawn under a key, made anew if it looks otherwise. The first one holds the others."""
+        known = self._before.pop(key, None)
+        if known is None or known[0] != look:
+            if known is not None:
+                known[1][0].remove()
+            known = look, make(f"/world/{key}")
+        self._shown[key] = known
+        return known[1]
+
+    def _draw_robot(self, i: int, params: BallbotParams, robot: Robot) -> None:
+        """Moves a robot, its arrows and its label. The first one can be dragged."""
+        look = params, robot.color, robot.alpha
+        nodes = self._nodes(f"robot{i}", look, lambda name: self._add_robot(name, params, robot, grab=i == 0))
+        _, ball, body, force, push, label = nodes
         place = pose(params, robot.x)
         ball.position, body.position, body.wxyz = place.ball, place.body, place.turn
-        keys = {key, f"force {robot.name}", f"push {robot.name}"}
-        self._draw_arrow(f"force {robot.name}", arrow(params, robot), FORCE)
-        self._draw_arrow(f"push {robot.name}", push_arrow(params, robot), PUSH)
-        return keys
+        for node, ends in ((force, arrow(params, robot)), (push, push_arrow(params, robot))):
+            node.visible = ends is not None
+            if ends is not None:
+                node.points = np.array([ends], np.float32)
+        label.text, label.visible = robot.label, robot.label != ""
+        label.position = place.top + (0.0, 0.0, _LABEL_HEIGHT * (i + 1))
 
-    def _add_robot(self, params: BallbotParams, robot: Robot, grab: bool) -> list[Any]:
-        """The nodes that move, then the one that holds them all."""
-        scene, name = self.server.scene, f"/world/{_node_name(robot.name)}"
-        root = scene.add_frame(name, show_axes=False)
-        opacity = None if robot.alpha == 1 else robot.alpha
-        ball, body = (scene.add_frame(f"{name}/{part}", show_axes=False) for part in ("ball", "body"))
-        look = {"opacity": opacity, "cast_shadow": False, "receive_shadow": False}
-        sphere = scene.add_icosphere(f"{name}/ball/shape", params.ball_radius, rgb(BALL), **look)
-        radius, length = params.body_radius, params.body_length
-        shape = scene.add_cylinder(f"{name}/body/shape", radius, length, rgb(robot.color), **look)
-        cap = scene.add_cylinder(
-            f"{name}/body/cap",
-            1.02 * radius,
-            0.06 * length,
-            rgb(BALL),
-            position=(0.0, 0.0, 0.44 * length),
-            **look,
-        )
+    def _add_robot(self, name: str, params: BallbotParams, robot: Robot, grab: bool) -> list[Any]:
+        scene, radius, length = self.server.scene, params.body_radius, params.body_length
+        look = {"opacity": None if robot.alpha == 1 else robot.alpha, "cast_shadow": False, "receive_shadow": False}
+        root, ball, body = (scene.add_frame(f"{name}{part}", show_axes=False) for part in ("", "/ball", "/body"))
+        parts = [
+            scene.add_icosphere(f"{name}/ball/shape", params.ball_radius, rgb(BALL), **look),
+            scene.add_cylinder(f"{name}/body/shape", radius, length, rgb(robot.color), **look),
+            scene.add_cylinder(
+                f"{name}/body/cap", 1.02 * radius, 0.06 * length, rgb(BALL), position=(0.0, 0.0, 0.44 * length), **look
+            ),
+        ]
         scene.add_cylinder(
             f"{name}/ball/shadow",
             1.3 * params.ball_radius,
             0.002,
             (40, 45, 60),
-            opacity=_SHADOW * robot.alpha,
             position=(0.0, 0.0, _SHADOW_HEIGHT - params.ball_radius),
-            cast_shadow=False,
-            receive_shadow=False,
+            **look | {"opacity": _SHADOW * robot.alpha},
         )
-        if grab:
-            for part in (sphere, shape, cap):
-                part.on_drag("left")(self._grabbed)
-        return [ball, body, root]
+        for part in parts if grab else ():
+            part.on_drag("left")(self._grabbed)
+        force, push = (
+            scene.add_arrows(f"{name}/{what}", np.zeros((1, 2, 3)), rgb(color), visible=False)
+            for what, color in (("force", FORCE), ("push", PUSH))
+        )
+        label = scene.add_label(f"{name}/label", "", anchor="bottom-center", visible=False)
+        return [root, ball, body, force, push, label]
 
-    def _draw_arrow(self, key: str, ends: tuple[np.ndarray, np.ndarray] | None, color: str) -> None:
-        if key not in self._nodes:
-            if ends is None:
-                return
-            name = f"/world/{_node_name(key)}"
-            self._nodes[key] = [self.server.scene.add_arrows(name, np.array([ends]), rgb(color))]
-        (node,) = self._nodes[key]
-        node.visible = ends is not None
-        if ends is not None:
-            node.points = np.array([ends], np.float32)
-
-    def _draw_label(self, key: str, text: str, place: np.ndarray) -> str:
-        if key not in self._nodes:
-            self._nodes[key] = [self.server.scene.add_label(f"/world/{_node_name(key)}", text, anchor="bottom-center")]
-        (node,) = self._nodes[key]
-        node.text, node.position = text, place
-        return key
-
-    def _draw_path(self, path: GroundPath) -> str:
-        key = f"path {path.name}"
-        segments = _segments(path)
-        if self._looks.get(key) != path.color:
-            self._remove(key)
-            self._looks[key] = path.color
-            name = f"/world/{_node_name(key)}"
-            thickness = 0.02 if path.dashed else 0.015
-            self._nodes[key] = [
-                self.server.scene.add_line_segments(name, segments, rgb(path.color), thickness=thickness)
-            ]
-        (node,) = self._nodes[key]
+    def _draw_lines(self, key: str, look: Hashable, segments: np.ndarray, color: tuple, width: float) -> None:
+        add = self.server.scene.add_line_segments
+        (node,) = self._nodes(key, look, lambda name: [add(name, segments, color, thickness=width)])
         node.points = segments
-        return key
 
-    def _draw_markers(self, markers: Sequence[Marker]) -> None:
-        if self._looks.get("markers") == tuple(markers):
-            return
-        self._remove("markers")
-        self._looks["markers"] = tuple(markers)
-        self._nodes["markers"] = [self._add_marker(i, marker) for i, marker in enumerate(markers)]
-
-    def _add_marker(self, i: int, marker: Marker) -> Any:
-        scene, (x, y), color = self.server.scene, marker.position, rgb(marker.color[:3])
+    def _draw_marker(self, key: str, marker: Marker) -> None:
+        """Draws a marker, which does not move."""
+        (x, y), color, opacity = marker.position, rgb(marker.color[:3]), marker.color[3]
         if marker.ring:
-            segments = _segments(GroundPath(ring(marker), ""))
-            return scene.add_line_segments(f"/world/marker{i}", segments, color, thickness=0.03)
-        opacity = None if marker.color[3] == 1 else marker.color[3]
-        return scene.add_cylinder(
-            f"/world/marker{i}",
-            marker.radius,
-            marker.height,
-            color,
-            opacity=opacity,
-            position=(x, y, marker.height / 2),
-        )
-
-    def _remove(self, key: str) -> None:
-        nodes = self._nodes.pop(key, [])
-        for node in nodes[-1:] if key.startswith("robot ") else nodes:
-            node.remove()
-        self._looks.pop(key, None)
+            self._draw_lines(key, marker, _segments(GroundPath(ring(marker), "")), color, 0.03)
+            return
+        add, look = self.server.scene.add_cylinder, {"opacity": None if opacity == 1 else opacity}
+        place = (x, y, marker.height / 2)
+        self._nodes(key, marker, lambda name: [add(name, marker.radius, marker.height, color, position=place, **look)])
 
     async def _grabbed(self, event: Any) -> None:
         """A coroutine, so that viser keeps the order of the events."""
-        if self.on_grab is not None:
-            self.on_grab(event.client_id, event.phase, _dragged(event))
+        if self.on_grab is not None and event.phase == "end":
+            self.on_grab(_dragged(event))
 
 
 class PageScene:
@@ -294,11 +222,6 @@ class PageScene:
         self._next = 0.0
         sys.stderr.write(f"the robot is shown at {self._viewer.address}\n")
 
-    @property
-    def address(self) -> str:
-        """What to open in a browser."""
-        return self._viewer.address
-
     def set_markers(self, markers: Sequence[Marker]) -> None:
         """Replaces the task's markers; an episode begins."""
         self._markers, self._trace = tuple(markers), []
@@ -318,16 +241,52 @@ class PageScene:
         self._viewer.close()
 
 
-def _free_port(host: str, port: int) -> int:
-    """The first port from `port` on where a server can listen. viser would wait for ever where there is none."""
-    failure: Exception | None = None
-    for attempt in range(port, port + (_TRIED_PORTS if port else 1)):
-        try:
-            socket.create_server((host, attempt), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
-            return attempt
-        except (OSError, OverflowError) as error:
-            failure = error
-    raise OSError(f"cannot listen on {host}, port {port}: {failure}; give another address or port of this machine")
+@contextlib.contextmanager
+def _guarded() -> Iterator[None]:
+    """A viser server that is started meanwhile answers no other website.
+
+    Any page that is open in a browser can connect to a server on the same machine, and can give this machine a name that it
+    owns. So `Host` and `Origin` of every request are checked, and nobody may frame the page.
+
+    Raises:
+        RuntimeError: none was started, or this version of viser starts it in another way.
+    """
+    from websockets.asyncio import server
+
+    start, guarded = server.serve, False
+
+    def serve(handler: Any, host: str, port: int, **settings: Any) -> Any:
+        nonlocal guarded
+        guarded, answer = True, settings["process_request"]
+
+        def process_request(connection: Any, request: Any) -> Any:
+            if refusal := _refusal(request.headers):
+                return connection.respond(403, refusal)
+            response = answer(connection, request)
+            if response is not None:
+                response.headers["Content-Security-Policy"] = "frame-ancestors 'self'"
+            return response
+
+        settings["process_request"] = process_request
+        return start(handler, host, port, **settings)
+
+    server.serve = serve  # pyright: ignore[reportAttributeAccessIssue] viser takes no other
+    try:
+        yield
+    finally:
+        server.serve = start
+    if not guarded:
+        raise RuntimeError("this version of viser cannot be guarded; install the one that constraints.txt names")
+
+
+def _refusal(headers: Any) -> str:
+    """Why a request with these headers is not answered; "" where it is."""
+    hosts = headers.get_all("Host")
+    if len(hosts) != 1 or not re.fullmatch(_LOCAL, hosts[0]):
+        return "open the address that was printed: the page has no other name"
+    if any(origin != f"http://{hosts[0]}" for origin in headers.get_all("Origin")):
+        return "another page may not connect"
+    return ""
 
 
 def _segments(path: GroundPath) -> np.ndarray:
@@ -350,11 +309,4 @@ def _dragged(event: Any) -> np.ndarray:
         on_level = eye + (start[2] - eye[2]) / ray[2] * ray
     vector = (on_level - start)[:2]
     length = float(np.hypot(*vector))
-    if not math.isfinite(length):
-        return np.zeros(2)
-    return vector * min(1.0, _GRAB_REACH / length) if length else vector
-
-
-def _node_name(name: str) -> str:
-    """A name without what viser reads as a path."""
-    return "".join(letter if letter.isalnum() else "_" for letter in name)
+    return vector * (_GRAB_REACH / max(length, _GRAB_REACH)) if math.isfinite(length) else np.zeros(2)

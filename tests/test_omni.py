@@ -21,7 +21,7 @@ from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Stabilize
 from ballbot_gym.two_forces import TwoForces
 from ballbot_train.learning.learners import LEARNERS
-from ballbot_train.play.world import World
+from ballbot_train.play.simulation import World
 from ballbot_train.policy import PolicyController, PolicyNetwork
 from ballbot_train.policy_files import PolicySpec
 

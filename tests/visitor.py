@@ -32,12 +32,11 @@ def wait_for(condition, seconds=20.0):
 
 
 class Visitor:
-    """Sees the page of a port. Without `arrive` it never says where its camera is, as viser's page does at once."""
+    """Sees the page of a port."""
 
-    def __init__(self, port, arrive=True, **headers):
+    def __init__(self, port, **headers):
         self.controls = {}
         self.files = {}
-        self.packets = 0
         self._labels = {}
         self._node = ""
         self.connection = connect(
@@ -47,11 +46,9 @@ class Visitor:
             max_size=None,
             close_timeout=0.5,
         )
-        self._thread = threading.Thread(target=self._listen, daemon=True)
-        self._thread.start()
-        if arrive:
-            self.send(**CAMERA)
-            wait_for(lambda: "Start" in self.controls)
+        threading.Thread(target=self._listen, daemon=True).start()
+        self.send(**CAMERA)
+        wait_for(lambda: "Start" in self.controls)
 
     def __enter__(self):
         return self
@@ -64,18 +61,15 @@ class Visitor:
         with contextlib.suppress(ConnectionClosed):
             self.connection.send(msgspec.msgpack.encode(message))
 
-    def update(self, label, /, **updates):
-        """Names properties of the control with this label, and values for them."""
-        self.send(type="GuiUpdateMessage", uuid=self.uuid(label), updates=updates)
-
     def change(self, label, value=True):
         """Gives a control a value, or presses a button. As in viser's page it shows the value at once."""
-        self.update(label, value=value)
-        self.controls[label]["value"] = value
+        control = self.controls[label]
+        self.send(type="GuiUpdateMessage", uuid=control["uuid"], updates={"value": value})
+        control["value"] = value
 
     def press(self, key):
         """Triggers the command with this label."""
-        self.send(type="CommandTriggerMessage", uuid=self.uuid(key))
+        self.send(type="CommandTriggerMessage", uuid=self.controls[key]["uuid"])
 
     def drag(self, phase, x):
         """Drags the robot along x, m."""
@@ -94,10 +88,6 @@ class Visitor:
             owner="",
         )
 
-    def uuid(self, label):
-        """viser's id of a control."""
-        return self.controls[label]["uuid"]
-
     def value(self, label):
         """What the page shows in a control."""
         return self.controls[label]["value"]
@@ -109,7 +99,6 @@ class Visitor:
     def _listen(self):
         with contextlib.suppress(ConnectionClosed):
             for packet in self.connection:
-                self.packets += 1
                 size = int.from_bytes(packet[8:16], "little")
                 inner = msgspec.msgpack.decode(zstandard.decompress(packet[16 : 16 + size]))
                 for message in inner["messages"]:

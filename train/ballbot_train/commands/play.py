@@ -5,7 +5,7 @@ from typing import Literal
 
 from ballbot_gym.env import make_task
 from ballbot_gym.robots import PAPER
-from ballbot_gym.viewer import HOST, PORT, Viewer, import_viser
+from ballbot_gym.viewer import PORT, Viewer, import_viser
 from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.play.live_page import PlayPage
@@ -21,7 +21,6 @@ def play(
     physics: Literal["bullet", "mujoco", "rk4"] | None = None,
     robot: RobotName = PAPER,
     seed: int = 0,
-    host: str = HOST,
     port: int = PORT,
     randomization: str | None = None,
 ) -> None:
@@ -37,8 +36,7 @@ def play(
         physics: "bullet", "mujoco" or "rk4"; default, the first that is installed.
         robot: name of a robot.
         seed: of random starts, noise and pushes.
-        host: address to bind. Everybody but this machine needs the token that is printed.
-        port: where the page is; the next free one, if it is taken.
+        port: where the page is, for this machine only; the next free one, if it is taken.
         randomization: name of a track, as "unknown": every episode has a robot of it, which the controllers are not told.
     """
     task = task_name(controller or "", task, robot)
@@ -46,8 +44,9 @@ def play(
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"
     start = None if episode == "random" else episode
+    console.print("preparing the controllers …")
     playground = Playground(task, controller, ghosts, physics, start, seed, robot, randomization)
-    viewer = Viewer(host, port, "ballbot play")
+    viewer = Viewer(port, "ballbot play")
     page = PlayPage(playground, viewer)
     signal.signal(signal.SIGTERM, lambda *_: page.stop())
     try:

@@ -1,40 +1,39 @@
-"""The page of the live playground: what is shown when, and the loop that keeps the simulation in real time.
+"""The page of the live playground: its controls, and the loop that keeps the simulation in real time.
 
 viser calls back in a thread of its own. What a browser asks for goes into a queue, and the loop of the simulation does it
-between two steps. So the playground itself needs no locks.
+between two steps. So the playground needs no locks.
 """
 
-import contextlib
-import gc
 import math
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
-import numpy as np
-
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, files
 from ballbot_gym.drawing import PUSH_SCALE
+from ballbot_gym.robots import without_wheels
+from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
 from ballbot_train.escaping import markdown_text
-from ballbot_train.play import views
-from ballbot_train.play.clock import Clock
-from ballbot_train.play.controls import Controls
-from ballbot_train.play.simulation import Playground
+from ballbot_train.evaluation.robustness import STRESSES
+from ballbot_train.play.simulation import LARGEST_PUSH, PLANT, Playground
+from ballbot_train.report import labels
 
+PATIENCE = 0.1
+"""s of lag that is caught up; more, as of a planner, is given up."""
 _DRAW_HZ, _TEXT_HZ = 30.0, 4.0
-_STARVED = 0.25  # s, after which a moment is drawn even if steps are due
-_MOST_STEPS = 10  # between two looks at the requests
-_IDLE = 0.02  # s, between two looks while nothing moves
-_LONGEST_REST = 3600.0  # s, between two looks while nobody is there
+_IDLE = 0.1  # s, between two looks while nobody is there
+_SLOWEST, _FASTEST = 0.1, 2.0  # simulated seconds per second
 _SCORES_SHOWN = 8
 _NOTICE_LENGTH = 300
 _HELP = "Drag the robot and let go: every robot gets the same push."
+_FILE_HINT = "a policy's .json, or a model of Stable-Baselines3 (.zip), where the simulation runs"
 
 
 class PlayPage:
-    """Controls and scene of a playground in a viewer, and the loop that runs them. Who may open the page may use them."""
+    """Controls and scene of a playground in a viewer, and the loop that runs them. Who opens the page may use them."""
 
     def __init__(self, playground: Playground, viewer: Viewer):
         """Builds the page; `run` brings it to life.
@@ -43,129 +42,214 @@ class PlayPage:
             playground: what is simulated.
             viewer: where it is shown. The page closes neither of them.
         """
-        self.playground, self.viewer = playground, viewer
-        self.clock = Clock(playground.world.task.control_dt)
+        self.playground, self.viewer, self._gui = playground, viewer, viewer.server.gui
         self.paused = False
-        self.single_steps = 0
-        """To do in a pause."""
-        self.visitors: set[int] = set()
-        """Ids of the browsers that show the page. While there are none, time stands still and nothing is computed."""
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        self._stopped = self._moving = False
-        self._status = viewer.server.gui.add_markdown("")
-        self._controls = Controls(self)
-        viewer.on_grab = self._grab
-        viewer.server.on_client_connect(self._on_connect)
-        viewer.server.on_client_disconnect(self._on_disconnect)
-        viewer.centre_on(np.array(playground.main.x[:2]))
+        self._stopped = False
+        self._next_text = 0.0
+        self._bound: list[tuple[Any, Callable[[], Any]]] = []
+        self._ghosts: dict[str, Any] = {}
+        playground.announce = self._announce
+        viewer.on_grab = lambda vector: self._requests.put(lambda: playground.push(*(vector / PUSH_SCALE).tolist()))
+        self._build()
 
     # --- the loop ---
 
     def run(self, seconds: float = math.inf) -> None:
-        """Simulates and draws in real time until `stop` is called, or for some seconds."""
-        end = time.perf_counter() + seconds
-        next_draw = next_text = drawn = 0.0
-        while not self._stopped and (now := time.perf_counter()) < end:
-            self._do_requests(0.0 if self.visitors else min(_LONGEST_REST, end - now))
-            if not self.visitors:
-                self.clock.stop()
-                self._moving = False
+        """Simulates and draws in real time until `stop` is called, or for some seconds. Stands still while nobody watches."""
+        now = due = next_draw = time.perf_counter()
+        end = now + seconds
+        while not self._stopped and now < end:
+            self._do_requests()
+            if not self.watched:
+                time.sleep(_IDLE)
+                now = due = time.perf_counter()
                 continue
-            stood, self._moving = not self._moving, self._steps_due()
-            if stood and self._moving:
-                self._collect_garbage()
             now = time.perf_counter()
-            if now >= next_draw and (self.clock.wait() > 0 or now - drawn > _STARVED):
-                self.viewer.draw(views.drawing(self.playground))
-                next_draw, drawn = max(next_draw + 1 / _DRAW_HZ, now), now
-                if now >= next_text:
-                    self._write()
-                    next_text = now + 1 / _TEXT_HZ
-            until = min(next_draw, end) - time.perf_counter()
-            time.sleep(max(0.0, min(until, self.clock.wait() if self._moving else _IDLE)))
+            if self.paused:
+                due = now + 1 / _DRAW_HZ
+            elif now >= due:
+                due = self.next_due(now, due)
+                self.playground.step()
+            if now >= next_draw:
+                self.viewer.draw(self.playground.drawing())
+                next_draw = max(next_draw, now) + 1 / _DRAW_HZ
+            if now >= self._next_text:
+                self._next_text = now + 1 / _TEXT_HZ
+                self._refresh()
+            time.sleep(max(0.0, min(due, next_draw) - time.perf_counter()))
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser shows the page."""
+        return bool(self.viewer.server.get_clients())
+
+    def next_due(self, now: float, due: float) -> float:
+        """When the step is due, s, that follows one that was due at `due` and begins now."""
+        return max(due, now - PATIENCE) + self.playground.world.task.control_dt / max(_SLOWEST, self.speed.value)
 
     def stop(self) -> None:
         """Ends `run`; from any thread."""
         self._stopped = True
-        self.request(lambda: None)
 
-    def request(self, action: Callable[[], object]) -> None:
-        """Has the loop do something between two steps; from any thread."""
-        self._requests.put(action)
-
-    def _collect_garbage(self) -> None:
-        """Does it when the robot begins to move. A collection of everything that was imported would be a step too late."""
-        gc.unfreeze()
-        gc.collect()
-        gc.freeze()
-        self.clock.stop()  # the pause that this made is not caught up
-
-    def _steps_due(self) -> bool:
-        """Does the steps that are due; whether the simulation moves."""
-        if self.paused:
-            self.clock.stop()
-            if self.single_steps > 0 and self.playground.step():
-                self.single_steps -= 1
-            return False
-        for _ in range(_MOST_STEPS):
-            if self.clock.take() is None:
-                break
-            if not self.playground.step():
-                self.clock.stop()
-                return False
-        return True
-
-    def _do_requests(self, patience: float) -> None:
-        """Does what was asked for until now, or within `patience`, s. Whatever a browser sends, the simulation goes on."""
-        asked: list[Callable[[], object]] = []
-        with contextlib.suppress(queue.Empty):
-            asked = [self._requests.get(timeout=patience)] if patience > 0 else []
-        asked += [self._requests.get() for _ in range(self._requests.qsize())]
-        for action in [*asked, *[self._controls.refresh] * (len(asked) > 0)]:
+    def _do_requests(self) -> None:
+        """Does what was asked for until now. What cannot be done is said, and the simulation goes on."""
+        while not self._requests.empty():
+            self.playground.notice = ""
             try:
-                action()
+                self._requests.get()()
             except Exception as error:
                 self.playground.notice = str(error) or repr(error)
+            self._next_text = 0.0
 
-    # --- browsers ---
+    # --- controls ---
 
-    def asking(self, action: Callable[[Any, Any], object]) -> Any:
+    def _build(self) -> None:
+        gui, playground = self._gui, self.playground
+        self._status = gui.add_markdown("")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Play"):
+            self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_task, lambda: playground.world.task_name)
+            self._bind(
+                gui.add_dropdown("Robot", without_wheels()), playground.set_robot, lambda: playground.world.robot
+            )
+            self._controller = gui.add_dropdown("Controller", ("lqr",))
+            self._bind(self._controller, playground.set_controller, lambda: playground.main.name)
+            file = gui.add_text("Policy file", "", hint=_FILE_HINT)
+            self._button("Use the policy file", lambda: playground.set_controller(file.value))
+            self._ghost_folder = gui.add_folder("Ghosts", expand_by_default=False)
+            self._build_time()
+            self._build_push()
+        with tabs.add_tab("Change"), gui.add_folder("What the controllers do not know"):
+            for stress, (label, low, high, step) in PLANT.items():
+                slider = gui.add_slider(label, low, high, step, 0.0, hint=STRESSES[stress].label)
+                self._bind(slider, partial(playground.set_plant, stress), partial(playground.plant.get, stress))
+            self._button(
+                "All as the controllers believe", lambda: [playground.set_plant(stress, 0.0) for stress in PLANT]
+            )
+        with tabs.add_tab("Scores"):
+            save = gui.add_button("Save the episode so far", hint="a trajectory file, for ballbot replay")
+            save.on_click(self._asking(lambda client, _: self._save(client)))
+            self._scores = gui.add_markdown("")
+        self._refresh()
+
+    def _build_time(self) -> None:
+        gui, playground = self._gui, self.playground
+        with gui.add_folder("Time"):
+            actions = {"Play / pause": self._toggle, "Step": self._step, "Restart": playground.restart}
+            self._button_group(" ", actions, hint="keys: space, and R for restart")
+            self.speed = gui.add_slider("Speed", _SLOWEST, _FASTEST, step=0.1, initial_value=1.0)
+            episode = gui.add_number("Certified episode", 0, min=0, step=1)
+            self._bind(
+                episode,
+                playground.start_certified,
+                lambda: episode.value if playground.episode is None else playground.episode,
+            )
+            starts = {
+                "Certified": lambda: playground.start_certified(episode.value),
+                "Random": playground.start_random,
+                "At rest": playground.start_at_rest,
+            }
+            self._button_group("Start", starts, hint="key: N for a random one")
+        self._key("pause or play", "space", self._toggle)
+        self._key("restart", "R", playground.restart)
+        self._key("random start", "N", playground.start_random)
+
+    def _build_push(self) -> None:
+        with self._gui.add_folder("Push"):
+            impulse = self._gui.add_slider("N·s", 0.0, LARGEST_PUSH, 5.0, 90.0)
+            bearing = self._gui.add_slider("Direction, °", 0.0, 360.0, 5.0, 0.0, hint="from the x axis")
+
+            def push() -> None:
+                along = math.radians(bearing.value)
+                self.playground.push(impulse.value * math.cos(along), impulse.value * math.sin(along))
+
+            self._button("Push", push, hint="key: P; or drag the robot and let go")
+            self._key("push", "P", push)
+
+    def _bind(self, control: Any, apply: Callable[[Any], object], read: Callable[[], Any]) -> None:
+        """Lets a control change the playground. What is refused goes back to what `read` says."""
+        control.on_update(self._asking(lambda _, value: apply(value)))
+        self._bound.append((control, read))
+
+    def _button(self, label: str, action: Callable[[], object], hint: str | None = None) -> None:
+        self._gui.add_button(label, hint=hint).on_click(self._asking(lambda *_: action()))
+
+    def _button_group(self, label: str, actions: Mapping[str, Callable[[], object]], hint: str) -> None:
+        group = self._gui.add_button_group(label, tuple(actions), hint=hint)
+        group.on_click(self._asking(lambda _, button: actions[button]()))
+
+    def _key(self, label: str, key: Any, action: Callable[[], object]) -> None:
+        self._gui.add_command(label, hotkey=key).on_trigger(self._asking(lambda *_: action()))
+
+    def _asking(self, action: Callable[[Any, Any], object]) -> Any:
         """A callback of viser that asks for something, by viser's client and the value that the control has got.
 
         It is a coroutine of viser's loop, so that callbacks come in the order of the changes.
         """
 
         async def asked(event: Any) -> None:
-            value = getattr(event.target, "value", None)
+            client, value = event.client, getattr(event.target, "value", None)
             if event.client_id is not None:  # not set by this program
-                self.request(lambda: action(event.client, value))
+                self._requests.put(lambda: action(client, value))
 
         return asked
 
-    def _grab(self, client_id: int, phase: str, vector: np.ndarray) -> None:
-        """A drag pushes when it ends, so that the arrow ends where it did."""
-        if phase == "end":
-            x, y = (vector / PUSH_SCALE).tolist()
-            self.request(lambda: self.playground.push(x, y))
+    def _refresh(self) -> None:
+        """Shows what holds now, in every control and in words."""
+        playground, names = self.playground, tuple(self.playground.controllers)
+        if tuple(self._ghosts) != names:
+            self._controller.options = names
+            for box in self._ghosts.values():
+                box.remove()
+            with self._ghost_folder:
+                self._ghosts = {name: self._gui.add_checkbox(name, False) for name in names}
+            for name, box in self._ghosts.items():
+                box.on_update(self._asking(partial(self._set_ghost, name)))
+        shown = [(box, partial(playground.ghosts.__contains__, name)) for name, box in self._ghosts.items()]
+        for control, read in [*self._bound, *shown]:
+            if control.value != (value := read()):
+                control.value = value
+        self._status.content = self._text()
+        scores = reversed(playground.scores[-_SCORES_SHOWN:])
+        self._scores.content = "\n".join(f"- {markdown_text(score.text)}" for score in scores)
 
-    async def _on_connect(self, client: Any) -> None:
-        self.visitors.add(client.client_id)
-        self.request(lambda: None)
+    # --- what they do ---
 
-    async def _on_disconnect(self, client: Any) -> None:
-        self.visitors.discard(client.client_id)
+    def _set_ghost(self, name: str, _: Any, wanted: bool) -> None:
+        others = [ghost for ghost in self.playground.ghosts if ghost != name]
+        self.playground.set_ghosts([*others, name] if wanted else others)
+
+    def _toggle(self) -> None:
+        self.paused = not self.paused
+
+    def _step(self) -> None:
+        self.paused = True
+        self.playground.step()
+
+    def _save(self, client: Any) -> None:
+        """Hands viser's client the trajectory of the episode so far."""
+        episode, name = self.playground.trajectory(), f"{self.playground.world.task_name}.npz"
+        content = files.npz({"t": episode.t, "x": episode.x, "u": episode.u})
+        client.send_file_download(name, content, save_immediately=True)
 
     # --- words ---
 
-    def _write(self) -> None:
-        playground = self.playground
-        main, best = playground.main, playground.optimum_cost_so_far
-        cost = f"cost {main.cost:.2f}" + (f", the optimum's {best:.2f}" if math.isfinite(best) else "")
-        lines = [
-            f"**{markdown_text(views.status(playground))}**",
-            f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, {cost}",
-        ]
-        lines += ["planning …"] * (playground.planning and not playground.preparing) + ["paused"] * self.paused
+    def _announce(self, text: str) -> None:
+        """Says what is about to be done, before it is done."""
+        self._status.content = f"**{markdown_text(text)}**"
+        self._next_text = 0.0
+
+    def _text(self) -> str:
+        """What goes on."""
+        playground, main = self.playground, self.playground.main
+        status = f"{labels.label(main.name)}, {playground.seconds:.1f} s of {playground.world.task.duration:g} s"
+        if playground.ended:
+            status = playground.scores[-1].text
+        cost = f"tilt {math.degrees(dynamics.tilt(main.x)):.0f}°, cost {main.cost:.2f}"
+        if math.isfinite(best := playground.optimum_cost):
+            now = playground.optimum_cost_so_far
+            cost += f", the optimum's {best:.2f}" if math.isnan(now) else f", the optimum's {now:.2f} of {best:.2f}"
+        lines = [f"**{markdown_text(status)}**", cost, *["paused"] * self.paused]
         lines.append(f"*{markdown_text(playground.notice[:_NOTICE_LENGTH])}*" if playground.notice else _HELP)
-        self._status.content = "  \n".join(lines)
-        self._controls.show_scores([markdown_text(score.text) for score in playground.scores[-_SCORES_SHOWN:]])
+        return "  \n".join(lines)

@@ -1,25 +1,31 @@
 """The simulation of the live playground, which knows nothing of pages: a ballbot, ghosts, pushes, hidden changes, costs.
 
-The robot that counts is the main one. Ghosts get the same start and the same pushes under other controllers. Controllers are
-made and plans are found in the background. A robot waits for its first controller, and goes on while another one is made.
+The robot that counts is the main one. Ghosts get the same start and the same pushes under other controllers.
 """
 
+import contextlib
 import math
-from collections.abc import Iterable, Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ballbot_gym.engines import default_physics
+from ballbot_gym import certified, dynamics
+from ballbot_gym.drawing import GHOST_OPACITY, Drawing, GroundPath, Robot
+from ballbot_gym.engines import State, default_physics
+from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
-from ballbot_gym.randomization import checked_randomization
-from ballbot_gym.robots import PAPER
+from ballbot_gym.randomization import Randomization, checked_randomization
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot
+from ballbot_gym.rollout import Controller, sensed
+from ballbot_gym.tasks import TASKS
 from ballbot_gym.trajectory import Trajectory
-from ballbot_train.evaluation.controllers import is_file
-from ballbot_train.play import background
-from ballbot_train.play.runner import Runner, failure_word
-from ballbot_train.play.world import PLANT, World, randomization, severity
+from ballbot_train.console import check_names
+from ballbot_train.evaluation.controllers import is_expert, is_file, is_made_for, make_controller, names
+from ballbot_train.evaluation.robustness import STRESSES
+from ballbot_train.policy_files import BEST, PolicyError
 from ballbot_train.report import labels
 
 LARGEST_PUSH = 250.0
@@ -31,9 +37,139 @@ _FIRST_PUSH_AFTER = 1.0  # s
 
 _PAUSE = 1.5  # s, between the end of a robot and its next episode
 _PUSH_SHOWN = 0.3  # s, for which a push is drawn
-_EPISODES_KEPT = 100
-_SETTLE = 900.0  # s: the first time in a task, solvers are compiled
-_LEAST_COST = 0.01  # of an optimum to which a cost is compared; one that starts at rest costs nothing
+_TRACE_STEPS = 400  # control steps that the trace on the floor goes back
+_PLAN_POINTS = 60  # of a drawn plan
+
+
+PLANT: dict[str, tuple[str, float, float, float]] = {
+    "mass": ("Masses, %", -50.0, 100.0, 5.0),
+    "com": ("Centre of mass, %", -30.0, 50.0, 5.0),
+    "delay": ("Delay, ms", 0.0, 120.0, 20.0),
+    "lag": ("Lag, ms", 0.0, 100.0, 5.0),
+    "noise": ("Sensor noise, ×", 0.0, 5.0, 0.25),
+    "push": ("Random pushes on the ball, N·s", 0.0, 12.0, 0.5),
+}
+"""What the controllers do not know: for a stress in `robustness.STRESSES` a label, the least and the greatest severity, and a
+step. 0 is nothing."""
+
+
+class World:
+    """A task for a robot, and what can be chosen there."""
+
+    def __init__(self, task: str, robot: str, files: Iterable[str] = ()):
+        """A task and a robot by name, and policy files, of which those are offered that are made for both.
+
+        Raises:
+            ValueError: an unknown task or robot, or a robot with wheels.
+        """
+        check_names("task", [task], TASKS)
+        check_names("robot", [robot], ROBOTS)
+        self.task_name, self.robot, self.params = task, robot, named_robot(robot)
+        if self.params.wheels is not None:
+            raise ValueError(f"the playground knows no robot with wheels, as {robot}; watch it with ballbot replay")
+        self.task = make_task(task, robot)
+        known = names(self.task, robot)
+        experts = [name for name in known if is_expert(name)]
+        self.controllers = [*experts, "nmpc-offset-free", *(name for name in known if name not in experts)]
+        """What can be chosen, experts first."""
+        for file in files:
+            with contextlib.suppress(PolicyError):  # a file that is gone by now
+                self.controllers += [file] * is_made_for(file, self.task, robot)
+        best = BEST.get(task, "")
+        self.best = best if best in known else "nmpc"
+        """The controller to begin with: the shipped policy with the least regret, or else NMPC."""
+        self.certified: certified.EvaluationSet | None = None
+        with contextlib.suppress(certified.CertificateError):
+            self.certified = certified.load(self.task, robot)
+
+
+class Runner:
+    """A ballbot under one controller, and its episode so far."""
+
+    def __init__(self, name: str, controller: Controller, world: World, physics: str, hidden: Randomization):
+        """`hidden` is what the controller does not know: the true robot, its actuator, sensors and pushes."""
+        self.name, self.controller = name, controller
+        self._world, self._physics = world, physics
+        self.env = self._env_with(hidden)
+
+    @property
+    def x(self) -> State:
+        """(8,) the state."""
+        return self.states[-1]
+
+    @property
+    def force(self) -> tuple[float, ...]:
+        """(2,) the last force, N."""
+        return self.forces[-1] if self.forces else (0.0, 0.0)
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether its episode is over."""
+        return self.violated != "" or self.arrived
+
+    def begin(self, start: tuple[np.ndarray, np.ndarray], seed: int) -> None:
+        """Begins an episode in a state (8,) with constants (nc,). The seed is of all that is drawn in it."""
+        self.env.reset(seed=seed, options={"state": start[0], "constants": start[1]})
+        self._go_from(tuple(start[0].tolist()))
+
+    def join(self, other: "Runner") -> None:
+        """Takes the place of another robot in its episode, and all that is drawn for it."""
+        self.env.reset()
+        self.env.set_state(other.env.get_state())
+        self._go_from(other.x)
+        self.cost, self.violated, self.arrived = other.cost, other.violated, other.arrived
+
+    def set_hidden(self, hidden: Randomization) -> None:
+        """Changes what the controller does not know, in the middle of an episode."""
+        before = self.env.get_state()
+        self.env.close()
+        self.env = self._env_with(hidden)
+        self.env.reset(seed=0)
+        kept = {name: getattr(before, name) for name in ("constants", "steps_left", "rng")}
+        self.env.set_state(self.env.get_state()._replace(x=self.x, memory=(), **kept))
+
+    def command(self, seconds: float) -> np.ndarray:
+        """(2,) the force, N, that the controller commands at that time of the episode, s.
+
+        Raises:
+            FloatingPointError: a force that is not finite.
+        """
+        u = self.controller.act(seconds, sensed(self.env, np.array(self.x), seconds))
+        u = np.asarray(u, np.float64)
+        if u.shape != (2,) or not np.isfinite(u).all():
+            raise FloatingPointError(f"it commands {u} N")
+        return u
+
+    def step(self, command: np.ndarray, push: np.ndarray) -> None:
+        """Holds a command (2,), N, for one control step, after a push (2,), N·s, on the body's centre of mass."""
+        if push.any():
+            pushed = dynamics.pushed(self.env.episode_params, self.x, tuple(push.tolist()))
+            self.states[-1] = tuple(map(float, pushed))
+            self.env.set_state(self.env.get_state()._replace(x=self.x, memory=()))
+        _, _, terminated, _, info = self.env.step(command / self._world.params.force_limit)
+        self.states.append(tuple(info["state"].tolist()) if np.isfinite(info["state"]).all() else self.x)
+        self.forces.append(tuple(info["force"].tolist()))
+        self.cost += info["cost"]
+        self.violated = self.env.limit_names[info["violated"]] if info["failure"] else ""
+        self.arrived = terminated and info["success"]
+
+    def plan(self, seconds: float) -> np.ndarray:
+        """(n, 2) where its controller plans to go from that time of the episode on, m; none if it does not plan."""
+        predicted, plan = getattr(self.controller, "predicted", None), getattr(self.controller, "plan", None)
+        if predicted is not None:
+            return predicted[:, :2]
+        if plan is None or hasattr(self.controller, "predicted"):
+            return np.zeros((0, 2))
+        rest = plan.trajectory.x[plan.trajectory.t >= seconds]
+        return rest[:: max(1, len(rest) // _PLAN_POINTS), :2]
+
+    def _env_with(self, hidden: Randomization) -> BallbotEnv:
+        return BallbotEnv(self._world.task, self._physics, robot=self._world.params, randomization=hidden)
+
+    def _go_from(self, x: State) -> None:
+        self.states: list[State] = [x]
+        self.forces: list[tuple[float, ...]] = []
+        self.cost, self.violated, self.arrived = 0.0, "", False
 
 
 class Score(NamedTuple):
@@ -55,15 +191,15 @@ class Score(NamedTuple):
         of = " to the optimum of the unchanged robot" * self.changed
         regret = "" if math.isnan(self.regret) else f", regret {100 * self.regret:.1f} %{of}"
         if self.failure:
-            return f"{self.controller}: {failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
+            return f"{self.controller}: {_failure_word(self.failure)} after {self.seconds:.1f} s{regret}"
         return f"{self.controller}: {self.seconds:.1f} s, cost {self.cost:.1f}{regret}"
 
 
 class Playground:
     """A ballbot, its ghosts and their world. `step` moves everything by one control step; nothing here waits for real time.
 
-    Whatever asks for something unknown, or for a value outside of its bounds, gets a ValueError and changes nothing. It is
-    for one thread.
+    Controllers are made, and planners plan, within the call that asks for it. A call that raises changes nothing: it names
+    something unknown, a value out of bounds (ValueError), or a controller that cannot be made or finds no plan.
     """
 
     def __init__(
@@ -93,25 +229,22 @@ class Playground:
         Raises:
             ValueError: an unknown task, robot, controller, episode or track.
         """
-        world = World(task, robot)
-        controller = world.best if controller is None else controller
-        world.check_controllers(controller, *ghosts)
+        self.announce: Callable[[str], object] = lambda text: None
+        """Is told in words what is about to be done that may take long."""
         self.scores: list[Score] = []
-        """Of the last episodes of the main robot."""
+        """Of the main robot's episodes."""
         self.plant = dict.fromkeys(PLANT, 0.0)
         """Severity of each hidden change."""
         self.runners: list[Runner] = []
         """The main robot, then the ghosts."""
-        self.steps = 0
-        """Control steps since the playground was opened."""
         self.notice = ""
         """What went wrong last, in words."""
+        self._files: list[str] = []
         self._rng = np.random.default_rng(seed)
         self._track = checked_randomization(randomization)
         self._physics = default_physics() if physics is None else physics
-        self._background = background.Background()
-        self._optimum: Future | None = None
-        self._open(world, controller, ghosts, episode)
+        world = World(task, robot)
+        self._open(world, [world.best if controller is None else controller, *ghosts], episode)
 
     # --- what it is ---
 
@@ -123,22 +256,12 @@ class Playground:
     @property
     def ghosts(self) -> tuple[str, ...]:
         """The names of the ghosts' controllers."""
-        return tuple(ghost.wanted for ghost in self.runners[1:])
+        return tuple(ghost.name for ghost in self.runners[1:])
 
     @property
     def controllers(self) -> list[str]:
         """What can be chosen in this task, and what is in use; policy files that were not used yet come to it."""
-        return list(dict.fromkeys([*self.world.controllers, *(runner.wanted for runner in self.runners)]))
-
-    @property
-    def preparing(self) -> bool:
-        """Whether a robot waits for its controller."""
-        return any(runner.controller is None for runner in self.runners)
-
-    @property
-    def planning(self) -> bool:
-        """Whether a controller is being made while the robots go on."""
-        return any(runner.making is not None for runner in self.runners)
+        return list(dict.fromkeys([*self.world.controllers, *(runner.name for runner in self.runners)]))
 
     @property
     def seconds(self) -> float:
@@ -152,27 +275,25 @@ class Playground:
 
     @property
     def optimum_cost(self) -> float:
-        """The best cost of an episode from this start without pushes; NaN while it is not known."""
-        costs, known = self._optimum_costs, self.world.certified
-        if costs is None and known is not None and self.episode is not None:
-            return float(known.costs[self.episode])
-        return math.nan if costs is None else float(costs[-1])
+        """The best cost of the certified episode without pushes; NaN of other starts."""
+        known = self.world.certified
+        return math.nan if known is None or self.episode is None else float(known.costs[self.episode])
 
     @property
     def optimum_cost_so_far(self) -> float:
-        """What the optimum has cost until now; NaN while it is not known."""
-        costs = self._optimum_costs
-        return math.nan if costs is None else float(costs[min(self.elapsed, len(costs) - 1)])
-
-    @property
-    def _optimum_costs(self) -> np.ndarray | None:
-        made = self._optimum
-        return made.result() if made is not None and made.done() and made.exception() is None else None
+        """What the optimum has cost until now; NaN where its trajectory is not kept."""
+        known = self.world.certified
+        if known is None or self.episode is None or self.episode >= len(known.trajectories):
+            return math.nan
+        task, best = self.world.task, known.trajectories[self.episode]
+        n = min(self.elapsed, len(best.u))
+        c = task.at(tuple(self.start[1].tolist()), best.t[:n])
+        return task.control_dt * float(np.sum(task.cost(tuple(best.x[:n].T), tuple(best.u[:n].T), c)))
 
     @property
     def shown_push(self) -> np.ndarray | None:
         """(2,) the push that is drawn, N·s; None if there was none lately."""
-        return self._push if self.steps < self._push_until else None
+        return self._push if self.elapsed < self._push_until else None
 
     def trajectory(self) -> Trajectory:
         """The main robot's episode so far.
@@ -180,54 +301,58 @@ class Playground:
         Raises:
             ValueError: it has not begun.
         """
-        if self.main.trajectory is None:
+        if not self.main.forces:
             raise ValueError("the episode has not begun: there is nothing to save")
-        return self.main.trajectory
+        times = self.world.task.control_dt * np.arange(len(self.main.states))
+        return Trajectory(times, np.array(self.main.states), np.array(self.main.forces))
+
+    def drawing(self) -> Drawing:
+        """The present moment."""
+        main, robots, paths = self.main, [], []
+        colors = [labels.color(Path(runner.name).stem, i) for i, runner in enumerate(self.runners)]
+        for i, runner in reversed(list(enumerate(self.runners))):
+            name, alpha = (f"ghost {i}", GHOST_OPACITY) if i else ("robot", 1.0)
+            force = np.array(runner.force) if runner is main and not main.violated else None
+            said = _failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
+            label, push = f"{labels.label(runner.name)} {said}", self.shown_push if runner is main else None
+            robots.append(Robot(np.array(runner.x), colors[i], force, alpha, name, push, label))
+            trace = np.array(runner.states[-_TRACE_STEPS:])[:, :2]
+            paths += [GroundPath(trace, colors[i], name=name)] * (len(trace) > 1)
+        plan = main.plan(self.seconds)
+        if len(plan) > 1 and not main.violated and not self.ended:
+            paths.append(GroundPath(plan, colors[0], dashed=True, name="plan"))
+        return Drawing(self.world.params, tuple(robots), tuple(paths), tuple(self.world.task.markers(self.start[1])))
 
     # --- time ---
 
-    def step(self) -> bool:
-        """Moves everything by one control step; False while the episode waits for its controllers."""
-        self._hand_out()
-        if self.preparing:
-            return False
+    def step(self) -> None:
+        """Moves everything by one control step. After an end everything stands still for a while, then the next begins."""
         if self.ended:
             self._pause_left -= 1
             if not self.ended:
                 self.restart()
-            return True
-        self._plan_again()
-        if self.preparing:
-            return False
-        if self.elapsed == self._first_push_at:
-            self._first_push_at = -1
+            return
+        dt = self.world.task.control_dt
+        if self._at_rest and self.elapsed == round(_FIRST_PUSH_AFTER / dt):
             self.push(*(part * self.world.params.total_mass / default_params().total_mass for part in FIRST_PUSH))
-        push = self._take_push()
+        push, self._pending_push = self._pending_push, np.zeros(2)
+        if push.any():
+            self._push, self._push_until = push, self.elapsed + round(_PUSH_SHOWN / dt)
         for runner in self.runners:
             if not runner.stands_still:
                 try:
-                    command = runner.act(self.steps, self.seconds)
+                    command = runner.command(self.seconds)
                 except Exception as error:  # a controller of any kind, such as a policy: the others go on
-                    self.notice, command = f"{labels.label(runner.wanted)}: {error}", np.zeros(2)
+                    self.notice, command = f"{labels.label(runner.name)}: {error}", np.zeros(2)
                 runner.step(command, push)
-        self.steps += 1
         self.elapsed += 1
-        self._after_step()
-        return True
-
-    def settle(self) -> None:
-        """Waits until every plan is found; for scripts and tests. A TimeoutError says that it took too long."""
-        for _ in range(2):  # a plan that is not found asks for another controller
-            jobs = [self._optimum, *(runner.making for runner in self.runners)]
-            if wait([job for job in jobs if job is not None], _SETTLE).not_done:
-                raise TimeoutError(f"no plan in {_SETTLE:g} s")
-            self._hand_out()
+        if self.elapsed >= self.world.task.steps or self.main.stands_still:
+            self._end()
 
     def close(self) -> None:
-        """Releases simulators and the background; may be called again."""
-        self._background.close()
+        """Releases the simulators; may be called again."""
         for runner in self.runners:
-            runner.close()
+            runner.env.close()
 
     # --- what a user does ---
 
@@ -235,10 +360,8 @@ class Playground:
         """Pushes every robot by an impulse along x and y, N·s, on its body's centre of mass, before the next control step."""
         length = math.hypot(x, y)
         if not math.isfinite(length):
-            self.notice = "a push must be finite numbers"
-            return
-        factor = min(1.0, LARGEST_PUSH / length) if length else 0.0
-        self._pending_push = self._pending_push + factor * np.array([x, y])
+            raise ValueError(f"a push must be finite numbers, not {x} and {y}")
+        self._pending_push = self._pending_push + np.array([x, y]) * (LARGEST_PUSH / max(length, LARGEST_PUSH))
 
     def set_task(self, task: str) -> None:
         """Another task, under the same controllers where it has them."""
@@ -249,34 +372,34 @@ class Playground:
         self._change(self.world.task_name, robot)
 
     def set_controller(self, name: str) -> None:
-        """Another controller for the main robot, as soon as it is made. The robot goes on where it is."""
-        self.world.check_controllers(name)
+        """Another controller for the main robot, which goes on where it is."""
+        controller = self._ready(name)
         self.set_ghosts([ghost for ghost in self.ghosts if ghost != name])
-        self.main.wanted = name
-        if self.main.controller is not None and not self.main.violated:
-            self._order(self.main)
-        else:
+        self.main.name, self.main.controller = name, controller
+        if self.ended:
             self.restart()
 
     def set_ghosts(self, ghosts: Sequence[str]) -> None:
         """Other ghosts. A new one begins where the main robot is."""
-        self.world.check_controllers(*ghosts)
-        wanted = [name for name in dict.fromkeys(ghosts) if name != self.main.wanted]
+        wanted = [name for name in dict.fromkeys(ghosts) if name != self.main.name]
+        ready = {name: self._ready(name) for name in wanted if name not in self.ghosts}
         for runner in self.runners[1:]:
-            if runner.wanted not in wanted:
-                runner.close()
+            if runner.name not in wanted:
+                runner.env.close()
                 self.runners.remove(runner)
-        for name in wanted:
-            if name not in self.ghosts:
-                runner = self._add(name)
-                runner.join(self.main)
-                self._order(runner)
+        for name, controller in ready.items():
+            self.runners.append(Runner(name, controller, self.world, self._physics, self._hidden()))
+            self.runners[-1].join(self.main)
 
     def set_plant(self, stress: str, value: float) -> None:
-        """Changes what the controllers do not know, for every robot. The value is a severity within its `Span`."""
-        self.plant[stress] = severity(stress, value)
+        """Changes what the controllers do not know, for every robot. The value is a severity within its bounds in `PLANT`."""
+        check_names("change", [stress], PLANT)
+        _, low, high, step = PLANT[stress]
+        if not low <= value <= high:
+            raise ValueError(f"{stress} must be {low:g} to {high:g}, not {value:g}")
+        self.plant[stress] = step * round(value / step)
         for runner in self.runners:
-            runner.set_plant(randomization(self.plant))
+            runner.set_hidden(self._hidden())
 
     def restart(self) -> None:
         """Begins the same episode again."""
@@ -284,7 +407,14 @@ class Playground:
 
     def start_certified(self, episode: int) -> None:
         """Begins a certified episode."""
-        self._begin(self.world.certified_start(episode), episode)
+        known = self.world.certified
+        if known is None:
+            raise ValueError(
+                f"{self.world.task_name} has no certified episodes for {self.world.robot}; begin a random one"
+            )
+        if not 0 <= episode < len(known):
+            raise ValueError(f"episode must be 0 to {len(known) - 1}, not {episode}")
+        self._begin((known.states[episode], known.constants[episode]), episode)
 
     def start_random(self) -> None:
         """Begins an episode with a random start."""
@@ -298,111 +428,75 @@ class Playground:
 
     def _change(self, task: str, robot: str) -> None:
         """Opens a task for a robot, with the present controllers that are made for them."""
-        world = World(task, robot)
-        world.offer(*self.world.policies)
-        ghosts = [ghost for ghost in self.ghosts if ghost in world.controllers]
-        self._open(world, self.main.wanted if self.main.wanted in world.controllers else world.best, ghosts, 0)
+        world = World(task, robot, self._files)
+        main = self.main.name if self.main.name in world.controllers else world.best
+        self._open(world, [main, *(ghost for ghost in self.ghosts if ghost in world.controllers)], 0)
 
-    def _open(self, world: World, controller: str, ghosts: Iterable[str], episode: int | str | None) -> None:
-        start = world.certified_start(episode) if isinstance(episode, int) and world.certified is not None else None
-        for runner in self.runners:
-            runner.close()
-        self.world, self.runners = world, []
-        for name in dict.fromkeys([controller, *ghosts]):
-            self._add(name)
+    def _open(self, world: World, controllers: Iterable[str], episode: int | str | None) -> None:
+        made = {name: self._made(name, world) for name in dict.fromkeys(controllers)}
+        self.close()
+        self.world = world
+        self.runners = [Runner(*each, world, self._physics, self._hidden()) for each in made.items()]
         if episode == "rest":
             self.start_at_rest()
-        elif start is None:
+        elif episode is None or world.certified is None:
             self.start_random()
         else:
-            self._begin(start, int(episode or 0))
+            self.start_certified(int(episode))
 
-    def _add(self, name: str) -> Runner:
-        self.runners.append(Runner(name, self.world.task, self.world.params, self._physics))
-        return self.runners[-1]
+    def _made(self, name: str, world: World) -> Controller:
+        """A controller by name, which is offered from then on if it is a policy file."""
+        self.announce(f"preparing {labels.label(name)} … the first time in a task, solvers are compiled")
+        controller = make_controller(name, world.task, world.params)
+        if is_file(name) and name not in world.controllers:
+            world.controllers.append(name)
+            self._files.append(name)
+        return controller
+
+    def _ready(self, name: str) -> Controller:
+        """A controller that goes on from where the main robot is."""
+        controller = self._made(name, self.world)
+        if not self.ended:
+            controller.reset(self.seconds, np.array(self.main.x), self.start[1])
+        return controller
 
     def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: int | None, at_rest: bool = False) -> None:
-        """Starts an episode; the robots wait for their controllers."""
+        """Begins an episode. A controller that finds no plan is replaced by LQR."""
         self.start, self.episode, self._at_rest = start, episode, at_rest
         self.elapsed = self._pause_left = self._push_until = 0
         self._pending_push = self._push = np.zeros(2)
-        hidden = (
-            randomization(self.plant) if any(self.plant.values()) else self._track
-        )  # a slider takes the track's place
-        self._first_push_at = -1 if not at_rest else round(_FIRST_PUSH_AFTER / self.world.task.control_dt)
         seed = int(self._rng.integers(2**32))  # the same for all, so that they meet the same robot, noise and pushes
         for runner in self.runners:
-            runner.begin(tuple(start[0].tolist()), tuple(start[1].tolist()), hidden, seed)
-            runner.take_controller(None, self.steps)
-            runner.name = runner.wanted
-            self._order(runner)
-        if self._optimum is not None:
-            self._optimum.cancel()
-        self._optimum = self._background.submit(
-            background.optimum_costs, self.world.task, self.world.params, *map(np.array, start)
-        )
+            runner.begin(start, seed)
+            self.announce(f"preparing {labels.label(runner.name)} …")
+            try:
+                runner.controller.reset(0.0, *map(np.array, start))
+            except Exception as error:
+                self.notice = f"{labels.label(runner.name)} cannot start here, LQR does instead: {error}"
+                runner.name, runner.controller = "lqr", make_controller("lqr", self.world.task, self.world.params)
+                runner.controller.reset(0.0, *map(np.array, start))
 
-    def _order(self, runner: Runner) -> None:
-        """Asks for the controller that a robot wants, from now on."""
-        name, step = runner.wanted, self.steps
-        problem = self.world.task, self.world.params, np.array(runner.x), np.array(self.start[1])
-        if runner.making is not None:
-            runner.making.cancel()
-        runner.making = self._background.submit(lambda: (name, step, background.begun(name, *problem)))
+    def _hidden(self) -> Randomization:
+        """What the controllers do not know. Changes by hand take the track's place."""
+        changes = [STRESSES[stress].at(value) for stress, value in self.plant.items() if value]
+        changed = {
+            f.name: value for each in changes for f in fields(each) if (value := getattr(each, f.name)) != f.default
+        }
+        return replace(Randomization(), **changed) if changes else self._track
 
-    def _hand_out(self) -> None:
-        """Hands out the controllers that are made."""
-        for runner in self.runners:
-            if runner.making is None or not runner.making.done():
-                continue
-            future, runner.making = runner.making, None
-            if (error := future.exception()) is not None:
-                self._do_without(runner, error)
-                continue
-            runner.name, step, controller = future.result()
-            runner.take_controller(controller, step)
-            if is_file(runner.name):
-                self.world.offer(runner.name)
-
-    def _plan_again(self) -> None:
-        """Has a robot wait for another plan if its plan to a first-exit goal is over, and it is not there.
-
-        NMPC would plan within `act`. But solvers must not run in two threads, so the background plans.
-        """
-        for runner in self.runners if self.world.task.first_exit else ():
-            if runner.has_no_plan_left(self.steps):
-                runner.take_controller(None, self.steps)
-                self._order(runner)
-
-    def _do_without(self, runner: Runner, error: BaseException) -> None:
-        """Leaves a robot under its controller where the wanted one cannot be made. If it has none, it gets LQR."""
-        who = labels.label(runner.wanted)
-        self.notice = f"{who}: {error}"
-        if runner.controller is not None:
-            runner.wanted = runner.name
-        elif runner.wanted != "lqr":
-            self.notice = f"{who} cannot start here, LQR does instead: {error}"
-            runner.wanted = "lqr"
-            self._order(runner)
-
-    def _after_step(self) -> None:
+    def _end(self) -> None:
+        """Notes the score. The same episode begins again after a pause; if only time is over, another where the robot is."""
         task, main = self.world.task, self.main
-        if self.elapsed < task.steps and not main.stands_still:
-            return
-        best = self.optimum_cost
-        regret = main.cost / best - 1 if best > _LEAST_COST else math.nan
         changed = any(self.plant.values()) or self._track.active
+        regret = main.cost / self.optimum_cost - 1
         score = Score(labels.label(main.name), self.seconds, main.cost, regret, main.violated, changed)
-        self.scores = [*self.scores, score][-_EPISODES_KEPT:]
+        self.scores.append(score)
         if task.first_exit or main.stands_still:
             self._pause_left = round(_PAUSE / task.control_dt)
-        else:  # another one from where the robot is
+        else:
             self._begin((np.array(main.x), self.start[1]), None)
 
-    def _take_push(self) -> np.ndarray:
-        """(2,) the push that was asked for, N·s."""
-        push, self._pending_push = self._pending_push, np.zeros(2)
-        if push.any():
-            self._push = push
-            self._push_until = self.steps + round(_PUSH_SHOWN / self.world.task.control_dt)
-        return push
+
+def _failure_word(limit: str) -> str:
+    """What a violated limit means, in words; "" for none."""
+    return {"": "", "tilt": "fell", "arena": "left the arena"}.get(limit, f"touched {limit}")
