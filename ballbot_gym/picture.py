@@ -1,7 +1,7 @@
 """Pictures of a `Drawing`, by NumPy and Pillow: they need neither a display nor OpenGL, and are the same on every machine.
 
-Each body is a surface of revolution. Its faces that are turned to the camera are painted, those far away first. All is painted
-twice as large and then halved, so that edges are smooth.
+Each body is a surface of revolution. Its faces that are turned to the camera are painted, those far away first. All is
+painted twice as large and then halved, so that edges are smooth.
 """
 
 import math

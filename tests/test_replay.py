@@ -72,7 +72,7 @@ def test_a_film_moves_and_ends_when_the_longest_take_does(two_takes):
 
 @pytest.mark.parametrize("ending", ["mp4", "webp"])
 def test_a_film_is_read_back_with_its_frames_and_duration(two_takes, tmp_path, ending):
-    path = write_film(two_takes, tmp_path / f"film.{ending}", seconds=1.0, fps=10, width=320)
+    path = write_film(film_frames(two_takes, film_times(1.0, 10, 1.0), 320), tmp_path / f"film.{ending}", fps=10)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     with imageio.get_reader(path) as reader:
         frames = list(reader.iter_data())
@@ -83,11 +83,12 @@ def test_a_film_is_read_back_with_its_frames_and_duration(two_takes, tmp_path, e
 
 
 def test_a_film_that_is_interrupted_leaves_nothing(two_takes, tmp_path):
-    def interrupt():
+    def interrupted():
+        yield next(film_frames(two_takes, [0.0], 320))
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_film(two_takes, tmp_path / "film.mp4", seconds=1.0, width=320, on_frame=interrupt)
+        write_film(interrupted(), tmp_path / "film.mp4")
     assert list(tmp_path.iterdir()) == []
 
 

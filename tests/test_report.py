@@ -13,7 +13,7 @@ from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
-from ballbot_train.report.film import write_film
+from ballbot_train.report.film import film_frames, write_film
 from ballbot_train.report.page import write_report
 from ballbot_train.report.replay import Replay, Take, replay_of
 
@@ -43,7 +43,7 @@ def page(tmp_path_factory):
         Take("NMPC", leaning(0.3, 1.0), "#e08a00"),
     )
     replays = [Replay("first", takes, markers), Replay("second", takes[1:])]
-    curve = figures.Curve("a", leaning(0.3, 1.0), "#1f6fb2")
+    curve = Take("a", leaning(0.3, 1.0), "#1f6fb2")
     picture = figures.save(figures.trajectory_figure("a figure", [curve]), folder / "pictures" / "some-figure.png")
     pictures = {"Pictures": [picture], "Nothing": []}
     return write_report(folder / "report.html", "A <title>", HEADER, ROWS, replays, pictures, {"commit": "abc"})
@@ -66,7 +66,7 @@ def test_what_has_no_data_has_no_section(page, tmp_path):
 def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
     name = """<script>alert('"a" & b')</script>"""
     picture = figures.save(
-        figures.trajectory_figure("t", [figures.Curve("a", leaning(0.1, 0.1), "red")]), tmp_path / "'a\"&.png"
+        figures.trajectory_figure("t", [Take("a", leaning(0.1, 0.1), "red")]), tmp_path / "'a\"&.png"
     )
     replays = [Replay(name, (Take(name, leaning(0.1, 0.1), "red", note=name),))]
     table, pictures = ([name], [[name, name]]), {name: [picture]}
@@ -83,9 +83,10 @@ def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
 
 def test_names_are_text_in_figures(tmp_path):
     name = "<b><a href='https://x.y'>$\\frac{1}$ & $x"
-    curve = figures.Curve(name, leaning(0.1, 0.1), "red")
+    curve = Take(name, leaning(0.1, 0.1), "red")
     assert figures.save(figures.trajectory_figure(name, [curve]), tmp_path / "a.png").stat().st_size > 1000
-    write_film(Replay(name, (Take(name, leaning(0.1, 0.1), "red", name),)), tmp_path / "a.webp", 0.1, width=64)
+    shown = Replay(name, (Take(name, leaning(0.1, 0.1), "red", name),))
+    write_film(film_frames(shown, [0.0, 0.1], 64), tmp_path / "a.webp")
 
 
 def test_the_report_of_a_robot_shows_its_episodes():

@@ -23,7 +23,7 @@ from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_l
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
-from ballbot_train.report.replay import certified_replay, replay_of
+from ballbot_train.report.replay import Take, certified_replay, replay_of
 
 
 def benchmark(
@@ -108,7 +108,6 @@ def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Pa
     """The first certified episode of a task under every controller, with its optimum."""
     replay = certified_replay(task, controllers, 0, physics, skip_planless=True, robot=robot)
     optimum = certified.load(task, robot, episodes=[0]).trajectories[0]
-    curves = [figures.Curve("optimum", optimum, "0.35", "--")]
-    curves += [figures.Curve(f"{take.label}, {take.note}", take.trajectory, take.color) for take in replay.takes]
-    figure = figures.trajectory_figure(replay.title, curves, replay.markers)
+    takes = [Take("optimum", optimum, "0.35", style="--"), *replay.takes]
+    figure = figures.trajectory_figure(replay.title, takes, replay.markers)
     return figures.save(figure, out / "figures" / f"{task}.png")

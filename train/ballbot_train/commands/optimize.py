@@ -49,8 +49,8 @@ def optimize(
     optimum = find_optimum(env.task, env.params, info["state"], info["constants"], twice=True)
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
-    curve = figures.Curve("optimum", trajectory, figures.COLORS["trajopt"])
-    figure = figures.trajectory_figure(env.task.id, [curve], env.task.markers(info["constants"]))
+    take = figures.Take("optimum", trajectory, figures.COLORS["trajopt"])
+    figure = figures.trajectory_figure(env.task.id, [take], env.task.markers(info["constants"]))
     picture = figures.save(figure, out / "figure.png")
     rows = [
         ["cost", f"{optimum.cost:.6f}"],

@@ -29,9 +29,9 @@ _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 @dataclass(frozen=True)
 class Take:
-    """One trajectory to watch.
+    """One trajectory to look at.
 
-    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle.
+    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle. `style` is of its lines in figures.
     """
 
     label: str
@@ -39,6 +39,7 @@ class Take:
     color: str
     note: str = ""
     failed: bool = False
+    style: str = "-"
     slip: np.ndarray | None = None
     """(n,) speed of the ball's lowest point over the floor as each force begins, m/s, where contact is simulated."""
 
@@ -193,7 +194,9 @@ def file_replay(paths: Sequence[Path]) -> Replay:
     takes = []
     for i, path in enumerate(paths):
         trajectory = playable(Trajectory.load(path), str(path))
-        takes.append(Take(_label(path, paths), trajectory, labels.color(path.stem, i)))
+        alone = sum(other.stem == path.stem for other in paths) == 1
+        label = path.stem if alone else f"{path.parent.name}/{path.stem}"
+        takes.append(Take(label, trajectory, labels.color(path.stem, i)))
     return Replay(", ".join(take.label for take in takes), tuple(takes))
 
 
@@ -208,9 +211,3 @@ def playable(trajectory: Trajectory, name: str) -> Trajectory:
     if trajectory.xdot is not None or not trajectory.held:
         trajectory = trajectory.resampled(_FILE_DT)
     return replace(trajectory, t=trajectory.t - trajectory.t[0])
-
-
-def _label(path: Path, paths: Sequence[Path]) -> str:
-    """The name of a file, with its folder if another file has the same name."""
-    unique = sum(other.stem == path.stem for other in paths) == 1
-    return path.stem if unique else f"{path.parent.name}/{path.stem}"
