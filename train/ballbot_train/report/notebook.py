@@ -26,7 +26,7 @@ from ballbot_train.report.replay import Replay, Take, playable
 if TYPE_CHECKING:
     from ballbot_train.evaluation.results import Row
 
-_HEIGHT = 470  # px of a replay below a cell
+_HEIGHT = 520  # px of a replay below a cell
 
 
 def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | BallbotParams) -> Path | None:
