@@ -9,13 +9,12 @@ import pytest
 from browser import start_chromium
 from builders import result
 
-from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
 from ballbot_train.report.film import film_frames, write_film
 from ballbot_train.report.page import write_report
-from ballbot_train.report.replay import Replay, Take, replay_of
+from ballbot_train.report.replay import Replay, Take, telling_episode
 
 HEADER = ["task", "controller", "regret", "falls"]
 ROWS = [
@@ -89,10 +88,11 @@ def test_names_are_text_in_figures(tmp_path):
     write_film(film_frames(shown, [0.0, 0.1], 64), tmp_path / "a.webp")
 
 
-def test_the_report_of_a_robot_shows_its_episodes():
-    results = [result(episode=0), result(episode=1)]
-    replays = {robot: replay_of("stabilize", ["lqr"], results, "rk4", robot) for robot in ("paper", "rolling")}
-    assert {robot: replay.params for robot, replay in replays.items()} == {r: named_robot(r) for r in replays}
+def test_the_telling_episode_is_the_first_in_which_one_controller_fails_and_another_does_not():
+    fails = [(True, True), (False, False), (False, True), (True, False)]
+    results = [result(episode=i, failure=failure) for i, both in enumerate(fails) for failure in both]
+    assert telling_episode("stabilize", results) == 2
+    assert telling_episode("stabilize", results[:4]) == 0
 
 
 @pytest.fixture(scope="module")

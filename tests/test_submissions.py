@@ -7,6 +7,7 @@ import pytest
 
 from ballbot_gym import certified, dynamics, files, named_robot
 from ballbot_gym.engines import PHYSICS, installed_physics
+from ballbot_gym.env import make_task
 from ballbot_train import evaluate
 from ballbot_train.evaluation import recordings, submissions
 from ballbot_train.evaluation.results import read_results
@@ -187,8 +188,8 @@ def test_motions_survive_the_way_through_text_and_file(rng, tmp_path):
     for motion in motions:
         for sent, arrived in zip(motion, recordings.from_text(recordings.to_text(motion)), strict=True):
             np.testing.assert_array_equal(sent, arrived)
-    about = {"task": "turn", "robot": "paper", "controller": "mine"}
-    read = recordings.read(recordings.write_in(tmp_path, about, motions))
+    ran = make_task("turn"), "turn", named_robot("paper"), "rk4", "mine"
+    read = recordings.read(recordings.write_in(tmp_path, motions, *ran))
     assert read.lengths.tolist() == lengths
     np.testing.assert_array_equal(np.rint(read.states / recordings.GRID), np.concatenate([x for x, _ in motions]))
     np.testing.assert_array_equal(read.actions / recordings.ACTION_GRID, np.concatenate([u for _, u in motions]))

@@ -23,7 +23,8 @@ from ballbot_train.report import labels
 
 LEAST_SLIP = 0.02
 """m/s: what is less is the simulation's error."""
-_SKID = "#c01818"
+SKID = "#c01818"
+"""The colour of a path where the ball slips."""
 _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 
@@ -67,23 +68,17 @@ class Replay:
     def drawing(self, take: Take, t: float) -> Drawing:
         """One of the takes at time t, s, with its path so far. After its end a robot stands still."""
         u = take.trajectory.force(t) if t < take.trajectory.duration else None
-        skids = (GroundPath(points, _SKID, name=f"skid {i}") for i, points in enumerate(_skids(take, t)))
-        paths = GroundPath(driven_path(take.trajectory, t), take.color), *skids
+        driven, skids = take.trajectory, ()
+        if take.slip is not None:
+            slips = np.flatnonzero((take.slip > LEAST_SLIP) & (driven.t[1:] <= t))
+            skids = (GroundPath(driven.x[i : i + 2, :2], SKID) for i in slips)
+        paths = GroundPath(driven_path(driven, t), take.color), *skids
         return Drawing(self.params, (Robot(take.trajectory.state(t), take.color, u),), paths, self.markers)
 
 
 def driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
     """(n, 2) the ground path until time t, m."""
     return np.concatenate([trajectory.x[trajectory.t < t, :2], trajectory.state(t)[None, :2]])
-
-
-def _skids(take: Take, t: float) -> list[np.ndarray]:
-    """Where the ball has slipped until time t, as pieces (n, 2) of its path, m."""
-    if take.slip is None:
-        return []
-    steps = np.flatnonzero((take.slip > LEAST_SLIP) & (take.trajectory.t[1:] <= t))
-    pieces = np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1)
-    return [take.trajectory.x[piece[0] : piece[-1] + 2, :2] for piece in pieces if len(piece)]
 
 
 def certified_replay(
@@ -173,16 +168,13 @@ class _SlipRecorder:
         return self._controller.act(t, x)
 
 
-def replay_of(
-    task: str, controllers: Sequence[str], results: Sequence[Result], physics: str, robot: str = PAPER
-) -> Replay:
-    """A telling episode of a task: the first in which one controller fails and another does not, else the first."""
+def telling_episode(task: str, results: Sequence[Result]) -> int:
+    """The first episode of a task in which one controller fails and another does not, else the first of all."""
     failures: dict[int, set[bool]] = {}
     for result in results:
         if result.task == task:
             failures.setdefault(result.episode, set()).add(result.failure)
-    episode = next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
-    return certified_replay(task, controllers, episode, physics, skip_planless=True, robot=robot)
+    return next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
 
 
 def file_replay(paths: Sequence[Path]) -> Replay:
