@@ -168,24 +168,6 @@ class _Painter:
             self._pen.polygon(outline, tuple(color))
 
 
-class PictureScene:
-    """Draws states of one ballbot among a task's markers as pictures of 640 × 480."""
-
-    def __init__(self, params: BallbotParams):
-        self._params, self._markers = params, ()
-
-    def set_markers(self, markers: Sequence[Marker]) -> None:
-        """Replaces the task's markers."""
-        self._markers = tuple(markers)
-
-    def draw(self, x: Sequence[float]) -> np.ndarray:
-        """(480, 640, 3) uint8 of state x (8,)."""
-        return picture(Drawing(self._params, (Robot(np.array(x)),), markers=self._markers))
-
-    def close(self) -> None:
-        """There is nothing to release."""
-
-
 def _post(marker: Marker) -> _Solid:
     foot = np.array([*marker.position, 0.0])
     return _placed(_CYLINDER, foot, foot + (0, 0, marker.height), marker.radius), marker.color
