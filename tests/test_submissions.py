@@ -97,7 +97,7 @@ def test_a_changed_start_and_mixed_up_episodes_are_refused(forge, submitted):
         "states": np.concatenate([honest.states[first + 1 :], honest.states[: first + 1]]),
         "actions": np.concatenate([honest.actions[first:], honest.actions[:first]]),
     }
-    with pytest.raises(SubmissionError, match="not begin at its certified start, but at that of episode 1"):
+    with pytest.raises(SubmissionError, match="episode 0, step 0: it does not begin at its certified start"):
         forge(**swapped)
 
 
