@@ -321,16 +321,13 @@ class BallbotEnv(gymnasium.Env):
             return None
         if not self._state:
             raise gymnasium.error.ResetNeeded("render() before reset()")
-        return self.render_state(self._state)
-
-    def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
-        """Draws any state x (8,) with this episode's markers, for instance one of a recorded trajectory."""
-        robot, markers = Robot(np.array(x, np.float64)), tuple(self.task.markers(self._constants_array))
-        if self.render_mode != "human":
-            return picture(Drawing(self.params, (robot,), markers=markers))
+        markers = tuple(self.task.markers(self._constants_array))
+        drawing = Drawing(self.params, (Robot(np.array(self._state)),), markers=markers)
+        if self.render_mode == "rgb_array":
+            return picture(drawing)
         if self._page is None:
             self._page = PageScene(self.task.control_dt)
-        self._page.draw(Drawing(self.params, (robot,), markers=markers))
+        self._page.draw(drawing)
         return None
 
     def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:

@@ -54,4 +54,5 @@ def print_entries(entries: Sequence[submissions.Entry]) -> None:
 def regret(entry: submissions.Entry) -> str:
     """The mean regret of a row with its interval, %; a dash where every episode failed."""
     numbers = entry.regret_mean, entry.regret_low, entry.regret_high
-    return with_interval(*(math.nan if value is None else value for value in numbers))
+    mean, low, high = (math.nan if value is None else value for value in numbers)
+    return with_interval(mean, low, high)

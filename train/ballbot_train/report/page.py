@@ -126,10 +126,8 @@ def _episode_data(replay: Replay) -> dict[str, object]:
 
 def _poster(replay: Replay) -> float:
     """The moment that a replay shows first: that of the greatest lean of a robot that does not fall, s."""
-    standing = [take.trajectory for take in replay.takes if not take.failed] or [
-        take.trajectory for take in replay.takes
-    ]
-    leaning = max(standing, key=lambda trajectory: trajectory.tilt.max())
+    standing = [take for take in replay.takes if not take.failed] or replay.takes
+    leaning = max((take.trajectory for take in standing), key=lambda trajectory: trajectory.tilt.max())
     return float(leaning.t[leaning.tilt.argmax()])
 
 

@@ -4,6 +4,8 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 
@@ -140,32 +142,22 @@ def _take(
     episode_set: certified.EvaluationSet,
     episode: int,
 ) -> Take:
-    seen = _SlipRecorder(env, controller)
-    run = rollout(env, seen, options=episode_set.options(episode))
+    slips: list[float] = []
+
+    def act(t: float, x: np.ndarray) -> np.ndarray:
+        slips.append(env.slip)
+        return controller.act(t, x)
+
+    watched = cast(Controller, SimpleNamespace(reset=controller.reset, act=act))
+    run = rollout(env, watched, options=episode_set.options(episode))
     if run.failure:
         note = f"fails at {run.trajectory.duration:.2f} s"
     else:
         note = f"regret {round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0:.1f} %"  # + 0: no −0.0
-    slip = np.array(seen.slips)
+    slip = np.array(slips)
     if slip.max() > LEAST_SLIP:
         note = f"{note}; slips for {env.task.control_dt * np.count_nonzero(slip > LEAST_SLIP):.2f} s"
     return Take(labels.label(name), run.trajectory, labels.color(Path(name).stem, i), note, run.failure, slip=slip)
-
-
-class _SlipRecorder:
-    """A controller, and how fast the ball slips whenever it acts."""
-
-    def __init__(self, env: BallbotEnv, controller: Controller):
-        self._env, self._controller = env, controller
-        self.slips: list[float] = []
-        """m/s, one for each control step."""
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._controller.reset(t, x, c)
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        self.slips.append(self._env.slip)
-        return self._controller.act(t, x)
 
 
 def telling_episode(task: str, results: Sequence[Result]) -> int:
