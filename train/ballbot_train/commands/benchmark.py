@@ -69,8 +69,11 @@ def benchmark(
     for task, names in chosen.items():
         episode = telling_episode(task, done)
         replays.append(certified_replay(task, names, episode, physics, skip_planless=True, robot=robot))
-        optimum = Take("optimum", certified.load(task, robot, episodes=[episode]).trajectories[0], "0.35", style="--")
-        figure = figures.trajectory_figure(replays[-1].title, [optimum, *replays[-1].takes], replays[-1].markers)
+        kept = certified.load(task, robot, episodes=range(episode + 1)).trajectories[
+            episode:
+        ]  # those of the first are kept
+        takes = [*(Take("optimum", each, "0.35", style="--") for each in kept), *replays[-1].takes]
+        figure = figures.trajectory_figure(replays[-1].title, takes, replays[-1].markers)
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
