@@ -69,10 +69,9 @@ def benchmark(
     for task, names in chosen.items():
         episode = telling_episode(task, done)
         replays.append(certified_replay(task, names, episode, physics, skip_planless=True, robot=robot))
-        kept = certified.load(task, robot, episodes=range(episode + 1)).trajectories[
-            episode:
-        ]  # those of the first are kept
-        takes = [*(Take("optimum", each, "0.35", style="--") for each in kept), *replays[-1].takes]
+        kept = certified.load(task, robot, episodes=range(episode + 1)).trajectories  # of the first episodes
+        optimum = [Take("optimum", each, "0.35", style="--") for each in kept[episode : episode + 1]]
+        takes = [*optimum, *replays[-1].takes]
         figure = figures.trajectory_figure(replays[-1].title, takes, replays[-1].markers)
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"

@@ -171,9 +171,7 @@ def open_study(search: Search, out: Path) -> "optuna.Study":
     )
     if not study.trials:
         study.enqueue_trial(encoded(SPACES[search.learner], LEARNERS[search.learner].settings(search.task)))
-    for stale in study.get_trials(
-        states=(_State.RUNNING,)
-    ):  # of a search that was killed, maybe before all were proposed
+    for stale in study.get_trials(states=(_State.RUNNING,)):  # of a search that was killed
         study.enqueue_trial({**stale.system_attrs.get("fixed_params", {}), **stale.params})
         study.tell(stale.number, state=_State.FAIL)
     return study
