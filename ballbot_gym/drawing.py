@@ -35,30 +35,25 @@ _NEAR, _FAR = 3.0, 6.0  # m from the last robot: from where on another counts le
 class Robot:
     """A ballbot: state x (8,), colour "#rrggbb", force u (2,), N, or None for no arrow, and opacity, less than 1 for ghosts.
 
-    `push` (2,), N·s, is an impulse on the body's centre of mass, drawn as an arrow, or None. Each robot of a drawing has a
-    name of its own. `label` is what a live page writes above it.
+    `push` (2,), N·s, is an impulse on the body's centre of mass, drawn as an arrow, or None. `label` is what a live page
+    writes above it.
     """
 
     x: np.ndarray
     color: str = BODY
     u: np.ndarray | None = None
     alpha: float = 1.0
-    name: str = "robot"
     push: np.ndarray | None = None
     label: str = ""
 
 
 @dataclass(frozen=True)
 class GroundPath:
-    """A line on the floor through points (n, 2), m: where a robot was, dashed where it plans to go.
-
-    Each path of a drawing has a name of its own.
-    """
+    """A line on the floor through points (n, 2), m: where a robot was, dashed where it plans to go."""
 
     points: np.ndarray
     color: str
     dashed: bool = False
-    name: str = "path"
 
 
 @dataclass(frozen=True)
@@ -107,20 +102,12 @@ class Pose(NamedTuple):
 def pose(params: BallbotParams, x: np.ndarray) -> Pose:
     """The pose of a ballbot in state x (8,). γ turns the body about the y axis, then θ about the turned −x axis."""
     ball = np.array([x[0], x[1], params.ball_radius])
-    axis = body_axis(x)
-    half_gamma, half_theta = 0.5 * x[2], 0.5 * x[3]
-    cos_g, sin_g, cos_t, sin_t = math.cos(half_gamma), math.sin(half_gamma), math.cos(half_theta), math.sin(half_theta)
+    gamma, theta = x[2], x[3]
+    axis = np.array([math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)])
+    cos_g, sin_g, cos_t, sin_t = math.cos(gamma / 2), math.sin(gamma / 2), math.cos(theta / 2), math.sin(theta / 2)
     turn = np.array([cos_g * cos_t, -cos_g * sin_t, sin_g * cos_t, sin_g * sin_t])  # about y, times about −x
     body = ball + params.com_height * axis
     return Pose(ball, body, body + params.body_length / 2 * axis, turn)
-
-
-def body_axis(x: np.ndarray) -> np.ndarray:
-    """(3,) the upward unit vector along the body in state x (8,)."""
-    gamma, theta = x[2], x[3]
-    return np.array(
-        [math.sin(gamma) * math.cos(theta), math.sin(theta), math.cos(gamma) * math.cos(theta)],
-    )
 
 
 def arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:

@@ -19,10 +19,11 @@ from ballbot_gym.checks import (
     real_array,
     reset_options,
 )
+from ballbot_gym.drawing import Drawing, Robot
 from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.picture import YAW, PictureScene
+from ballbot_gym.picture import YAW, picture
 from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
@@ -141,7 +142,7 @@ class BallbotEnv(gymnasium.Env):
                 viser.
         """
         self._spec: EnvSpec | None = None
-        self._scene: PictureScene | PageScene | None = None
+        self._page: PageScene | None = None
         self._state: State = ()  # until the first reset
         self.params = checked_robot(robot, params)
         physics = default_physics(self.params) if physics is None else physics
@@ -320,15 +321,14 @@ class BallbotEnv(gymnasium.Env):
             return None
         if not self._state:
             raise gymnasium.error.ResetNeeded("render() before reset()")
-        return self.render_state(self._state)
-
-    def render_state(self, x: Sequence[float] | np.ndarray) -> np.ndarray | None:
-        """Draws any state x (8,) with this episode's markers, for instance one of a recorded trajectory."""
-        if self._scene is None:
-            page = self.render_mode == "human"
-            self._scene = PageScene(self.params, self.task.control_dt) if page else PictureScene(self.params)
-            self._scene.set_markers(self.task.markers(self._constants_array))
-        return self._scene.draw(tuple(map(float, x)))
+        markers = tuple(self.task.markers(self._constants_array))
+        drawing = Drawing(self.params, (Robot(np.array(self._state)),), markers=markers)
+        if self.render_mode == "rgb_array":
+            return picture(drawing)
+        if self._page is None:
+            self._page = PageScene(self.task.control_dt)
+        self._page.draw(drawing)
+        return None
 
     def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:
         """Keys for `gymnasium.utils.play.play(env, noop=np.zeros(2))`: w, a, s, d push the ball as seen on the screen."""
@@ -389,13 +389,13 @@ class BallbotEnv(gymnasium.Env):
 
     def __getstate__(self) -> dict[str, Any]:
         self.np_random  # noqa: B018  an env that was never seeded is seeded here, so that its copy draws the same episodes
-        kept = {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_scene", "_judge")}
+        kept = {name: value for name, value in self.__dict__.items() if name not in ("_simulator", "_page", "_judge")}
         return kept | {"_memory": () if self._closed else self._simulator.memory()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         memory = state.pop("_memory")
         self.__dict__.update(state)
-        self._scene = self._judge = None
+        self._page = self._judge = None
         self._simulator = make_simulator(self.physics, self.params, self.task.control_dt, self._physics_dt)
         if self._closed:
             self._simulator.close()
@@ -409,9 +409,9 @@ class BallbotEnv(gymnasium.Env):
         self._closed = True
         self._steps_left = 0
         self._simulator.close()
-        if self._scene is not None:
-            self._scene.close()
-            self._scene = None
+        if self._page is not None:
+            self._page.close()
+            self._page = None
 
     def _check_open(self) -> None:
         if self._closed:
@@ -422,8 +422,8 @@ class BallbotEnv(gymnasium.Env):
         self._constants, self._constants_array = c, np.array(c, np.float64)
         if self._judge is not None:
             self._judge.set_constants(c)
-        if self._scene is not None:
-            self._scene.set_markers(self.task.markers(self._constants_array))
+        if self._page is not None:
+            self._page.trace = []
 
     def _use_code(self, start: bool) -> None:
         """Takes machine code if there is some; if start, it is made in the background. `_set_constants` must follow."""

@@ -19,11 +19,12 @@ from ballbot_gym.checks import (
     real_array,
     reset_options,
 )
+from ballbot_gym.drawing import Drawing, Robot
 from ballbot_gym.engines import PHYSICS, PHYSICS_NAMES
 from ballbot_gym.env import REWARD_PARTS, make_task
 from ballbot_gym.lazy import install
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.picture import PictureScene
+from ballbot_gym.picture import picture
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import spec_of
 from ballbot_gym.robots import PAPER, checked_robot
@@ -176,7 +177,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         for array in (self._none, self._nothing, self._everywhere):
             array.flags.writeable = False
         self._survive = self.task.survival_reward * self.task.control_dt
-        self._scene: PictureScene | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -314,13 +314,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             return None
         if self.batch.state is None:
             raise gymnasium.error.ResetNeeded("render() before reset()")
-        if self._scene is None:
-            self._scene = PictureScene(self.params)
-        images = []
-        for x, c in zip(self.batch.state.x.T.tolist(), np.array(self.batch.state.c.T.tolist()), strict=True):
-            self._scene.set_markers(self.task.markers(c))
-            images.append(self._scene.draw(tuple(x)))
-        return tuple(images)
+        states, constants = (np.array(part.T.tolist()) for part in (self.batch.state.x, self.batch.state.c))
+        return tuple(
+            picture(Drawing(self.params, (Robot(x),), markers=tuple(self.task.markers(c))))
+            for x, c in zip(states, constants, strict=True)
+        )
 
     def get_state(self) -> VectorState:
         """The state of all envs in their episodes, from which `set_state` goes on bit-identically.
@@ -345,15 +343,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 f"the state is of {len(state.ended)} envs of {state.task}; this one has {self.num_envs} of {self.task}"
             )
         self.batch.state, self._ended = state.batch, state.ended
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_scene": None}
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Releases the renderer."""
-        if self._scene is not None:
-            self._scene.close()
-            self._scene = None
 
     def _check_open(self) -> None:
         if self.closed:

@@ -11,14 +11,14 @@ import math
 import re
 import sys
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrow, pose, push_arrow, ring
-from ballbot_gym.engines import State
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import rgb
@@ -203,38 +203,30 @@ class Viewer:
 
 
 class PageScene:
-    """Shows an environment in a page, in real time. It has the methods of `PictureScene`."""
+    """Shows an environment in a page, in real time."""
 
-    def __init__(self, params: BallbotParams, frame_seconds: float):
+    def __init__(self, frame_seconds: float):
         """Starts the page and says its address on stderr.
 
         Args:
-            params: the robot.
             frame_seconds: s, between two drawings.
 
         Raises:
             ImportError: viser is missing.
         """
-        self._viewer = Viewer()
-        self._params, self._frame_seconds = params, frame_seconds
-        self._markers: tuple[Marker, ...] = ()
-        self._trace: list[np.ndarray] = []
-        self._next = 0.0
+        self._viewer, self._frame_seconds, self._next = Viewer(), frame_seconds, 0.0
+        self.trace: list[np.ndarray] = []
+        """Points (2,) at which the robot was in this episode, m."""
         sys.stderr.write(f"the robot is shown at {self._viewer.address}\n")
 
-    def set_markers(self, markers: Sequence[Marker]) -> None:
-        """Replaces the task's markers; an episode begins."""
-        self._markers, self._trace = tuple(markers), []
-
-    def draw(self, x: State) -> None:
-        """Shows state x when its time has come."""
+    def draw(self, drawing: Drawing) -> None:
+        """Shows a drawing of one robot, and where it was, when its time has come."""
         now = time.perf_counter()
         self._next = max(self._next + self._frame_seconds, now)
         time.sleep(self._next - now)
-        state = np.array(x)
-        self._trace.append(state[:2])
-        robot, path = Robot(state), GroundPath(np.array(self._trace), "#d97706")
-        self._viewer.draw(Drawing(self._params, (robot,), (path,) if len(self._trace) > 1 else (), self._markers))
+        self.trace.append(drawing.robots[0].x[:2])
+        path = GroundPath(np.array(self.trace), drawing.robots[0].color)
+        self._viewer.draw(replace(drawing, paths=(path,) if len(self.trace) > 1 else ()))
 
     def close(self) -> None:
         """Stops the page; may be called again."""

@@ -84,10 +84,12 @@ def _fresh(out: Path) -> Made:
 
 def _search(out: Path) -> Made:
     """How many trials a search has, and what the first of them reached, whose settings are the learner's own."""
-    with (out / "trials.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["state"] in ("complete", "pruned")]
-    own = {"trial", "cpu_minutes"}  # what a trial that began anew does not share
-    return {"trials": len(rows), "first": {key: value for key, value in rows[0].items() if key not in own}}
+    import optuna
+
+    study = optuna.load_study(study_name="tune", storage=f"sqlite:///{out.absolute()}/study.db")
+    trials = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
+    first = {key: value for key, value in trials[0].user_attrs.items() if key != "cpu_minutes"}
+    return {"trials": len(trials), "first": first | trials[0].params}
 
 
 def _policy(out: Path) -> Made:

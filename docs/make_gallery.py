@@ -120,8 +120,8 @@ def _recorded(path: Path, row: Entry, episode: int) -> Trajectory:
 def drawing(replay: Replay, optimum: Trajectory, t: float) -> Drawing:
     """A moment, s, with the optimum as a ghost."""
     drawn = replay.drawing(replay.takes[0], t)
-    ghost = Robot(optimum.state(t), labels.OPTIMUM, alpha=GHOST_OPACITY, name="ghost")
-    path = GroundPath(driven_path(optimum, t), labels.OPTIMUM, True, "ghost")
+    ghost = Robot(optimum.state(t), labels.OPTIMUM, alpha=GHOST_OPACITY)
+    path = GroundPath(driven_path(optimum, t), labels.OPTIMUM, True)
     return replace(drawn, robots=(ghost, *drawn.robots), paths=(*drawn.paths, path))
 
 

@@ -9,13 +9,12 @@ import pytest
 from browser import start_chromium
 from builders import result
 
-from ballbot_gym.robots import named_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
-from ballbot_train.report.film import write_film
+from ballbot_train.report.film import film_frames, write_film
 from ballbot_train.report.page import write_report
-from ballbot_train.report.replay import Replay, Take, replay_of
+from ballbot_train.report.replay import Replay, Take, telling_episode
 
 HEADER = ["task", "controller", "regret", "falls"]
 ROWS = [
@@ -43,7 +42,7 @@ def page(tmp_path_factory):
         Take("NMPC", leaning(0.3, 1.0), "#e08a00"),
     )
     replays = [Replay("first", takes, markers), Replay("second", takes[1:])]
-    curve = figures.Curve("a", leaning(0.3, 1.0), "#1f6fb2")
+    curve = Take("a", leaning(0.3, 1.0), "#1f6fb2")
     picture = figures.save(figures.trajectory_figure("a figure", [curve]), folder / "pictures" / "some-figure.png")
     pictures = {"Pictures": [picture], "Nothing": []}
     return write_report(folder / "report.html", "A <title>", HEADER, ROWS, replays, pictures, {"commit": "abc"})
@@ -65,13 +64,10 @@ def test_what_has_no_data_has_no_section(page, tmp_path):
 
 def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
     name = """<script>alert('"a" & b')</script>"""
-    picture = figures.save(
-        figures.trajectory_figure("t", [figures.Curve("a", leaning(0.1, 0.1), "red")]), tmp_path / "'a\"&.png"
-    )
-    replays = [Replay(name, (Take(name, leaning(0.1, 0.1), "red", note=name),))]
-    table, pictures = ([name], [[name, name]]), {name: [picture]}
-    path = write_report(tmp_path / "r.html", name, *table, replays, pictures, {name: name})
-    text = path.read_text()
+    take = Take(name, leaning(0.1, 0.1), "red", note=name)
+    pictures = {name: [figures.save(figures.trajectory_figure(name, [take]), tmp_path / "'a\"&.png")]}
+    replays, table = [Replay(name, (take,))], ([name], [[name, name]])
+    text = write_report(tmp_path / "r.html", name, *table, replays, pictures, {name: name}).read_text()
     assert "alert" in text
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(&#39;&#34;a&#34; &amp; b&#39;)&lt;/script&gt;" in text
@@ -83,15 +79,16 @@ def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
 
 def test_names_are_text_in_figures(tmp_path):
     name = "<b><a href='https://x.y'>$\\frac{1}$ & $x"
-    curve = figures.Curve(name, leaning(0.1, 0.1), "red")
-    assert figures.save(figures.trajectory_figure(name, [curve]), tmp_path / "a.png").stat().st_size > 1000
-    write_film(Replay(name, (Take(name, leaning(0.1, 0.1), "red", name),)), tmp_path / "a.webp", 0.1, width=64)
+    take = Take(name, leaning(0.1, 0.1), "red", name)
+    assert figures.save(figures.trajectory_figure(name, [take]), tmp_path / "a.png").stat().st_size > 1000
+    write_film(film_frames(Replay(name, (take,)), [0.0, 0.1], 64), tmp_path / "a.webp")
 
 
-def test_the_report_of_a_robot_shows_its_episodes():
-    results = [result(episode=0), result(episode=1)]
-    replays = {robot: replay_of("stabilize", ["lqr"], results, "rk4", robot) for robot in ("paper", "rolling")}
-    assert {robot: replay.params for robot, replay in replays.items()} == {r: named_robot(r) for r in replays}
+def test_the_telling_episode_is_the_first_in_which_one_controller_fails_and_another_does_not():
+    fails = [(True, True), (False, False), (False, True), (True, False)]
+    results = [result(episode=i, failure=failure) for i, both in enumerate(fails) for failure in both]
+    assert telling_episode("stabilize", results) == 2
+    assert telling_episode("stabilize", results[:4]) == 0
 
 
 @pytest.fixture(scope="module")
@@ -164,14 +161,12 @@ def test_the_table_sorts_by_numbers_and_keeps_what_is_missing_last(opened):
     assert opened.execute_script(heads) == [None, "ascending", None, None]
 
 
-def test_the_first_picture_is_the_greatest_lean_of_a_robot_that_does_not_fall(opened):
+def test_the_first_picture_is_the_greatest_lean_of_a_robot_that_does_not_fall_and_scrubbing_moves_every_robot(opened):
     assert tilts(opened) == ["57°", "17°"]
-
-
-def test_scrubbing_moves_every_robot(opened):
     scrub(opened, 0)
     assert tilts(opened) == ["0°", "0°"]
     before = opened.execute_script(PICTURES)
+    assert all(colors > 200 for colors, _ in before)  # a blank one has one
     scrub(opened, 0.8)
     assert tilts(opened) == ["57°", "14°"]  # the first has ended, at 1 rad
     after = opened.execute_script(PICTURES)
@@ -180,18 +175,17 @@ def test_scrubbing_moves_every_robot(opened):
 
 def test_playing_moves_until_the_end_and_pauses_where_it_is_told(opened):
     scrub(opened, 0)  # from where the film takes four seconds, time enough to press
+    clock = "return document.querySelector('.clock').textContent"
     opened.execute_script("document.querySelector('.speed').value = '0.25'")
     press(opened, "Play")
     wait_for(opened, "return parseFloat(document.querySelector('.clock').textContent) > 0.05")
     press(opened, "Pause")
+    held = opened.execute_script(clock)
     time.sleep(0.3)
-    held = opened.execute_script("return document.querySelector('.clock').textContent")
-    assert 0 < float(held.split()[0]) < 1
-    time.sleep(0.3)
-    assert opened.execute_script("return document.querySelector('.clock').textContent") == held
+    assert opened.execute_script(clock) == held < "1"
     opened.execute_script("document.querySelector('.speed').value = '2'")
     press(opened, "Play")
-    wait_for(opened, "return document.querySelector('.clock').textContent === '1.00 s'")
+    wait_for(opened, f"{clock} === '1.00 s'")
     wait_for(opened, "return document.querySelector('.play').textContent === 'Play'")
 
 
@@ -208,10 +202,6 @@ def test_another_episode_has_its_own_scenes(opened):
     press(opened, "second")
     wait_for(opened, "return document.querySelectorAll('.view').length === 1")
     assert tilts(opened) == ["17°"]
-
-
-def test_a_scene_shows_robot_floor_and_obstacles(opened):
-    assert all(colors > 200 for colors, _ in opened.execute_script(PICTURES))  # a blank one has one
 
 
 @pytest.mark.parametrize("width", [360, 800, 1600])

@@ -1,6 +1,5 @@
 """The search of hyperparameters: it finds the better settings, goes on after a kill, and writes what tools read."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -8,6 +7,7 @@ import pytest
 
 pytest.importorskip("optuna")
 
+import yaml
 from builders import measured
 from optuna.distributions import CategoricalDistribution as Categorical
 from optuna.distributions import FloatDistribution as Float
@@ -76,24 +76,16 @@ def fakes(monkeypatch):
 SEARCH = Search("ppo", "stabilize", (0, 1), 600_000, 3)
 
 
-def trials(folder):
-    with open(folder / "trials.csv") as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_search_starts_with_the_tuned_settings_and_keeps_the_best(fakes, tmp_path):
     best = tuning.run(SEARCH, 10, tmp_path)
-    rows = trials(tmp_path)
-    assert len(rows) == 10
-    assert float(rows[0]["learning_rate"]) == LEARNERS["ppo"].settings("stabilize").learning_rate
-    finished = [float(row["cost"]) for row in rows if row["state"] == "complete"]
-    assert best["validation_cost"] == pytest.approx(min(finished))
+    trials = tuning.open_study(SEARCH, tmp_path).trials
+    assert len(trials) == 10
+    assert trials[0].params["learning_rate"] == LEARNERS["ppo"].settings("stabilize").learning_rate
+    assert best["validation_cost"] == min(trial.value for trial in trials if trial.state.name == "COMPLETE")
     assert json.loads((tmp_path / "best.json").read_text()) == json.loads(json.dumps(best))
     assert len(best["costs"]) == len(best["seeds"]) == 2
-    assert {"complete", "pruned"} <= {row["state"] for row in rows}
-    for row in rows:
-        assert (row["error"] != "") == (row["state"] == "fail")
-        assert row["state"] != "complete" or float(row["cost_spread"]) == pytest.approx(0.01, abs=1e-3)
+    assert {"COMPLETE", "PRUNED"} <= {trial.state.name for trial in trials}
+    assert all(("error" in trial.user_attrs) == (trial.state.name == "FAIL") for trial in trials)
 
 
 def test_a_killed_search_goes_on_with_the_trial_that_was_running(fakes, tmp_path, monkeypatch):
@@ -104,16 +96,15 @@ def test_a_killed_search_goes_on_with_the_trial_that_was_running(fakes, tmp_path
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(tuning, "outcome_of", killed)
+        patch.setattr(tuning, "attempt", killed)
         with pytest.raises(KeyboardInterrupt):
             tuning.run(SEARCH, 4, tmp_path)
     before = len(fakes)
     tuning.run(SEARCH, 4, tmp_path)
-    assert len(trials(tmp_path)) == 4
     asked = tuning.open_study(SEARCH, tmp_path).trials
-    interrupted = next(trial for trial in asked if "interrupted" in trial.user_attrs)
-    again = asked[interrupted.number + 1]
-    assert again.params == interrupted.params
+    (interrupted,) = (trial for trial in asked if "cpu_minutes" not in trial.user_attrs)
+    assert len(asked) == 5
+    assert asked[interrupted.number + 1].params == interrupted.params
     assert fakes[before].learning_rate == pytest.approx(interrupted.params["learning_rate"])
 
 
@@ -131,7 +122,6 @@ def test_another_search_is_not_mixed_into_a_folder(fakes, tmp_path):
 
 @pytest.mark.parametrize("learner", ["ppo", "sac"])
 def test_the_file_for_rl_zoo3_has_the_four_ids(learner):
-    yaml = pytest.importorskip("yaml")
     read = yaml.safe_load(zoo_yaml(learner, {task: LEARNERS[learner].settings(task) for task in TASKS}))
     assert list(read) == [task.id for task in TASKS.values()]
     for settings in read.values():
@@ -156,6 +146,6 @@ def test_the_command_prints_the_best_and_how_to_train_with_it(fakes, tmp_path, c
 def test_real_trainings_have_an_outcome_per_seed():
     tiny = {"num_envs": 4, "num_steps": 4, "hidden": (4,), "batch_size": 8}
     search = Search("ppo", "stabilize", (0, 1), 32, 1, "rolling")
-    cost, outcome = tuning.outcome_of(search, settings_of(search, tiny))
-    assert isinstance(cost, float)
-    assert len(set(outcome["costs"])) == 2
+    reached = tuning.attempt(search, settings_of(search, tiny))
+    assert len(set(reached["costs"])) == 2
+    assert reached["steps"] == [pytest.approx(sum(reached["costs"]) / 2)]

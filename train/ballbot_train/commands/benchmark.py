@@ -23,7 +23,7 @@ from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_l
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
-from ballbot_train.report.replay import certified_replay, replay_of
+from ballbot_train.report.replay import Take, certified_replay, telling_episode
 
 
 def benchmark(
@@ -64,9 +64,16 @@ def benchmark(
     rows = leaderboard(done, seed=seed)
     write_leaderboard(rows, done, facts, out)
     regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
-    pictures = [_episode_figure(task, group, physics, out, robot) for task, group in chosen.items()]
     table = [cells(row) for row in rows]
-    replays = [replay_of(task, names, done, physics, robot) for task, names in chosen.items()]
+    replays, pictures = [], []
+    for task, names in chosen.items():
+        episode = telling_episode(task, done)
+        replays.append(certified_replay(task, names, episode, physics, skip_planless=True, robot=robot))
+        kept = certified.load(task, robot, episodes=range(episode + 1)).trajectories  # of the first episodes
+        optimum = [Take("optimum", each, "0.35", style="--") for each in kept[episode : episode + 1]]
+        takes = [*optimum, *replays[-1].takes]
+        figure = figures.trajectory_figure(replays[-1].title, takes, replays[-1].markers)
+        pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
     page = write_report(out / "report.html", title, HEADER, table, replays, shown, facts)
@@ -102,13 +109,3 @@ def _benchmark_tracks(
     write_results("tracks", rows, results, facts, out)
     title = f"{episodes} certified episodes per task and track, physics={physics}"
     publish(out, "tracks", title, tracks.HEADER, [tracks.cells(row) for row in rows])
-
-
-def _episode_figure(task: str, controllers: Sequence[str], physics: str, out: Path, robot: str) -> Path:
-    """The first certified episode of a task under every controller, with its optimum."""
-    replay = certified_replay(task, controllers, 0, physics, skip_planless=True, robot=robot)
-    optimum = certified.load(task, robot, episodes=[0]).trajectories[0]
-    curves = [figures.Curve("optimum", optimum, "0.35", "--")]
-    curves += [figures.Curve(f"{take.label}, {take.note}", take.trajectory, take.color) for take in replay.takes]
-    figure = figures.trajectory_figure(replay.title, curves, replay.markers)
-    return figures.save(figure, out / "figures" / f"{task}.png")

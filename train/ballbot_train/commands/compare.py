@@ -1,13 +1,10 @@
 """`ballbot compare`: is one benchmark's result better than another's?"""
 
-import math
 from pathlib import Path
-from typing import Any
 
-from ballbot_gym import files
 from ballbot_train.console import console, print_table
 from ballbot_train.evaluation import comparison
-from ballbot_train.evaluation.results import to_json
+from ballbot_train.evaluation.results import with_interval
 from ballbot_train.evaluation.submissions import read_run
 
 
@@ -17,7 +14,6 @@ def compare(
     /,
     match: tuple[str, str] | None = None,
     training_margin: float = comparison.TRAINING_MARGIN,
-    out: Path | None = None,
 ) -> None:
     """Says for every task and controller whether B is better than A, worse, or that the episodes cannot tell.
 
@@ -27,7 +23,6 @@ def compare(
         match: a controller of A and one of B, to compare controllers of different names.
         training_margin: differences of success and regret up to this decide nothing between policies with different weights,
             which the seed of their training makes differ; 0.02 is 2 %. Other controllers are told apart from 0.1 % on.
-        out: file for the same as JSON.
     """
     runs = read_run(a), read_run(b)
     compared = comparison.compare(runs[0], runs[1], match, training_margin)
@@ -37,24 +32,9 @@ def compare(
             console.print(f"{key}: {first} in A, {second} in B")
     header = ["task", "controller", "B is", "episodes", "success B − A", "regret B − A", "because"]
     print_table(f"A: {a}\nB: {b}", header, [_cells(entry) for entry in compared])
-    if out is not None:
-        files.write(out, to_json({"about": [run[0] for run in runs], "rows": compared}))
 
 
 def _cells(entry: comparison.Comparison) -> list[str]:
-    def shown(value: float, low: float, high: float) -> str:
-        if not math.isfinite(value):
-            return "–"
-        return f"{100 * value:+.2f} % ({100 * low:+.2f} to {100 * high:+.2f})"
-
-    success: Any = (entry.success, entry.success_low, entry.success_high)
-    regret: Any = (entry.regret, entry.regret_low, entry.regret_high)
-    return [
-        entry.task,
-        entry.controller,
-        entry.verdict,
-        str(entry.episodes),
-        shown(*success),
-        shown(*regret),
-        entry.why,
-    ]
+    success = with_interval(entry.success, entry.success_low, entry.success_high, "+")
+    regret = with_interval(entry.regret, entry.regret_low, entry.regret_high, "+")
+    return [entry.task, entry.controller, entry.verdict, str(entry.episodes), success, regret, entry.why]

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from ballbot_train.console import console, print_table
+from ballbot_gym import files
+from ballbot_train.console import console, print_rows
 
 
 def curves(runs: tuple[Path, ...], /, out: Path = Path("runs/curves")) -> None:
@@ -10,13 +11,14 @@ def curves(runs: tuple[Path, ...], /, out: Path = Path("runs/curves")) -> None:
 
     Args:
         runs: folders of `ballbot train`, or folders of such folders, as of several seeds.
-        out: folder of curves.png, of curves.csv with every point, and of curves.md with where each curve ends.
+        out: folder of curves.png, and of curves.csv with where each curve ends.
     """
     from ballbot_train.report import curves as report  # it imports matplotlib
+    from ballbot_train.report.figures import save
 
     if not runs:
         raise ValueError("give at least one folder of ballbot train")
     drawn = report.grouped(report.read_runs(runs))
-    picture = report.write(drawn, out)
-    print_table("where the curves end", *report.summary(drawn))
-    console.print(f"figure: {picture}\npoints: {out / 'curves.csv'}\ntable: {out / 'curves.md'}")
+    picture, rows = save(report.figure(drawn), out / "curves.png"), report.summary(drawn)
+    print_rows("where the curves end", rows)
+    console.print(f"figure: {picture}\ntable: {files.write_csv(out / 'curves.csv', rows)}")

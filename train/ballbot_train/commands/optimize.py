@@ -10,7 +10,7 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import RobotName, check_least, check_names, console, print_table
-from ballbot_train.report import figures
+from ballbot_train.report import figures, labels
 
 _MOST_STEPS = 5000  # control steps of an episode; longer ones take hours and gigabytes
 
@@ -49,8 +49,8 @@ def optimize(
     optimum = find_optimum(env.task, env.params, info["state"], info["constants"], twice=True)
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
-    curve = figures.Curve("optimum", trajectory, figures.COLORS["trajopt"])
-    figure = figures.trajectory_figure(env.task.id, [curve], env.task.markers(info["constants"]))
+    take = figures.Take("optimum", trajectory, labels.COLORS["trajopt"])
+    figure = figures.trajectory_figure(env.task.id, [take], env.task.markers(info["constants"]))
     picture = figures.save(figure, out / "figure.png")
     rows = [
         ["cost", f"{optimum.cost:.6f}"],

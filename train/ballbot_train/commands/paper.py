@@ -12,7 +12,7 @@ from ballbot_gym.engines import PHYSICS_NAMES
 from ballbot_gym.params import default_params
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.console import check_names, console, physics_or_default, print_rows
-from ballbot_train.report import figures
+from ballbot_train.report import figures, labels
 
 _GREY = (0.75, 0.75, 0.75, 1.0)
 
@@ -32,11 +32,11 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         tracked = track_plan(entry.solve(params), params)
         plan = tracked.plan
         plan.trajectory.save(out / f"{name}.npz")
-        curves = [
-            figures.Curve("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", "--"),
-            figures.Curve(f"{simulator} under TVLQR", tracked.executed, figures.COLORS["trajopt"]),
+        takes = [
+            figures.Take("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", style="--"),
+            figures.Take(f"{simulator} under TVLQR", tracked.executed, labels.COLORS["trajopt"]),
         ]
-        figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", curves, _paper_markers(entry, plan))
+        figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", takes, _paper_markers(entry, plan))
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}.png")
         tilt = math.degrees(np.abs(plan.trajectory.x[:, 2:4]).max())
         rows.append(
@@ -64,11 +64,11 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
     rows = []
     for name in names:
         entry = PAPER_PROBLEMS[name]
-        curves = []
+        takes = []
         for run in compare_stabilization(entry):
             episode, rate = run.episode, f"{run.rate:.0f} Hz"
-            label = f"{figures.LABELS[run.controller]}, {rate}"
-            curves.append(figures.Curve(label, episode.trajectory, figures.COLORS[run.controller]))
+            label = f"{labels.LABELS[run.controller]}, {rate}"
+            takes.append(figures.Take(label, episode.trajectory, labels.COLORS[run.controller]))
             peak = math.degrees(np.abs(episode.trajectory.x[:, 2:4]).max())
             rows.append(
                 {
@@ -81,9 +81,8 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
                     "fell": str(episode.failure),
                 }
             )
-        figure = figures.trajectory_figure(
-            f"{entry.figure}: {entry.title}, LQR against trajectory optimization", curves
-        )
+        title = f"{entry.figure}: {entry.title}, LQR against trajectory optimization"
+        figure = figures.trajectory_figure(title, takes)
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}-lqr-and-trajopt.png")
     print_rows(f"Stabilization in {simulator}, both with Stabilize's weights", rows)
 

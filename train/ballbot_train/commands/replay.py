@@ -6,7 +6,7 @@ from pathlib import Path
 from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.console import Physics, RobotName, check_names, console, physics_or_default, progress_bar
-from ballbot_train.report.film import Format, film_times, write_film, write_strip
+from ballbot_train.report.film import Format, film_frames, film_times, write_film, write_strip
 from ballbot_train.report.replay import Replay, certified_replay, file_replay
 
 _MOST_FRAMES = 100_000
@@ -61,9 +61,10 @@ def replay(
         return
     count = end / speed * fps
     _check(count <= _MOST_FRAMES, f"the film would have {count:.3g} frames; give another speed or fps")
+    times = film_times(end, fps, speed)
     with progress_bar() as progress:
-        bar = progress.add_task("frames", total=len(film_times(end, fps, speed)))
-        write_film(shown, path, end, fps, speed, width or _WIDTHS[format], on_frame=lambda: progress.advance(bar))
+        drawn = film_frames(shown, times, width or _WIDTHS[format])
+        write_film(progress.track(drawn, total=len(times), description="frames"), path, fps)
     console.print(f"film: {path}, {path.stat().st_size / 1e6:.1f} MB")
 
 

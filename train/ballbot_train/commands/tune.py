@@ -32,8 +32,8 @@ def tune(
         seeds: trainings per trial, with the seeds 0, 1, 2 ... What counts is their mean.
         env_steps: length of each training.
         evaluations: of each training; after each of them a trial may be pruned.
-        out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), trials.csv, best.json
-            and, for ppo and sac on the paper's robot, settings for rl-zoo3.
+        out: folder of the search; default runs/tune/TASK-LEARNER. It holds the study (SQLite), best.json and, on the
+            paper's robot, settings for rl-zoo3.
         workers: who runs trials.
         robot: name of a robot.
     """
@@ -49,7 +49,7 @@ def tune(
         bar = progress.add_task(f"{learner} {task}", total=trials)
         best = tuning.run(search, trials, out, lambda count: progress.update(bar, completed=count), workers)
     if not best:
-        raise ValueError(f"none of {trials} trials came to its end; {out / 'trials.csv'} says why. Give more --trials")
+        raise ValueError(f"none of {trials} trials came to its end; {out / 'study.db'} says why. Give more --trials")
     settings = tuning.settings_of(search, {name: best["settings"][name] for name in tuning.SPACES[learner]})
     rows = [
         [f"{seed}", f"{cost:.3f}", f"{success:.1%}", f"{regret:.1%}"]
@@ -60,7 +60,7 @@ def tune(
     header = ["seed", "validation cost", "success", "certified regret"]
     print_table(f"the best, trial {best['trial']}, of {learner} on {task}", header, rows)
     console.print(
-        f"trials: {out / 'trials.csv'}\nsettings: {out / 'best.json'}\n"
+        f"trials: optuna trials --study-name tune --storage sqlite:///{out / 'study.db'}\nsettings: {out / 'best.json'}\n"
         f"train with them: {command_with(learner, Run(task=task, robot=robot), settings)}",
         soft_wrap=True,
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ballbot_train.console import console, print_rows
 from ballbot_train.evaluation import submissions
+from ballbot_train.evaluation.results import with_interval
 
 
 def verify(files: tuple[Path, ...], /, *, write: Path | None = None) -> None:
@@ -52,10 +53,6 @@ def print_entries(entries: Sequence[submissions.Entry]) -> None:
 
 def regret(entry: submissions.Entry) -> str:
     """The mean regret of a row with its interval, %; a dash where every episode failed."""
-    numbers = [
-        math.nan if value is None else 100 * value for value in (entry.regret_mean, entry.regret_low, entry.regret_high)
-    ]
-    mean, low, high = numbers
-    if not math.isfinite(mean):
-        return "–"
-    return f"{mean:.2f} %" + (f" ({low:.2f} to {high:.2f})" if math.isfinite(low) else "")
+    numbers = entry.regret_mean, entry.regret_low, entry.regret_high
+    mean, low, high = (math.nan if value is None else value for value in numbers)
+    return with_interval(mean, low, high)

@@ -202,9 +202,7 @@ def benchmark(
 def _write_recording(group: Group, motions: Sequence[recordings.Motion], out: Path) -> None:
     task, params = make_task(group.task, group.robot), named_robot(group.robot)
     digest = registry.policy_digest(group.controller, task, group.robot)
-    recordings.write_in(
-        out, recordings.about(task, group.task, params, group.physics, group.controller, digest), motions
-    )
+    recordings.write_in(out, motions, task, group.task, params, group.physics, group.controller, digest)
 
 
 def _job(group: Group, episodes: range, seed: int, record: bool) -> jobs.Job:

@@ -45,7 +45,6 @@ class Comparison:
     """Over the episodes in which neither failed; less is better."""
     regret_low: float
     regret_high: float
-    margin: float
     verdict: str
     """B is "better" or "worse", "cannot tell", or "not comparable"."""
     why: str
@@ -146,7 +145,7 @@ def _compare_one(
         success = float(wins.mean()), interval(wins, seed)
         regret = (float(regrets.mean()), interval(regrets, seed)) if len(regrets) else nothing
         outcome, why = _judge(wins, success[1], regret[1], len(regrets), margin)
-    return Comparison(task, name, len(shared), success[0], *success[1], regret[0], *regret[1], margin, outcome, why)
+    return Comparison(task, name, len(shared), success[0], *success[1], regret[0], *regret[1], outcome, why)
 
 
 def _hindrance(pairs: Sequence[tuple[Result, Result]]) -> str:

@@ -139,8 +139,8 @@ def evaluate(
             write_leaderboard([row], results, facts, Path(out))
             if keep is not None and not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
-                about = recordings.about(env.task, named[1], env.params, env.physics, named[0], digest)
-                recordings.write_in(Path(out), about, motions)
+                who = env.physics, named[0], digest
+                recordings.write_in(Path(out), motions, env.task, named[1], env.params, *who)
         return row
     finally:
         env.close()

@@ -82,12 +82,22 @@ def from_text(text: str) -> Motion:
     return numbers[:states].reshape(-1, 8), numbers[states:].reshape(-1, 2)
 
 
-def about(
-    task: Task, name: str, robot: BallbotParams, physics: str, controller: str, policy: str = ""
-) -> dict[str, Any]:
-    """`Recording.about` of a run; `name` is the task's, `policy` the digest of its weights."""
+def write_in(
+    out: Path,
+    motions: Sequence[Motion],
+    task: Task,
+    name: str,
+    robot: BallbotParams,
+    physics: str,
+    controller: str,
+    policy: str = "",
+) -> Path:
+    """Writes what was done in the first certified episodes, in order, into a results folder.
+
+    `name` is the task's, `policy` the digest of the controller's weights.
+    """
     made_by = provenance()
-    return {
+    about = {
         "task": name,
         "problem": task.problem(),
         "robot": robot_name(robot),
@@ -96,19 +106,15 @@ def about(
         "policy": policy,
         "versions": {key: str(made_by[key]) for key in ("version", "commit", "python", "numpy")},
     }
+    states, actions = (np.concatenate(parts) for parts in zip(*motions, strict=True))
+    lengths = np.array([len(part) for _, part in motions])
+    path = out / FOLDER / file_of(name, about["robot"], Path(controller).stem)
+    return write(path, about, Recording({}, lengths, GRID * states, ACTION_GRID * actions))
 
 
 def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
     """Name of the file of what a controller did in a task."""
     return f"{file_name(task, robot)}-{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-')}{ending}"
-
-
-def write_in(out: Path, about: Mapping[str, Any], motions: Sequence[Motion]) -> Path:
-    """Writes what was done in the first certified episodes, in order, into a results folder."""
-    states, actions = (np.concatenate(parts) for parts in zip(*motions, strict=True))
-    lengths = np.array([len(part) for _, part in motions])
-    path = out / FOLDER / file_of(about["task"], about["robot"], Path(about["controller"]).stem)
-    return write(path, about, Recording({}, lengths, GRID * states, ACTION_GRID * actions))
 
 
 def write(path: Path, about: Mapping[str, Any], recording: Recording) -> Path:

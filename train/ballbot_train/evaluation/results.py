@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -240,9 +240,10 @@ def shown(value: float, form: str, unit: str = "") -> str:
     return format(value, form) + unit if math.isfinite(value) else "–"
 
 
-def _mean_with_interval(row: Row) -> str:
-    ends = f" ({100 * row.regret_low:.2f} to {100 * row.regret_high:.2f})" if math.isfinite(row.regret_low) else ""
-    return shown(row.regret_mean, ".2%") + ends
+def with_interval(value: float, low: float, high: float, sign: Literal["", "+"] = "") -> str:
+    """A share with its interval in per cent, with plus signs if wanted; a dash where there is none."""
+    ends = f" ({100 * low:{sign}.2f} to {100 * high:{sign}.2f})" if math.isfinite(low) else ""
+    return shown(100 * value, f"{sign}.2f", " %") + ends
 
 
 _COLUMNS: dict[str, Callable[[Row], str]] = {
@@ -250,8 +251,8 @@ _COLUMNS: dict[str, Callable[[Row], str]] = {
     "controller": lambda row: Path(row.controller).name,  # a policy may be a long path
     "success": lambda row: f"{100 * row.success:.1f} %",
     "falls": lambda row: f"{row.falls}/{row.episodes}",
-    "regret mean": _mean_with_interval,
-    "regret median": lambda row: shown(row.regret_median, ".2%"),
+    "regret mean": lambda row: with_interval(row.regret_mean, row.regret_low, row.regret_high),
+    "regret median": lambda row: percent(row.regret_median),
     "peak tilt": lambda row: shown(row.peak_tilt_median, ".1f", "°"),
     "settle": lambda row: shown(row.settle_time_median, ".2f", " s"),
     "mean force": lambda row: shown(row.effort_mean, ".0f", " N"),

@@ -310,16 +310,11 @@ def _judged(
 
 
 def _check_starts(steps: _Steps, known: certified.EvaluationSet) -> None:
-    wanted = np.rint(known.states / recordings.GRID)
-    for episode in np.flatnonzero(steps.lengths):
-        start = np.rint(steps.states[steps.first[episode]] / recordings.GRID)
-        if (start == wanted[episode]).all():
-            continue
-        other = np.flatnonzero((start == wanted).all(1))
-        raise SubmissionError(
-            f"{steps.path}: episode {episode}, step 0: it does not begin at its certified start"
-            + (f", but at that of episode {other[0]}" if len(other) else "")
-        )
+    begun = np.flatnonzero(steps.lengths)
+    starts = np.rint(steps.states[steps.first[begun]] / recordings.GRID)
+    wrong = begun[(starts != np.rint(known.states[begun] / recordings.GRID)).any(1)]
+    if len(wrong):
+        raise SubmissionError(f"{steps.path}: episode {wrong[0]}, step 0: it does not begin at its certified start")
 
 
 def _stepped(physics: str, robot: BallbotParams, task: Task, before: np.ndarray, force: np.ndarray) -> np.ndarray:

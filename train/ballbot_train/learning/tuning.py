@@ -14,9 +14,8 @@ A search is a folder:
 | file | holds |
 |---|---|
 | config.json | learner, task, seeds and budget; the folder belongs to one search |
-| study.db | Optuna's study, in SQLite: every finished trial. `optuna-dashboard sqlite:///…` shows it |
-| trials.csv | a line per trial: its state, its costs over the seeds, its settings |
-| best.json | all settings of the best trial, what each seed reached, and the command that trains with them |
+| study.db | Optuna's study "tune", in SQLite: every trial. `optuna-dashboard` and `optuna trials` show it |
+| best.json | all settings of the best trial, and what each seed reached |
 | ppo.yml or sac.yml | settings of the four ids in the format of rl-zoo3 |
 
 A search that is killed goes on where it stopped; trials that were running begin anew. Trials run in this process, in several,
@@ -27,7 +26,7 @@ prune, and say what theirs reached.
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,15 +45,14 @@ from ballbot_train.learning.learners import LEARNERS, ppo, sac
 
 try:
     import optuna
-    import sqlalchemy.exc  # Optuna's
+    import sqlalchemy.exc  # Optuna's, as is yaml
+    import yaml
 except ModuleNotFoundError as error:
     raise missing("ballbot tune", error.name, "tune") from error
 
 _STARTUP_TRIALS = 8  # drawn at random before the estimator proposes, and before any trial is pruned
-_INTERRUPTED = "interrupted"
 _STUDY = "study.db"
-
-
+_State = optuna.trial.TrialState
 _Space = dict[str, optuna.distributions.BaseDistribution]
 
 
@@ -139,19 +137,19 @@ def run(
     jobs.claim(out, asdict(search), "config.json")
     try:
         study = open_study(search, out)
-        on_trial(begun := len(_ended(study)))
+        on_trial(begun := _ended(study))
 
         def tasks() -> Iterator[Any]:
             for _ in range(begun, trials):
                 trial = study.ask(SPACES[search.learner])
-                completed = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
-                yield trial, _attempt, (search, settings_of(search, trial.params), completed)
+                completed = study.get_trials(states=(_State.COMPLETE,))
+                yield trial, attempt, (search, settings_of(search, trial.params), completed)
 
         for trial, reached in executors.completed(tasks(), workers, serial=True):
             _end(study, trial, reached)
-            write_tables(study, search, out)
-            on_trial(len(_ended(study)))
-        return write_tables(study, search, out)
+            write_best(study, search, out)
+            on_trial(_ended(study))
+        return write_best(study, search, out)
     except (sqlalchemy.exc.DBAPIError, optuna.exceptions.StorageInternalError) as error:
         cause = error.__cause__ or error
         raise files.FileError(
@@ -173,18 +171,10 @@ def open_study(search: Search, out: Path) -> "optuna.Study":
     )
     if not study.trials:
         study.enqueue_trial(encoded(SPACES[search.learner], LEARNERS[search.learner].settings(search.task)))
-    for stale in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):  # of a search that was killed
-        waiting = [_given(trial) for trial in study.get_trials(states=(optuna.trial.TrialState.WAITING,))]
-        if _given(stale) not in waiting:  # a kill may have come before the next lines
-            study.enqueue_trial(_given(stale))
-        study._storage.set_trial_user_attr(stale._trial_id, _INTERRUPTED, True)
-        study.tell(stale.number, state=optuna.trial.TrialState.FAIL)
+    for stale in study.get_trials(states=(_State.RUNNING,)):  # of a search that was killed
+        study.enqueue_trial({**stale.system_attrs.get("fixed_params", {}), **stale.params})
+        study.tell(stale.number, state=_State.FAIL)
     return study
-
-
-def _given(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
-    """The parameters of a trial as far as they are known: a kill may have come before all were proposed."""
-    return {**trial.system_attrs.get("fixed_params", {}), **trial.params}
 
 
 def encoded(space: Mapping[str, Any], settings: Any) -> dict[str, Any]:
@@ -201,100 +191,70 @@ def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
     return replace(settings, evaluations=search.evaluations, iterations=iterations)
 
 
-def _end(study: "optuna.Study", trial: "optuna.Trial", reached: dict[str, Any]) -> None:
-    """Ends a trial with what it reached."""
-    for step, cost in enumerate(reached.pop("steps"), 1):
-        trial.report(cost, step)
-    for name, value in reached.items():
-        trial.set_user_attr(name, value)
-    if "error" in reached:
-        study.tell(trial, state=optuna.trial.TrialState.FAIL)
-    elif "costs" in reached:
-        study.tell(trial, float(np.mean(reached["costs"])))
-    else:
-        study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+def attempt(search: Search, settings: Any, completed: Sequence["optuna.trial.FrozenTrial"] = ()) -> dict[str, Any]:
+    """Trains with one set of settings on every seed.
 
+    Where the median of the completed trials was better after as many evaluations, it ends early.
 
-def _attempt(search: Search, settings: Any, completed: "list[optuna.trial.FrozenTrial]") -> dict[str, Any]:
-    """A trial, on a worker: its costs after every evaluation as "steps", what `outcome_of` gives at the end, and the CPU
-    time, min. A failure is an "error" in words. Where the median of the completed trials was better by then, it ends early.
+    Returns:
+        "steps", after every evaluation the least cost so far, averaged over the seeds, and "cpu_minutes". If it came to its
+        end, lists with an entry per seed: "costs", the least of the validation episodes; "success", the share of them in
+        which the last policy succeeded; and "certified_regret", its mean regret on the certified episodes, where no success
+        counts as failing at once. If it failed, an "error" in words.
     """
-    pruner = optuna.pruners.MedianPruner(n_startup_trials=_STARTUP_TRIALS, n_warmup_steps=1)
-    study = optuna.create_study(pruner=pruner)
+    study = optuna.create_study(pruner=optuna.pruners.MedianPruner(n_startup_trials=_STARTUP_TRIALS, n_warmup_steps=1))
     study.add_trials(completed)
     trial, began, steps = study.ask(), time.process_time(), list[float]()
     reached: dict[str, Any] = {"steps": steps}
     try:
-        for each in outcome_of(search, settings):
-            if isinstance(each, dict):
-                reached |= each
-                break
-            steps.append(each)
-            trial.report(each, len(steps))
-            if len(steps) < search.evaluations and trial.should_prune():
+        task, params = make_task(search.task, search.robot), named_robot(search.robot)
+        learners = [LEARNERS[search.learner].make(task, params, settings, seed, None) for seed in search.seeds]
+        best = [math.inf] * len(learners)
+        for k in range(1, search.evaluations + 1):
+            for learner in learners:
+                while learner.iteration < learner.iterations * k // search.evaluations:
+                    learner.iterate()
+            measured = [training.score_and_validate(learner.network, task, search.robot) for learner in learners]
+            costs = [(each["validation/cost"] + each["validation/mean_cost"]) / 2 for each in measured]
+            best = [min(pair) for pair in zip(best, costs, strict=True)]
+            steps.append(float(np.mean(best)))
+            trial.report(steps[-1], k)
+            if k == search.evaluations:
+                reached["costs"] = best
+                reached["success"] = [each["validation/success"] for each in measured]
+                reached["certified_regret"] = [each["certified/cost_ratio"] - 1 for each in measured]
+            elif trial.should_prune():
                 break
     except (ValueError, FloatingPointError) as error:  # what torch answers to weights that are not finite
         reached["error"] = f"{error!r:.200}"
     return reached | {"cpu_minutes": (time.process_time() - began) / 60}
 
 
-def outcome_of(search: Search, settings: Any) -> Iterator[float | dict[str, Any]]:
-    """Trains with one set of settings on every seed.
-
-    Yields:
-        After every evaluation the least cost so far, averaged over the seeds. At the end lists with an entry per seed:
-        "costs", the least of the validation episodes; "success", the share of them in which the last policy succeeded; and
-        "certified_regret", its mean regret on the certified episodes, where no success counts as failing at once.
-    """
-    task, params = make_task(search.task, search.robot), named_robot(search.robot)
-    learners = [LEARNERS[search.learner].make(task, params, settings, seed, None) for seed in search.seeds]
-    best, measured = [math.inf] * len(learners), []
-    for k in range(1, search.evaluations + 1):
-        for learner in learners:
-            while learner.iteration < learner.iterations * k // search.evaluations:
-                learner.iterate()
-        measured = [training.score_and_validate(learner.network, task, search.robot) for learner in learners]
-        costs = [(each["validation/cost"] + each["validation/mean_cost"]) / 2 for each in measured]
-        best = [min(pair) for pair in zip(best, costs, strict=True)]
-        yield float(np.mean(best))
-    yield {
-        "costs": best,
-        "success": [each["validation/success"] for each in measured],
-        "certified_regret": [each["certified/cost_ratio"] - 1 for each in measured],
-    }
+def _end(study: "optuna.Study", trial: "optuna.Trial", reached: dict[str, Any]) -> None:
+    """Ends a trial with what it reached."""
+    for step, cost in enumerate(reached.pop("steps"), 1):
+        trial.report(cost, step)
+    for name, value in reached.items():
+        trial.set_user_attr(name, value)
+    if "costs" in reached:
+        study.tell(trial, float(np.mean(reached["costs"])))
+    else:
+        study.tell(trial, state=_State.FAIL if "error" in reached else _State.PRUNED)
 
 
-def _ended(study: "optuna.Study") -> list[Any]:
-    """The trials that ended by themselves."""
-    return [trial for trial in study.trials if trial.state.is_finished() and _INTERRUPTED not in trial.user_attrs]
+def _ended(study: "optuna.Study") -> int:
+    """How many trials ended by themselves."""
+    states = _State.COMPLETE, _State.PRUNED
+    return sum(trial.state in states or "error" in trial.user_attrs for trial in study.trials)
 
 
-def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, Any]:
-    """Writes what a search has found so far.
+def write_best(study: "optuna.Study", search: Search, out: Path) -> dict[str, Any]:
+    """Writes the best that a search has found so far.
 
     Returns:
         The contents of best.json; empty where no trial has come to its end.
     """
-    rows = []
-    for trial in _ended(study):
-        costs = trial.user_attrs.get("costs", [])
-        reached = list(trial.intermediate_values.values())
-        rows.append(
-            {
-                "trial": trial.number,
-                "state": trial.state.name.lower(),
-                "cost": trial.value if trial.value is not None else min(reached, default=math.nan),
-                "cost_spread": max(costs) - min(costs) if costs else math.nan,
-                "costs": " ".join(f"{cost:.4f}" for cost in costs),
-                "success": " ".join(f"{share:.3f}" for share in trial.user_attrs.get("success", [])),
-                "certified_regret": " ".join(f"{share:.4f}" for share in trial.user_attrs.get("certified_regret", [])),
-                "cpu_minutes": trial.user_attrs.get("cpu_minutes", math.nan),
-                "error": trial.user_attrs.get("error", ""),
-                **{name: trial.params.get(name, "") for name in SPACES[search.learner]},
-            }
-        )
-    files.write_csv(out / "trials.csv", rows)
-    if not study.get_trials(states=(optuna.trial.TrialState.COMPLETE,)):
+    if not study.get_trials(states=(_State.COMPLETE,)):
         return {}
     trial = study.best_trial
     settings = settings_of(search, trial.params)
@@ -317,7 +277,7 @@ def write_tables(study: "optuna.Study", search: Search, out: Path) -> dict[str, 
 
 def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:
     """Settings of PPO or SAC by name of task as a file of hyperparameters for rl-zoo3."""
-    lines = [
+    comment = [
         f"# Hyperparameters of Stable-Baselines3's {learner.upper()} for rl-zoo3, found by `ballbot tune {learner}`:",
         "# python -m rl_zoo3.train --algo NAME --env ID --conf-file THIS --gym-packages ballbot_gym "
         "--env-kwargs physics:\"'rk4'\"",
@@ -325,10 +285,8 @@ def zoo_yaml(learner: str, settings: Mapping[str, Any]) -> str:
         "# the schedules of discount and standard deviation, scaled rewards, shorter training episodes, longer control",
         "# steps.",
     ]
-    for task, chosen in settings.items():
-        lines += ["", f"{TASKS[task].id}:"]
-        lines += [f"  {name}: {value}" for name, value in _zoo(learner, chosen).items()]
-    return "\n".join(lines) + "\n"
+    chosen = {TASKS[task].id: _zoo(learner, each) for task, each in settings.items()}
+    return "\n".join([*comment, "", yaml.safe_dump(chosen, sort_keys=False, width=1000)])
 
 
 def _zoo(learner: str, chosen: Any) -> dict[str, Any]:
@@ -347,7 +305,7 @@ def _zoo(learner: str, chosen: Any) -> dict[str, Any]:
             "gae_lambda": round(chosen.gae_lambda, 4),
             "clip_range": ppo.CLIP_RANGE,
             "max_grad_norm": ppo.MAX_GRAD_NORM,
-            "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, log_std_init={math.log(chosen.std):.3f})"',
+            "policy_kwargs": f"dict(net_arch={list(chosen.hidden)}, log_std_init={math.log(chosen.std):.3f})",
         }
     return common | {
         "buffer_size": chosen.buffer_size,
@@ -357,5 +315,5 @@ def _zoo(learner: str, chosen: Any) -> dict[str, Any]:
         "tau": sac.TAU,
         "ent_coef": f"auto_{sac.ENT_COEF}",
         "target_entropy": round(chosen.target_entropy, 3),
-        "policy_kwargs": f'"dict(net_arch={list(chosen.hidden)}, activation_fn=nn.SiLU)"',
+        "policy_kwargs": f"dict(net_arch={list(chosen.hidden)}, activation_fn=nn.SiLU)",
     }

@@ -311,16 +311,16 @@ class Playground:
         main, robots, paths = self.main, [], []
         colors = [labels.color(Path(runner.name).stem, i) for i, runner in enumerate(self.runners)]
         for i, runner in reversed(list(enumerate(self.runners))):
-            name, alpha = (f"ghost {i}", GHOST_OPACITY) if i else ("robot", 1.0)
+            alpha = GHOST_OPACITY if i else 1.0
             force = np.array(runner.force) if runner is main and not main.violated else None
             said = _failure_word(runner.violated) or f"{math.degrees(dynamics.tilt(runner.x)):.0f}°"
             label, push = f"{labels.label(runner.name)} {said}", self.shown_push if runner is main else None
-            robots.append(Robot(np.array(runner.x), colors[i], force, alpha, name, push, label))
+            robots.append(Robot(np.array(runner.x), colors[i], force, alpha, push, label))
             trace = np.array(runner.states[-_TRACE_STEPS:])[:, :2]
-            paths += [GroundPath(trace, colors[i], name=name)] * (len(trace) > 1)
+            paths += [GroundPath(trace, colors[i])] * (len(trace) > 1)
         plan = main.plan(self.seconds)
         if len(plan) > 1 and not main.violated and not self.ended:
-            paths.append(GroundPath(plan, colors[0], dashed=True, name="plan"))
+            paths.append(GroundPath(plan, colors[0], dashed=True))
         return Drawing(self.world.params, tuple(robots), tuple(paths), tuple(self.world.task.markers(self.start[1])))
 
     # --- time ---

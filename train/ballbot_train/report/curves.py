@@ -11,14 +11,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.stats
 from matplotlib.figure import Figure
 
 from ballbot_gym import files
-from ballbot_train.console import markdown
 from ballbot_train.report.labels import color, label
 
 AXES = {"env_steps": "env steps", "minutes": "minutes of one core"}
@@ -36,7 +34,6 @@ class TrainingRun:
     folder: Path
     task: str
     learner: str
-    seed: int
     settings: str
     """As JSON text; runs that differ in their seeds alone have the same."""
     columns: dict[str, np.ndarray]
@@ -53,15 +50,14 @@ class LearningCurve:
     runs: tuple[TrainingRun, ...]
 
     def against(self, axis: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """x, interquartile mean, low and high of its band, (m) each; empty where the runs do not know x."""
+        """x, interquartile mean, low and high of its band, (m,) each; empty where the runs do not know x."""
         known = [(run.columns[axis], run.columns["regret"]) for run in self.runs]
         known = [(x[keep], y[keep]) for x, y in known if (keep := np.isfinite(x) & np.isfinite(y)).sum() > 1]
         if len(known) < len(self.runs):
             none = np.zeros(0)
             return none, none, none, none
         grid = np.linspace(max(x[0] for x, _ in known), min(x[-1] for x, _ in known), _POINTS)
-        values = np.array([np.interp(grid, x, y) for x, y in known])
-        return grid, interquartile_mean(values), *bootstrap_band(values)
+        return grid, *_middle_and_band(np.array([np.interp(grid, x, y) for x, y in known]))
 
     def final(self, name: str) -> np.ndarray:
         """(n,) the last value of each seed."""
@@ -73,12 +69,11 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
     return scipy.stats.trim_mean(values, 0.25, axis=-2)
 
 
-def bootstrap_band(values: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high (m,) of the 95 % percentile bootstrap interval of the interquartile mean of (n, m) values over n."""
-    chosen = np.random.default_rng(seed).integers(len(values), size=(_RESAMPLES, len(values)))
-    means = interquartile_mean(values[chosen])
-    low, high = np.percentile(means, [2.5, 97.5], axis=0)
-    return low, high
+def _middle_and_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Interquartile mean of (n, m) values over n, and low and high of its 95 % percentile bootstrap interval, (m,) each."""
+    chosen = np.random.default_rng(0).integers(len(values), size=(_RESAMPLES, len(values)))
+    low, high = np.percentile(interquartile_mean(values[chosen]), [2.5, 97.5], axis=0)
+    return interquartile_mean(values), low, high
 
 
 def read_runs(paths: Sequence[Path]) -> list[TrainingRun]:
@@ -89,16 +84,12 @@ def read_runs(paths: Sequence[Path]) -> list[TrainingRun]:
     """
     runs = []
     for path in paths:
-        found = (
-            [path]
-            if (path / "evaluations.csv").exists()
-            else [p.parent for p in sorted(path.glob("*/evaluations.csv"))]
-        )
+        found = sorted(path.glob("evaluations.csv")) or sorted(path.glob("*/evaluations.csv"))
         if not found:
             raise ValueError(
                 f"{path} holds no training, and neither do the folders in it; give folders of ballbot train"
             )
-        runs += [_read_run(folder) for folder in found]
+        runs += [_read_run(file.parent) for file in found]
     return runs
 
 
@@ -112,7 +103,7 @@ def _read_run(folder: Path) -> TrainingRun:
         columns["minutes"] = columns["cpu_seconds"] / 60
         columns["regret"] = columns["cost_ratio"] - 1
         settings = json.dumps(config["settings"], sort_keys=True)
-        return TrainingRun(folder, config["task"], config["learner"], config["seed"], settings, columns)
+        return TrainingRun(folder, config["task"], config["learner"], settings, columns)
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise ValueError(f"{folder} holds no training of ballbot train, or a damaged one: {error!r}") from error
 
@@ -154,50 +145,24 @@ def figure(curves: Sequence[LearningCurve]) -> Figure:
     return drawn
 
 
-def points(curves: Sequence[LearningCurve]) -> list[dict[str, Any]]:
-    """Every point of the figure, as rows of a table."""
+def summary(curves: Sequence[LearningCurve]) -> list[dict[str, str]]:
+    """Rows of a table: where each curve ends."""
     rows = []
     for curve in curves:
-        for axis in AXES:
-            for x, middle, low, high in zip(*curve.against(axis), strict=True):
-                place = {"task": curve.task, "curve": curve.label, "axis": axis, "x": float(x)}
-                rows.append(place | {"iqm": float(middle), "low": float(low), "high": float(high)})
-    return rows
-
-
-def summary(curves: Sequence[LearningCurve]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a table: where each curve ends."""
-    header = ["task", "curve", "seeds", "env steps", "minutes", "regret: IQM [95 %]", "median", "worst"]
-    header += ["success", "failures"]
-    rows = []
-    for curve in curves:
-        final = curve.final("regret")
-        low, high = bootstrap_band(final[:, None])
+        regret, steps = curve.final("regret"), np.median(curve.final("env_steps"))
+        middle, low, high = (float(value[0]) for value in _middle_and_band(regret[:, None]))
         rows.append(
-            [
-                curve.task,
-                curve.label,
-                f"{len(curve.runs)}",
-                _number(np.median(curve.final("env_steps"))),
-                f"{np.median(curve.final('minutes')):.1f}",
-                f"{interquartile_mean(final[:, None])[0]:.4g} [{low[0]:.4g}, {high[0]:.4g}]",
-                f"{np.median(final):.4g}",
-                f"{final.max():.4g}",
-                f"{np.median(curve.final('success')):.1%}",
-                f"{np.median(curve.final('failures')):.0f}",
-            ]
+            {
+                "task": curve.task,
+                "curve": curve.label,
+                "seeds": f"{len(curve.runs)}",
+                "env steps": "–" if math.isnan(steps) else f"{steps:,.0f}",
+                "minutes": f"{np.median(curve.final('minutes')):.1f}",
+                "regret: IQM [95 %]": f"{middle:.4g} [{low:.4g}, {high:.4g}]",
+                "median": f"{np.median(regret):.4g}",
+                "worst": f"{regret.max():.4g}",
+                "success": f"{np.median(curve.final('success')):.1%}",
+                "failures": f"{np.median(curve.final('failures')):.0f}",
+            }
         )
-    return header, rows
-
-
-def _number(value: Any) -> str:
-    return "–" if math.isnan(value) else f"{value:,.0f}"
-
-
-def write(curves: Sequence[LearningCurve], out: Path) -> Path:
-    """Writes curves.png, curves.csv with every point, and curves.md with where each curve ends; returns the figure's path."""
-    from ballbot_train.report.figures import save
-
-    files.write_csv(out / "curves.csv", points(curves), ("task", "curve", "axis", "x", "iqm", "low", "high"))
-    files.write(out / "curves.md", markdown(*summary(curves)))
-    return save(figure(curves), out / "curves.png")
+    return rows

@@ -5,7 +5,6 @@ import itertools
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,27 +17,16 @@ from matplotlib.ticker import LogFormatter
 
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
-from ballbot_gym.trajectory import Trajectory
 from ballbot_train.evaluation.basins import AXES, BasinMap
 from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
-from ballbot_train.report.labels import COLORS as COLORS
 from ballbot_train.report.labels import LABELS, color, label
+from ballbot_train.report.replay import Take
 
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A trajectory to draw, with its label, colour and line style."""
-
-    label: str
-    trajectory: Trajectory
-    color: str
-    style: str = "-"
-
-
-def trajectory_figure(title: str, curves: Sequence[Curve], markers: Sequence[Marker] = ()) -> Figure:
+def trajectory_figure(title: str, takes: Sequence[Take], markers: Sequence[Marker] = ()) -> Figure:
     """The paper's form: position, velocity and lean over time, forces over time, and the ground path."""
     figure = Figure(figsize=(12, 6.2), layout="constrained")
     figure.suptitle(title, fontsize=13)
@@ -53,23 +41,19 @@ def trajectory_figure(title: str, curves: Sequence[Curve], markers: Sequence[Mar
     }
     for key, (y_label, first, names, factor) in panels.items():
         axis = axes[key]
-        for curve, i in itertools.product(curves, range(2)):
-            t, values = (
-                curve.trajectory.t,
-                curve.trajectory.u[:, i] if first is None else curve.trajectory.x[:, first + i],
-            )
-            held = "steps-post" if first is None and curve.trajectory.held else "default"
-            look = {"color": curve.color, "lw": 1.5, "alpha": 0.8 if i else 1.0, "drawstyle": held}
-            axis.plot(t[: len(values)], factor * values, ":" if i else curve.style, **look)
+        for take, i in itertools.product(takes, range(2)):
+            shown = take.trajectory
+            values = shown.u[:, i] if first is None else shown.x[:, first + i]
+            held = "steps-post" if first is None and shown.held else "default"
+            look = {"color": take.color, "lw": 1.5, "alpha": 0.8 if i else 1.0, "drawstyle": held}
+            axis.plot(shown.t[: len(values)], factor * values, ":" if i else take.style, **look)
         axis.set_ylabel(y_label)
         axis.set_title(names, fontsize=9, color="0.35")
         axis.grid(alpha=0.3)
         axis.axhline(0, color="0.6", lw=0.6)
-    for curve in curves:
-        axes["path"].plot(*curve.trajectory.x[:, :2].T, curve.style, color=curve.color, lw=2, label=curve.label)
     for key in ("lean", "force"):
         axes[key].set_xlabel("time, s")
-    _finish_path(axes["path"], curves, markers)
+    _draw_path(axes["path"], takes, markers)
     return figure
 
 
@@ -179,13 +163,15 @@ def _folded(text: str) -> str:
     return "\n".join(textwrap.wrap(text, 28))
 
 
-def _finish_path(axis: Axes, curves: Sequence[Curve], markers: Sequence[Marker]) -> None:
+def _draw_path(axis: Axes, takes: Sequence[Take], markers: Sequence[Marker]) -> None:
+    for take in takes:
+        name = f"{take.label}, {take.note}" if take.note else take.label
+        axis.plot(*take.trajectory.x[:, :2].T, take.style, color=take.color, lw=2, label=name)
     for marker in markers:
         look = {"fill": not marker.ring, "ls": "--" if marker.ring else "-", "color": marker.color[:3]}
         axis.add_patch(patches.Circle(marker.position, marker.radius, **look, alpha=0.4)).set_zorder(0)
-    start, end = curves[0].trajectory.x[0], curves[0].trajectory.x[-1]
-    axis.plot(*start[:2], "o", color="k", ms=5)
-    axis.plot(*end[:2], "s", color="k", ms=5)
+    for mark, x in (("o", takes[0].trajectory.x[0]), ("s", takes[0].trajectory.x[-1])):
+        axis.plot(*x[:2], mark, color="k", ms=5)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set(xlabel="x, m", ylabel="y, m", title="ground path (● start, ■ end)")
     axis.grid(alpha=0.3)

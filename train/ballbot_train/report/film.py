@@ -4,7 +4,7 @@ import io
 import math
 import tempfile
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +25,6 @@ _FAILED = "#c01818"
 _FONT = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
 _COLUMNS = 4
 _STRIP_SIZE = (520, 390)  # pixels of a strip's picture
-_FALLEN = 45.0  # deg: at a smaller tilt a failure is the touch of an obstacle, or a lost grip
 _PAUSE = 1.5  # s, for which a film that loops shows its last picture
 
 
@@ -45,62 +44,41 @@ def write_strip(replay: Replay, path: Path, frames: int, seconds: float) -> Path
     return figures.save(figure, path)
 
 
-def write_film(
-    replay: Replay,
-    path: Path,
-    seconds: float,
-    fps: int = 25,
-    speed: float = 1.0,
-    width: int = 1280,
-    on_frame: Callable[[], None] = lambda: None,
-) -> Path:
-    """Writes a film of the takes side by side.
+def write_film(frames: Iterable[np.ndarray], path: Path, fps: int = 25) -> Path:
+    """Writes a film.
 
     Args:
-        replay: the takes.
+        frames: what `film_frames` yields.
         path: path of the file. Its ending selects the format: .mp4 or .webp. The file appears when it is complete.
             WebP repeats forever, and pauses at the end.
-        seconds: time of the episode at which the film ends.
         fps: frames per second.
-        speed: seconds of the episode per second of film.
-        width: width, px; the height is 9/16 of it.
-        on_frame: called after each frame.
 
     Raises:
         OSError: the file cannot be written, or there is no ffmpeg.
     """
-    pictures = _reported(film_frames(replay, film_times(seconds, fps, speed), width), on_frame)
-    content = _mp4(pictures, fps, path) if path.suffix == ".mp4" else _webp(pictures, fps)
-    return files.write(path, content)
+    return files.write(path, _mp4(frames, fps, path) if path.suffix == ".mp4" else _webp(frames, fps))
 
 
-def _reported(pictures: Iterator[np.ndarray], on_frame: Callable[[], None]) -> Iterator[np.ndarray]:
-    for frame in pictures:
-        yield frame
-        on_frame()
-
-
-def _mp4(pictures: Iterator[np.ndarray], fps: int, path: Path) -> bytes:
+def _mp4(frames: Iterable[np.ndarray], fps: int, path: Path) -> bytes:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # interrupted, ffmpeg may still write
         unfinished = Path(folder) / path.name
         options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
         try:
             with imageio.get_writer(unfinished, **options) as writer:
-                for frame in pictures:
+                for frame in frames:
                     writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
         except RuntimeError as error:  # imageio-ffmpeg raises it if its wheel brought no ffmpeg
             raise OSError(f"{path}: cannot encode: {error}") from error
         return unfinished.read_bytes()
 
 
-def _webp(pictures: Iterator[np.ndarray], fps: int) -> bytes:
-    """A film that repeats forever."""
-    images = [Image.fromarray(frame) for frame in pictures]
+def _webp(frames: Iterable[np.ndarray], fps: int) -> bytes:
+    first, *others = map(Image.fromarray, frames)
     frame_ms = round(1000 / fps)
-    durations = [frame_ms] * (len(images) - 1) + [frame_ms + round(1000 * _PAUSE)]
+    durations = [frame_ms] * len(others) + [frame_ms + round(1000 * _PAUSE)]
     options: dict[str, Any] = {"duration": durations, "loop": 0, "quality": 75, "method": 4}
     buffer = io.BytesIO()
-    images[0].save(buffer, "WEBP", save_all=True, append_images=images[1:], **options)
+    first.save(buffer, "WEBP", save_all=True, append_images=others, **options)
     return buffer.getvalue()
 
 
@@ -127,17 +105,15 @@ def film_frames(replay: Replay, times: Sequence[float] | np.ndarray, width: int 
             right, bottom = left + wide - 4, top + high - 4
             shown = picture(replay.drawing(take, t), max(right - left, 1), max(bottom - top, 1))
             frame.paste(Image.fromarray(shown), (left, top))
-            slip, ended = take.slip_at(t), t >= take.trajectory.duration
+            label, slip = textwrap.fill(take.label, letters), take.slip_at(t)
             tilt = f"{_tilt(take.trajectory.state(t)):.0f}°" + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
-            label = textwrap.fill(take.label, letters)
             pen.text((left + 3, top + 2), label, take.color, font)
             pen.text((left + 3, top + 3 * line // 2 * (1 + label.count("\n"))), tilt, take.color, large)
-            if take.failed and ended:
-                fell = "fell" if _tilt(take.trajectory.x[-1]) > _FALLEN else "failed"
-                pen.text((right - 4, top + 3 * line // 2), fell, _FAILED, large, "ra")
-            if ended or not take.failed:
+            if t >= take.trajectory.duration or not take.failed:
                 note = "\n".join(textwrap.fill(part, letters) for part in take.note.split("; "))
-                pen.text((right - 4, bottom - 4), note, "#333333", font, "rd", align="right")
+                pen.text(
+                    (right - 4, bottom - 4), note, _FAILED if take.failed else "#333333", font, "rd", align="right"
+                )
         yield np.asarray(frame)
 
 

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import webbrowser
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,27 +26,19 @@ from ballbot_train.report.replay import Replay, Take, playable
 if TYPE_CHECKING:
     from ballbot_train.evaluation.results import Row
 
-_HEIGHT = 470  # px of a replay below a cell
+_HEIGHT = 520  # px of a replay below a cell
 
 
 def show_motions(shown: Sequence[Moving], names: Sequence[str], robot: str | BallbotParams) -> Path | None:
     """See `ballbot_gym.display.Moving.show`."""
-    names = _names(shown, names)
-    takes = tuple(
-        Take(name, playable(one.motion, name), labels.color(name.lower(), i))
-        for i, (name, one) in enumerate(zip(names, shown, strict=True))
-    )
-    return _show(Replay(" and ".join(names), takes, _markers(shown), checked_robot(robot)))
+    takes = tuple(replace(take, trajectory=playable(take.trajectory, take.label)) for take in _takes(shown, names))
+    title = " and ".join(take.label for take in takes)
+    return _show(Replay(title, takes, _markers(shown), checked_robot(robot)))
 
 
 def plot_motions(shown: Sequence[Moving], names: Sequence[str]) -> Figure:
     """See `ballbot_gym.display.Moving.plot`."""
-    names = _names(shown, names)
-    curves = [
-        figures.Curve(name, one.motion, labels.color(name.lower(), i))
-        for i, (name, one) in enumerate(zip(names, shown, strict=True))
-    ]
-    return _figure(figures.trajectory_figure("", curves, _markers(shown)))
+    return _figure(figures.trajectory_figure("", _takes(shown, names), _markers(shown)))
 
 
 def plot_rows(rows: "Sequence[Row]") -> Figure:
@@ -68,12 +61,16 @@ def as_image(figure: Figure) -> str:
     return f'<img alt="the figure" src="data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
 
 
-def _names(shown: Sequence[Moving], names: Sequence[str]) -> list[str]:
+def _takes(shown: Sequence[Moving], names: Sequence[str]) -> list[Take]:
     if names and len(names) != len(shown):
         raise ValueError(f"labels names {len(names)} of {len(shown)} motions; give one for each")
     kinds = [type(one).__name__ for one in shown]
     alone = len(kinds) == len(set(kinds))
-    return list(names) or [kind if alone else f"{kind} {i}" for i, kind in enumerate(kinds, 1)]
+    names = names or [kind if alone else f"{kind} {i}" for i, kind in enumerate(kinds, 1)]
+    return [
+        Take(name, one.motion, labels.color(name.lower(), i))
+        for i, (name, one) in enumerate(zip(names, shown, strict=True))
+    ]
 
 
 def _markers(shown: Sequence[Moving]) -> tuple[Marker, ...]:

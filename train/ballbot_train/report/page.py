@@ -21,7 +21,6 @@ from ballbot_train.report.replay import Replay, Take
 
 _ASSETS = Path(__file__).parent / "assets"
 _WORD_COLUMNS = 2  # of a table: the first columns hold words, the others hold numbers
-_REPLAY_SCRIPTS = ("scene.js", "replay.js")
 _REPLAY_DT = 0.02  # s, between the states in the page
 
 
@@ -49,37 +48,36 @@ def write_report(
         name: [{"name": each.stem, "base64": base64.b64encode(files.read(each)).decode()} for each in group]
         for name, group in pictures.items()
     }
+    return files.write(path, _page(title, replays, header, rows, shown, facts))
+
+
+def replay_page(replay: Replay) -> str:
+    """An episode in 3D as a page of its own."""
+    return _page(replay.title, [replay])
+
+
+def _page(
+    title: str,
+    replays: Sequence[Replay],
+    header: Sequence[str] = (),
+    rows: Sequence[Sequence[str]] = (),
+    pictures: Mapping[str, Sequence[Mapping[str, str]]] = {},
+    facts: Mapping[str, object] = {},
+) -> str:
+    episodes = [_episode_data(replay) for replay in replays if replay.takes]
     page = render(
         "page.html.j2",
         title=title,
         header=header,
         rows=rows,
         word_columns=_WORD_COLUMNS,
-        data=_replay_data(replays),
-        pictures=shown,
+        data=scene_data(replays[0].params) | {"episodes": episodes} if episodes else {},
+        pictures=pictures,
         facts=facts,
         style=asset("style.css"),
-        scripts=[asset(name) for name in ("table.js", *_REPLAY_SCRIPTS)],
-    )
-    return files.write(path, page)
-
-
-def replay_page(replay: Replay) -> str:
-    """An episode in 3D as a page of its own."""
-    page = render(
-        "frame.html.j2",
-        title=replay.title,
-        data=_replay_data([replay]),
-        style=asset("style.css"),
-        scripts=[asset(name) for name in _REPLAY_SCRIPTS],
+        scripts=[asset(name) for name in ("table.js", "scene.js", "replay.js")],
     )
     return str(page)
-
-
-def _replay_data(replays: Sequence[Replay]) -> dict[str, object]:
-    """What replay.html.j2 shows; empty without replays."""
-    episodes = [_episode_data(replay) for replay in replays if replay.takes]
-    return scene_data(replays[0].params) | {"episodes": episodes} if episodes else {}
 
 
 def scene_data(params: BallbotParams) -> dict[str, object]:
@@ -128,15 +126,13 @@ def _episode_data(replay: Replay) -> dict[str, object]:
 
 def _poster(replay: Replay) -> float:
     """The moment that a replay shows first: that of the greatest lean of a robot that does not fall, s."""
-    standing = [take.trajectory for take in replay.takes if not take.failed] or [
-        take.trajectory for take in replay.takes
-    ]
-    leaning = max(standing, key=lambda trajectory: trajectory.tilt.max())
+    standing = [take for take in replay.takes if not take.failed] or replay.takes
+    leaning = max((take.trajectory for take in standing), key=lambda trajectory: trajectory.tilt.max())
     return float(leaning.t[leaning.tilt.argmax()])
 
 
 def _take_data(take: Take) -> dict[str, object]:
-    """Columns at every `_REPLAY_DT`: a millimetre, a tenth of a milliradian and a newton are enough to look at."""
+    """Poses and forces at every `_REPLAY_DT`: 0.1 mm, 0.1 mrad and 1 N are enough to look at."""
     times = _REPLAY_DT * np.arange(math.floor(take.trajectory.duration / _REPLAY_DT + 1e-6) + 1)
     x = np.array([take.trajectory.state(t) for t in times])
     u = np.array([take.trajectory.force(t) for t in times])
@@ -144,7 +140,6 @@ def _take_data(take: Take) -> dict[str, object]:
         "label": take.label,
         "color": take.color,
         "note": take.note,
-        **{name: x[:, i].round(3).tolist() for i, name in enumerate(("x", "y"))},
-        **{name: x[:, 2 + i].round(4).tolist() for i, name in enumerate(("gamma", "theta"))},
-        **{name: u[:, i].round(0).tolist() for i, name in enumerate(("fx", "fy"))},
+        "x": x[:, :4].round(4).tolist(),
+        "u": u.round().astype(int).tolist(),
     }

@@ -4,6 +4,8 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 
@@ -23,15 +25,16 @@ from ballbot_train.report import labels
 
 LEAST_SLIP = 0.02
 """m/s: what is less is the simulation's error."""
-_SKID = "#c01818"
+SKID = "#c01818"
+"""The colour of a path where the ball slips."""
 _FILE_DT = 0.02  # s, between the states of a trajectory that is interpolated
 
 
 @dataclass(frozen=True)
 class Take:
-    """One trajectory to watch.
+    """One trajectory to look at.
 
-    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle.
+    `note` says how it ended, and `failed` whether the robot fell or touched an obstacle. `style` is of its lines in figures.
     """
 
     label: str
@@ -39,6 +42,7 @@ class Take:
     color: str
     note: str = ""
     failed: bool = False
+    style: str = "-"
     slip: np.ndarray | None = None
     """(n,) speed of the ball's lowest point over the floor as each force begins, m/s, where contact is simulated."""
 
@@ -66,23 +70,17 @@ class Replay:
     def drawing(self, take: Take, t: float) -> Drawing:
         """One of the takes at time t, s, with its path so far. After its end a robot stands still."""
         u = take.trajectory.force(t) if t < take.trajectory.duration else None
-        skids = (GroundPath(points, _SKID, name=f"skid {i}") for i, points in enumerate(_skids(take, t)))
-        paths = GroundPath(driven_path(take.trajectory, t), take.color), *skids
+        driven, skids = take.trajectory, ()
+        if take.slip is not None:
+            slips = np.flatnonzero((take.slip > LEAST_SLIP) & (driven.t[1:] <= t))
+            skids = (GroundPath(driven.x[i : i + 2, :2], SKID) for i in slips)
+        paths = GroundPath(driven_path(driven, t), take.color), *skids
         return Drawing(self.params, (Robot(take.trajectory.state(t), take.color, u),), paths, self.markers)
 
 
 def driven_path(trajectory: Trajectory, t: float) -> np.ndarray:
     """(n, 2) the ground path until time t, m."""
     return np.concatenate([trajectory.x[trajectory.t < t, :2], trajectory.state(t)[None, :2]])
-
-
-def _skids(take: Take, t: float) -> list[np.ndarray]:
-    """Where the ball has slipped until time t, as pieces (n, 2) of its path, m."""
-    if take.slip is None:
-        return []
-    steps = np.flatnonzero((take.slip > LEAST_SLIP) & (take.trajectory.t[1:] <= t))
-    pieces = np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1)
-    return [take.trajectory.x[piece[0] : piece[-1] + 2, :2] for piece in pieces if len(piece)]
 
 
 def certified_replay(
@@ -144,44 +142,31 @@ def _take(
     episode_set: certified.EvaluationSet,
     episode: int,
 ) -> Take:
-    seen = _SlipRecorder(env, controller)
-    run = rollout(env, seen, options=episode_set.options(episode))
+    slips: list[float] = []
+
+    def act(t: float, x: np.ndarray) -> np.ndarray:
+        slips.append(env.slip)
+        return controller.act(t, x)
+
+    watched = cast(Controller, SimpleNamespace(reset=controller.reset, act=act))
+    run = rollout(env, watched, options=episode_set.options(episode))
     if run.failure:
         note = f"fails at {run.trajectory.duration:.2f} s"
     else:
         note = f"regret {round(100 * (run.cost / episode_set.costs[episode] - 1), 1) + 0:.1f} %"  # + 0: no −0.0
-    slip = np.array(seen.slips)
+    slip = np.array(slips)
     if slip.max() > LEAST_SLIP:
         note = f"{note}; slips for {env.task.control_dt * np.count_nonzero(slip > LEAST_SLIP):.2f} s"
     return Take(labels.label(name), run.trajectory, labels.color(Path(name).stem, i), note, run.failure, slip=slip)
 
 
-class _SlipRecorder:
-    """A controller, and how fast the ball slips whenever it acts."""
-
-    def __init__(self, env: BallbotEnv, controller: Controller):
-        self._env, self._controller = env, controller
-        self.slips: list[float] = []
-        """m/s, one for each control step."""
-
-    def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
-        self._controller.reset(t, x, c)
-
-    def act(self, t: float, x: np.ndarray) -> np.ndarray:
-        self.slips.append(self._env.slip)
-        return self._controller.act(t, x)
-
-
-def replay_of(
-    task: str, controllers: Sequence[str], results: Sequence[Result], physics: str, robot: str = PAPER
-) -> Replay:
-    """A telling episode of a task: the first in which one controller fails and another does not, else the first."""
+def telling_episode(task: str, results: Sequence[Result]) -> int:
+    """The first episode of a task in which one controller fails and another does not, else the first of all."""
     failures: dict[int, set[bool]] = {}
     for result in results:
         if result.task == task:
             failures.setdefault(result.episode, set()).add(result.failure)
-    episode = next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
-    return certified_replay(task, controllers, episode, physics, skip_planless=True, robot=robot)
+    return next((episode for episode, seen in sorted(failures.items()) if len(seen) == 2), min(failures))
 
 
 def file_replay(paths: Sequence[Path]) -> Replay:
@@ -193,7 +178,9 @@ def file_replay(paths: Sequence[Path]) -> Replay:
     takes = []
     for i, path in enumerate(paths):
         trajectory = playable(Trajectory.load(path), str(path))
-        takes.append(Take(_label(path, paths), trajectory, labels.color(path.stem, i)))
+        alone = sum(other.stem == path.stem for other in paths) == 1
+        label = path.stem if alone else f"{path.parent.name}/{path.stem}"
+        takes.append(Take(label, trajectory, labels.color(path.stem, i)))
     return Replay(", ".join(take.label for take in takes), tuple(takes))
 
 
@@ -208,9 +195,3 @@ def playable(trajectory: Trajectory, name: str) -> Trajectory:
     if trajectory.xdot is not None or not trajectory.held:
         trajectory = trajectory.resampled(_FILE_DT)
     return replace(trajectory, t=trajectory.t - trajectory.t[0])
-
-
-def _label(path: Path, paths: Sequence[Path]) -> str:
-    """The name of a file, with its folder if another file has the same name."""
-    unique = sum(other.stem == path.stem for other in paths) == 1
-    return path.stem if unique else f"{path.parent.name}/{path.stem}"

@@ -1,15 +1,13 @@
 // The same episode under several controllers: a scene each, by scene.js. The data are states at 50 Hz.
 "use strict";
 
-const NEAR = 3.4; // m, of the camera from a robot that it follows
-
 // State and force of a take at time t, interpolated; it stays where it ended.
 function sample(take, dt, t) {
   const last = take.x.length - 1;
   const place = Math.min(t / dt, last);
   const [n, share] = [Math.floor(place), place % 1];
-  const at = (name) => take[name][n] + share * ((take[name][n + 1] ?? take[name][n]) - take[name][n]);
-  return { n, x: ["x", "y", "gamma", "theta"].map(at), u: place < last ? [take.fx[n], take.fy[n]] : null };
+  const x = take.x[n].map((from, i) => from + share * ((take.x[n + 1] ?? take.x[n])[i] - from));
+  return { n, x, u: place < last ? take.u[n] : null };
 }
 
 const tiltOf = (gamma, theta) => (Math.acos(Math.min(1, Math.cos(gamma) * Math.cos(theta))) * 180) / Math.PI;
@@ -42,7 +40,6 @@ class Replay {
       this.pause();
       this.seek(Number(event.target.value));
     };
-    this.find("follow").onchange = () => this.draw();
   }
 
   choose(index) {
@@ -115,15 +112,9 @@ class Replay {
       stage.querySelector(".tilt").textContent = tiltOf(now.x[2], now.x[3]).toFixed(0) + "°";
       if (!scene) return;
       scene.theme = THEMES[this.night.matches ? "dark" : "light"];
-      const way = take.x.map((x, k) => [x, take.y[k]]);
-      const [across, along] = [0, 1].map((i) => way.map((point) => point[i]));
-      const [low, high] = [Math.min, Math.max].map((of) => [of(...across), of(...along)]);
-      const follow = this.find("follow").checked;
-      const middle = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2];
-      scene.camera.target = [...(follow ? now.x.slice(0, 2) : middle), 0.5];
-      scene.camera.distance = NEAR + (follow ? 0 : 1.2 * Math.hypot(high[0] - low[0], high[1] - low[1]));
-      const driven = [...way.slice(0, now.n + 1), now.x.slice(0, 2)];
-      const paths = [{ points: way, color: take.color, dashed: true }, { points: driven, color: take.color, dashed: false }];
+      scene.camera.target = [...now.x.slice(0, 2), 0.5];
+      const driven = [...take.x.slice(0, now.n + 1), now.x];
+      const paths = [{ points: take.x, color: take.color, dashed: true }, { points: driven, color: take.color, dashed: false }];
       scene.draw({ robots: [{ x: now.x, u: now.u, color: take.color, alpha: 1 }], paths, markers });
     });
   }
