@@ -42,10 +42,12 @@ _AVERAGED_ITERATIONS = 20  # over which the policy is a running average
 # of ending outside of the goal, less this depth, in units of the goal functions
 _GOAL_PENALTY, _GOAL_CLEARANCE = 30.0, 0.1
 _FAILURE_PENALTY = 1000.0  # cost of a failure in training. It has no gradient
-_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 3000.0  # as of the margins, for `dynamics.limits` of robots that can slip
+_GRIP_CLEARANCE, _GRIP_PENALTY = 0.05, 10000.0  # as of the margins, for `dynamics.limits` of robots that can slip
 _MIN_COST = 0.5  # cheaper episodes are weighted as if they cost this much
 _RESTING = 25  # last control steps that may lack the goal, of episodes of full length or with noise
-_STEEPEST = 10.0  # slope of the logarithm of an episode's cost with a state: steeper ones, of robots that fall, are cut
+# slope of the logarithm of an episode's cost with a state: steeper ones, of robots that fall, are cut. Near a friction limit
+# slopes of 10 are common, and with cuts there the gradient led uphill
+_STEEPEST, _STEEPEST_WITH_GRIP = 10.0, 100.0
 _PATIENCE = 5  # control steps for which episodes go on when all have reached the goal
 _COMPILE_FROM = 50  # iterations; compiling a control step takes half a minute
 _STATE = ("iteration", "_trained", "_average", "_optimizer", "_batch")
@@ -173,12 +175,18 @@ class WholeEpisodes:
             # where an episode has failed, the model goes on from its start, which leads to no infinite numbers
             x = torch.where(alive & standing, step.x, start)
             if self._batch.randomization.active and x.requires_grad:
-                x.register_hook(_tamed)
+                x.register_hook(self._tamed)
             state = state._replace(x=x, actuator=step.actuator, past=step.past, steps=state.steps + ahead)
         if not task.first_exit:
             return total + _FAILURE_PENALTY * ~alive, alive
         # one that fails ends where it failed, and not at its best moment before
         return torch.where(alive, torch.stack(ends).amin(0), last), reached
+
+    def _tamed(self, slope: torch.Tensor) -> torch.Tensor:
+        """The slope (8, B) of the mean of B episodes' losses with their states, in no episode steeper than the steepest."""
+        steepest = _STEEPEST_WITH_GRIP if self._batch.params.grips else _STEEPEST
+        most = steepest / slope.shape[1]
+        return torch.nan_to_num(slope * (most / slope.norm(dim=0)).clamp(max=1.0), 0.0, 0.0, 0.0)
 
     def _one_step(self, state: BatchState) -> _Step:
         """One control step of every episode; compiled."""
@@ -190,10 +198,8 @@ class WholeEpisodes:
         c = task.at(state.c.unbind(0), time + task.control_dt)
         if config.margin_penalty:
             for margin in task.margins(x, c):
-                cost = (
-                    cost
-                    + config.margin_penalty * task.control_dt * (config.margin_clearance - margin).clamp(min=0) ** 2
-                )
+                shortfall = (config.margin_clearance - margin).clamp(min=0)
+                cost = cost + config.margin_penalty * task.control_dt * shortfall**2
         cost = cost + grip_penalty(self._batch.model(state.drawn.unbind(0)), before, force, task.control_dt)
         goal = torch.stack(task.goal(x, c))
         lacking = (goal + _GOAL_CLEARANCE).clamp(min=0).sum(0)
@@ -206,9 +212,3 @@ def grip_penalty(params: Any, x: tuple[Any, ...], force: tuple[Any, ...], dt: fl
     """What a control step of dt, s, in which the ball slips or nearly does, costs in training, of B robots: (B,) or 0."""
     shortfalls = ((_GRIP_CLEARANCE - limit).clamp(min=0) for limit in dynamics.limits(params, x, force, hold=dt))
     return sum(_GRIP_PENALTY * dt * shortfall**2 for shortfall in shortfalls)
-
-
-def _tamed(slope: torch.Tensor) -> torch.Tensor:
-    """The slope (8, B) of the mean of B episodes' losses with their states, no steeper than `_STEEPEST` in any episode."""
-    most = _STEEPEST / slope.shape[1]
-    return torch.nan_to_num(slope * (most / slope.norm(dim=0)).clamp(max=1.0), 0.0, 0.0, 0.0)
