@@ -10,6 +10,7 @@ import logging
 import math
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import replace
@@ -36,6 +37,7 @@ _JUMP = 4.0  # m, of a distance that it follows at once
 _LABEL_HEIGHT = 0.16  # m, between the labels of robots that are in one place
 _GRAB_REACH = 3.0  # m, the farthest that a drag counts
 _LOCAL = r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"  # names that no website can have; tunnels have other ports
+_STARTING = threading.Lock()
 
 
 def has_viser() -> bool:
@@ -245,7 +247,7 @@ def _guarded() -> Iterator[None]:
     """
     from websockets.asyncio import server
 
-    start, guarded = server.serve, False
+    guarded = False
 
     def serve(handler: Any, host: str, port: int, **settings: Any) -> Any:
         nonlocal guarded
@@ -262,11 +264,13 @@ def _guarded() -> Iterator[None]:
         settings["process_request"] = process_request
         return start(handler, host, port, **settings)
 
-    server.serve = serve  # pyright: ignore[reportAttributeAccessIssue] viser takes no other
-    try:
-        yield
-    finally:
-        server.serve = start
+    with _STARTING:  # else another thread's guard could be kept for ever
+        start = server.serve
+        server.serve = serve  # pyright: ignore[reportAttributeAccessIssue] viser takes no other
+        try:
+            yield
+        finally:
+            server.serve = start
     if not guarded:
         raise RuntimeError("this version of viser cannot be guarded; install the one that constraints.txt names")
 

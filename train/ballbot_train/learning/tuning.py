@@ -172,7 +172,9 @@ def open_study(search: Search, out: Path) -> "optuna.Study":
     if not study.trials:
         study.enqueue_trial(encoded(SPACES[search.learner], LEARNERS[search.learner].settings(search.task)))
     for stale in study.get_trials(states=(_State.RUNNING,)):  # of a search that was killed
-        study.enqueue_trial({**stale.system_attrs.get("fixed_params", {}), **stale.params})
+        waiting = [_given(trial) for trial in study.get_trials(states=(_State.WAITING,))]
+        if _given(stale) not in waiting:  # a kill may have come before the next line
+            study.enqueue_trial(_given(stale))
         study.tell(stale.number, state=_State.FAIL)
     return study
 
@@ -189,6 +191,11 @@ def settings_of(search: Search, chosen: Mapping[str, Any]) -> Any:
     settings = replace(LEARNERS[search.learner].settings(search.task), **decoded)
     iterations = max(1, round(search.env_steps / (settings.num_envs * settings.num_steps)))
     return replace(settings, evaluations=search.evaluations, iterations=iterations)
+
+
+def _given(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
+    """The parameters of a trial as far as they are known: a kill may have come before all were proposed."""
+    return {**trial.system_attrs.get("fixed_params", {}), **trial.params}
 
 
 def attempt(search: Search, settings: Any, completed: Sequence["optuna.trial.FrozenTrial"] = ()) -> dict[str, Any]:
