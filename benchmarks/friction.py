@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from ballbot_gym import certified, dynamics, files
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import BallbotParams, default_params
+from ballbot_gym.randomization import TRACKS
 from ballbot_gym.robots import named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_gym.tasks import TASKS
@@ -152,7 +153,35 @@ def contact(out: Path, episodes: int) -> None:
     files.write_csv(out / "contact.csv", rows)
 
 
-def main(out: Path = Path("runs/friction"), costs: bool = False, contact_episodes: int = 0) -> None:
+def never_slip(out: Path, episodes: int) -> None:
+    """What it costs to slip on no floor of "unknown": each robot's optimum on the slipperiest, over that on its own."""
+    from ballbot_baselines.optimum import find_optimum
+
+    nominal, track, rows = named_robot("rolling"), TRACKS["unknown"], []
+    for name in TASKS:
+        task, stored = make_task(name, nominal), certified.load(name, nominal, randomization=track)
+        for i in range(episodes):
+            drawn = [*stored.drawn[i]]
+            drawn[track.DRAWN.index("friction")] = track.friction[0]
+            slippery = track.robot(nominal, tuple(drawn))
+            try:
+                cost = find_optimum(task, slippery, stored.states[i], stored.constants[i]).cost
+            except PlanError:
+                cost = math.nan
+            rows.append({"task": name, "episode": i, "costs_more": cost / stored.costs[i] - 1})
+        more = np.array([row["costs_more"] for row in rows if row["task"] == name])
+        found = more[np.isfinite(more)]
+        print(
+            f"{name}: {len(found)} of {episodes} can do without slipping anywhere, which costs {found.mean():.1%} more "
+            f"(median {np.median(found):.1%}, worst {found.max():.0%})",
+            flush=True,
+        )
+    files.write_csv(out / "never_slip.csv", rows)
+
+
+def main(
+    out: Path = Path("runs/friction"), costs: bool = False, contact_episodes: int = 0, unknown_episodes: int = 0
+) -> None:
     """Measures what the stored optima of the paper's robot need, and writes demand.csv and friction.png.
 
     Args:
@@ -161,12 +190,16 @@ def main(out: Path = Path("runs/friction"), costs: bool = False, contact_episode
             contact.csv says what the floor gave.
         costs: also find optima of the rolling robot at several coefficients of friction, which takes minutes, and write
             sweep.csv and sweep.png with their cost and greatest lean.
+        unknown_episodes: of the rolling robot's certified ones on the track "unknown", whose optima are found for the
+            slipperiest floor too; never_slip.csv says what that costs.
     """
     demand(out)
     if costs:
         sweep(out)
     if contact_episodes:
         contact(out, contact_episodes)
+    if unknown_episodes:
+        never_slip(out, unknown_episodes)
 
 
 if __name__ == "__main__":

@@ -18,14 +18,14 @@ from ballbot_gym.batch import BallbotBatch
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.params import default_params
-from ballbot_gym.randomization import TRACKS, Randomization
+from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS, Randomization
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train import evaluate
 from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.controllers import make_controller
-from ballbot_train.evaluation.fresh import evaluate_fresh
+from ballbot_train.evaluation.fresh import as_batch_policy, evaluate_fresh
 from ballbot_train.evaluation.tracks import EXPERTS, conditions, with_experts
 from ballbot_train.learning.actors import started
 from ballbot_train.onnx_export import export_onnx
@@ -237,3 +237,26 @@ def test_an_informed_policy_acts_as_its_start_at_first_and_runs_behind_a_filter(
         export_onnx(path, tmp_path / "policy.onnx", make_task("stabilize"))
     with pytest.raises(ValueError, match="give --informed"):
         started(informed, start.spec)
+
+
+def test_an_informed_policy_is_told_at_first_what_the_filter_knows_then_and_the_drawn_robot_afterwards(tmp_path):
+    import torch
+
+    task = make_task("stabilize")
+    start = load_network(shipped_policies(task)["shac"], task)
+    informed = started(start, replace(start.spec, informed=True))
+    for part in informed.parameters():
+        part.data += 0.01
+    firsts = []
+    for policy in (informed, save_policy(tmp_path / "policy", informed, {})):
+        batch = BallbotBatch(task, 4, randomization="unknown", compile=False, dtype=torch.float64)
+        seen, act = batch.reset(seed=3), as_batch_policy(policy, batch)
+        firsts.append(act(seen).detach().double())
+        if policy is informed:
+            drawn = batch.state.drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T
+            as_drawn = [informed(torch.cat([seen, drawn], 1).float()) / drawn[:, -1:]]
+            seen = batch.step(firsts[0]).observation
+            as_drawn.append(informed(torch.cat([seen, drawn], 1).float()) / drawn[:, -1:])
+            torch.testing.assert_close(act(seen).double(), as_drawn[1], rtol=1e-5, atol=1e-5)
+            assert not torch.allclose(as_drawn[0], firsts[0], rtol=1e-3)
+    torch.testing.assert_close(*firsts, rtol=1e-3, atol=1e-4)

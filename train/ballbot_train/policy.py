@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,9 @@ try:
     import torch
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
+
+if TYPE_CHECKING:
+    from ballbot_gym.batch import BatchState
 
 _TOLD = len(ROBOT_FACTORS)
 _TOLD_SCALE = 0.3  # of what informed policies are told, less 1
@@ -81,13 +84,15 @@ class PolicyNetwork(torch.nn.Module):
         raw = self.raw(observation)
         return torch.tanh(raw) if self.spec.squash == "tanh" else raw.clamp(-1.0, 1.0)
 
-    def knowing(self, observation: torch.Tensor, drawn: torch.Tensor) -> torch.Tensor:
-        """Actions (B, 2) for observations (B, no) without what an informed policy is told of the robots: that is in what a
-        randomization drew for them (n, B).
+    def knowing(self, observation: torch.Tensor, state: "BatchState", track: Randomization) -> torch.Tensor:
+        """Actions (B, 2) for observations (B, no) without what an informed policy is told of the robots. That is what `track`
+        drew for them, as a filter tells it: in the first control step, when nothing is known yet, what is drawn on average.
         """
         if not self.spec.informed:
             return self(observation)
-        told = drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T.to(observation.dtype)
+        told = state.drawn[[Randomization.DRAWN.index(name) for name in ROBOT_FACTORS]].T.to(observation.dtype)
+        expected = told.new_tensor([sum(getattr(track, name)) / 2 for name in ROBOT_FACTORS])
+        told = torch.where(state.steps[:, None] == 0, expected, told)
         return self(torch.cat([observation, told], -1)) / told[:, -1:]
 
     def raw(self, observation: torch.Tensor) -> torch.Tensor:

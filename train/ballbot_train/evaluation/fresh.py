@@ -279,7 +279,7 @@ def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> Bat
             predictor(observation.float().numpy(), next(begins)), device=observation.device
         )
     if isinstance(policy, PolicyNetwork) and policy.spec.informed:
-        return lambda observation: policy.knowing(observation.float(), cast(BatchState, batch.state).drawn)
+        return lambda seen: policy.knowing(seen.float(), cast(BatchState, batch.state), batch.randomization)
     if callable(policy):
         function: Any = policy
         return lambda observation: function(observation.float())

@@ -157,7 +157,6 @@ class WholeEpisodes:
         rests = not task.first_exit and (noisy or task.steps >= self._own_steps)
         ends, patience = [], _PATIENCE
         last = torch.full_like(total, _FAILURE_PENALTY)
-        ahead = int(noisy or task.clock)  # what noise and clock give changes with the steps
         for k in range(task.steps):
             step = self._step(state)
             total = total + torch.where(alive & standing, step.cost, 0.0)
@@ -176,7 +175,7 @@ class WholeEpisodes:
             x = torch.where(alive & standing, step.x, start)
             if self._batch.randomization.active and x.requires_grad:
                 x.register_hook(self._tamed)
-            state = state._replace(x=x, actuator=step.actuator, past=step.past, steps=state.steps + ahead)
+            state = state._replace(x=x, actuator=step.actuator, past=step.past, steps=state.steps + 1)
         if not task.first_exit:
             return total + _FAILURE_PENALTY * ~alive, alive
         # one that fails ends where it failed, and not at its best moment before
@@ -191,7 +190,8 @@ class WholeEpisodes:
     def _one_step(self, state: BatchState) -> _Step:
         """One control step of every episode; compiled."""
         config, task = self.config, self.task
-        new, result = self._batch.transition(state, self._trained.knowing(self._batch.observe(state), state.drawn))
+        action = self._trained.knowing(self._batch.observe(state), state, self._batch.randomization)
+        new, result = self._batch.transition(state, action)
         before, force = state.x.unbind(0), result.force.unbind(0)
         x, time = result.final_x.unbind(0), state.steps * task.control_dt
         cost = task.cost(before, force, task.at(state.c.unbind(0), time)) * task.control_dt
