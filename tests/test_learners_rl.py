@@ -216,7 +216,7 @@ def test_sac_sees_and_acts_in_the_frame_of_its_task_and_keeps_the_steady_motion(
     learner._env.step_async(learner._model.predict(seen, deterministic=True)[0])
     with torch.no_grad():
         expected = learner.network(batch.observe(batch.state))
-    np.testing.assert_allclose(learner._env.venv._actions, expected, atol=1e-6)  # float32
+    np.testing.assert_allclose(learner._env._actions, expected, atol=1e-6)  # float32
     if task == "stabilize":
         with torch.no_grad():
             assert learner.network(torch.zeros(8)).tolist() == [0.0, 0.0]

@@ -1,7 +1,7 @@
 """What PPO and SAC share: stages of training, the envs they train on, imitation, and their actors as policies."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -9,8 +9,8 @@ import gymnasium
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import NStepReplayBuffer, RolloutBuffer
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import nn
 
 from ballbot_gym.batch import BatchState
@@ -29,7 +29,6 @@ from ballbot_train.learning.frames import seen_in, to_world
 from ballbot_train.learning.sb3 import BallbotVecEnv
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork
-from ballbot_train.policy_files import PolicySpec
 
 
 @dataclass(frozen=True)
@@ -92,6 +91,9 @@ class ModelFree(ABC):
     A resumed run does exactly what it would have done; only the success rate of the last hundred episodes starts anew.
     """
 
+    _imitation_weight: float
+    """Of the imitation loss, the mean squared difference of the actions, at the start."""
+
     def __init__(
         self,
         task: Task,
@@ -140,10 +142,25 @@ class ModelFree(ABC):
         )
         self._env = TrainingEnv(batch, self._reward_scale, frame)
 
-    def _set_model(self, model: BaseAlgorithm, actor: nn.Module, optimizers: Sequence[torch.optim.Optimizer]) -> None:
-        """Takes SB3's model, its actor from observation to mean action, and its optimizers, the actor's first."""
+    def _set_model(
+        self,
+        model: BaseAlgorithm,
+        actor: nn.Module,
+        optimizers: Sequence[torch.optim.Optimizer],
+        buffer: RolloutBuffer | NStepReplayBuffer,
+        value_biases: Sequence[torch.Tensor],
+    ) -> None:
+        """Takes SB3's model and parts of it.
+
+        Args:
+            model: PPO or SAC.
+            actor: from observation to mean action.
+            optimizers: the actor's first.
+            buffer: of what the actor met.
+            value_biases: of the outputs of all critics.
+        """
         self._model: Any = model  # PPO or SAC, which both have a gamma
-        self._actor, self._optimizers = actor, optimizers
+        self._actor, self._optimizers, self._buffer, self._value_biases = actor, optimizers, buffer, value_biases
         self._average = average_of(actor, _AVERAGED_ITERATIONS)
         model.set_logger(Logger(folder=None, output_formats=[]))
         model._last_obs = self._env.reset()
@@ -175,26 +192,17 @@ class ModelFree(ABC):
     def network(self) -> PolicyNetwork:
         """The policy learnt so far."""
 
-    @abstractmethod
-    def _value_biases(self) -> list[torch.Tensor]:
-        """The biases of the outputs of all critics."""
-
     def _raise_gamma(self, gamma: float) -> None:
         """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
         more = self._value_of_living(gamma) - self._value_of_living(self._model.gamma)
         with torch.no_grad():
-            for bias in self._value_biases():
+            for bias in self._value_biases:
                 bias.add_(more)
         self._take_gamma(gamma)
 
     def _take_gamma(self, gamma: float) -> None:
         """Gives the discount factor to all that have a copy of it."""
-        self._model.gamma = self._env.batch.gamma = gamma
-
-    @property
-    @abstractmethod
-    def _imitation_weight(self) -> float:
-        """Weight of the imitation loss, the mean squared difference of the actions, at the start."""
+        self._model.gamma = self._buffer.gamma = self._env.batch.gamma = gamma
 
     @property
     def preparation(self) -> int:
@@ -299,7 +307,7 @@ class ModelFree(ABC):
             (self._imitation_weight * (1 - self._progress) * self._imitation.loss()).backward()
 
 
-class TrainingEnv(VecEnvWrapper):
+class TrainingEnv(BallbotVecEnv):
     """The envs of a batch for learning, with scaled rewards.
 
     Their episodes may be shorter than the task's, and the optimal policy stays the same. An episode that runs out of time is
@@ -316,35 +324,34 @@ class TrainingEnv(VecEnvWrapper):
             frame: in which observations are shown and actions taken; default, the task's own.
         """
         world: dict[str, Any] = {"randomization": batch.randomization, "history": batch.history}
-        self._vector = BallbotVectorEnv(
+        vector = BallbotVectorEnv(
             batch.num_envs, batch.own_task, params=batch.params, compile=False, engine="torch", **world
         )
-        self._vector.batch = self.batch = batch
+        vector.batch = self.batch = batch
+        super().__init__(vector)
         self._scale = np.float32(reward_scale)
         self._frame, self._axes = frame, np.zeros(0)
-        seen = None if frame is None else gymnasium.spaces.Box(-np.inf, np.inf, (frame.size,), np.float32)
-        super().__init__(BallbotVecEnv(self._vector), seen)
+        if frame is not None:
+            self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (frame.size,), np.float32)
 
     def reset(self) -> np.ndarray:
         """Starts an episode in every env, with step counts that differ so that the episodes never end together."""
-        observation, batch = cast(np.ndarray, self.venv.reset()), self.batch
+        observation, batch = super().reset(), self.batch
         assert batch.state is not None
-        steps = torch.arange(self.num_envs) * self._vector.task.steps // self.num_envs
+        steps = torch.arange(self.num_envs) * self.env.task.steps // self.num_envs
         batch.state = batch.state._replace(steps=steps)
         return self._seen(observation)
 
     def step_async(self, actions: np.ndarray) -> None:
-        if self._frame is not None:
-            actions = to_world(self._axes, actions)
-        self.venv.step_async(actions)
+        super().step_async(actions if self._frame is None else to_world(self._axes, actions))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        observation, reward, done, infos = self.venv.step_wait()
+        observation, reward, done, infos = super().step_wait()
         if self._frame is not None:
             for i in np.flatnonzero(done).tolist():
                 last, _ = seen_in(self._frame, infos[i]["terminal_observation"][np.newaxis])
                 infos[i]["terminal_observation"] = last[0]
-        return self._seen(cast(np.ndarray, observation)), self._scale * reward, done, infos
+        return self._seen(observation), self._scale * reward, done, infos
 
     def state_dict(self) -> dict[str, Any]:
         """State of every env: tensors and plain values."""
@@ -416,13 +423,3 @@ class ScopedRng:
 
     def _capture(self) -> None:
         self._torch, self._numpy = torch.get_rng_state(), cast(Any, np.random.get_state())
-
-
-def as_policy(layers: Iterable[nn.Module], task: Task, **fields: Any) -> PolicyNetwork:
-    """Copies the layers of an actor, from observation to mean action, into a policy; fields are those of `PolicySpec`."""
-    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
-    hidden = tuple(layer.out_features for layer in linear[:-1])
-    network = PolicyNetwork(PolicySpec.of(task, hidden=hidden, linear=False, **fields))
-    for copy, layer in zip((part for part in network.mlp if isinstance(part, nn.Linear)), linear, strict=True):
-        copy.load_state_dict(layer.state_dict())
-    return network

@@ -283,8 +283,8 @@ class Ppo(ModelFree):
         self._log_std.requires_grad_(False)
         if config.relative_values:  # the critic's last layer, which the policy has as an identity
             policy.value_net.register_forward_hook(self._weigh)
-        self._model: PPO
-        self._set_model(model, policy.branches.actor, (policy.optimizer,))
+        branches = policy.branches
+        self._set_model(model, branches.actor, (policy.optimizer,), model.rollout_buffer, [branches.critic.linear.bias])
 
     @property
     def network(self) -> PolicyNetwork:
@@ -293,18 +293,9 @@ class Ppo(ModelFree):
     def _improve(self) -> dict[str, float]:
         std = schedules.geometric(self.config.std, self.config.final_std, self._progress)
         self._log_std.data.fill_(np.log(std))
+        # the likelihood's gradient with the mean, whose squared difference the imitation loss is
+        self._imitation_weight = self.config.imitation_weight * float(self._log_std.exp()[0]) ** -2
         return super()._improve()
-
-    def _value_biases(self) -> list[torch.Tensor]:
-        return [cast(BranchedPolicy, self._model.policy).branches.critic.linear.bias]
-
-    def _take_gamma(self, gamma: float) -> None:
-        super()._take_gamma(gamma)
-        self._model.rollout_buffer.gamma = gamma
-
-    @property
-    def _imitation_weight(self) -> float:
-        return self.config.imitation_weight * float(self._log_std.detach().exp()[0]) ** -2
 
 
 make = Ppo

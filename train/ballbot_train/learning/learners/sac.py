@@ -5,7 +5,7 @@ online reinforcement learning with offline data", 2023). `ModelFree` says what e
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -27,7 +27,7 @@ from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highes
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
-from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig, as_policy
+from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.policy import PolicyNetwork, centred
 from ballbot_train.policy_files import Mirrors
@@ -214,9 +214,14 @@ class CentredActor(Actor):
 class OwnPolicy(SACPolicy):
     """SB3's policy with critics of another network, and an actor that may be centred."""
 
-    def __init__(self, *args: Any, network: "CriticNetwork", centre: Frame | None, **kwargs: Any):
-        """Args: network: makes one critic's network; centre: the frame of a centred actor; the others are SB3's."""
-        self._network, self._centre = network, centre
+    def __init__(self, *args: Any, products: bool, layer_norm: bool, value: float, centre: Frame | None, **kwargs: Any):
+        """Args:
+        products: whether critics see products.
+        layer_norm: whether the layers of others are normalized.
+        value: that critics expect everywhere at the start, about.
+        centre: the frame of a centred actor.
+        """
+        self._products, self._layer_norm, self._value, self._centre = products, layer_norm, value, centre
         super().__init__(*args, **kwargs)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
@@ -228,32 +233,31 @@ class OwnPolicy(SACPolicy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         critic = super().make_critic(features_extractor)
         inputs, hidden = critic.features_extractor.features_dim + 2, cast(list[int], self.net_arch)
-        critic.q_networks = [self._network(inputs, hidden, self.activation_fn) for _ in critic.q_networks]
+        critic.q_networks = [self._critic(inputs, hidden) for _ in critic.q_networks]
         for index, network in enumerate(critic.q_networks):
             critic.add_module(f"qf{index}", network)
         return critic.to(self.device)
 
-
-CriticNetwork = Callable[[int, list[int], type[torch.nn.Module]], torch.nn.Module]
-"""From number of inputs, units of the hidden layers and activation to a network with one output."""
-
-
-def _critic_network(products: bool, layer_norm: bool, value: float) -> CriticNetwork:
-    """What makes critics: they see products and expect `value` everywhere at the start, or their layers may be normalized."""
-
-    def network(inputs: int, hidden: list[int], activation: type[torch.nn.Module]) -> torch.nn.Module:
-        if products:
-            return QuadraticCritic(CriticInputs(inputs), hidden, activation, value)
-        after: Any = [torch.nn.LayerNorm] if layer_norm else None
-        return torch.nn.Sequential(*create_mlp(inputs, 1, hidden, activation, post_linear_modules=after))
-
-    return network
+    def _critic(self, inputs: int, hidden: list[int]) -> torch.nn.Module:
+        if self._products:
+            return QuadraticCritic(CriticInputs(inputs), hidden, self.activation_fn, self._value)
+        after: Any = [torch.nn.LayerNorm] if self._layer_norm else None
+        critic = torch.nn.Sequential(*create_mlp(inputs, 1, hidden, self.activation_fn, post_linear_modules=after))
+        torch.nn.init.constant_(last_bias(critic), self._value)
+        return critic
 
 
 def last_bias(critic: torch.nn.Module) -> torch.Tensor:
     """The bias of a critic's output."""
     last = critic.linear if isinstance(critic, QuadraticCritic) else cast(torch.nn.Sequential, critic)[-1]
     return cast(torch.nn.Linear, last).bias
+
+
+def copy_layers(source: torch.nn.Module, to: torch.nn.Module) -> None:
+    """Copies the weights of linear layers, in order."""
+    layers = ((part for part in module.modules() if isinstance(part, torch.nn.Linear)) for module in (source, to))
+    for given, taken in zip(*layers, strict=True):
+        taken.load_state_dict(given.state_dict())
 
 
 class Sac(ModelFree):
@@ -271,8 +275,9 @@ class Sac(ModelFree):
         """As of `Algorithm.make`. Demonstrations are kept beside its own steps, and a policy must be one of SAC's."""
         if demos is not None and config.n_steps > 1:
             raise ValueError("n_steps must be 1 with demonstrations, which are single steps")
-        self._spec = spec_for(task, config.symmetry, config.hidden)
-        frame = None if self._spec.frame is None else FRAMES[self._spec.frame]
+        spec = spec_for(task, config.symmetry, config.hidden)
+        frame = None if spec.frame is None else FRAMES[spec.frame]
+        self._spec = replace(spec, activation="silu", squash="tanh" if frame is None else "tanh_in_frame")
         given = None if demos is None else load_demos(demos, task)
         if given is not None and task.first_exit:
             given = given.without_pay(task, FAILURE_PRICE)
@@ -280,12 +285,7 @@ class Sac(ModelFree):
             given = demos_in_frame(given, frame)
         warm = demos is not None or start is not None
         super().__init__(task, params, config, given, warm, frame, None if warm else _CONTROL_DT)
-        self.config = config
-        value = self._value_of_living(self._gamma)
-        networks = {
-            "network": _critic_network(config.products, warm, value),
-            "centre": frame if self._spec.centred else None,
-        }
+        self.config, self._imitation_weight = config, _IMITATION_WEIGHT
         model = SAC(
             OwnPolicy,
             self._env,
@@ -306,7 +306,14 @@ class Sac(ModelFree):
             },
             ent_coef=f"auto_{ENT_COEF}",
             target_entropy=config.target_entropy,
-            policy_kwargs={"net_arch": list(config.hidden), "activation_fn": torch.nn.SiLU, **networks},
+            policy_kwargs={
+                "net_arch": list(config.hidden),
+                "activation_fn": torch.nn.SiLU,
+                "products": config.products,
+                "layer_norm": warm,
+                "value": self._value_of_living(self._gamma),
+                "centre": frame if spec.centred else None,
+            },
             seed=seed,
             device="cpu",
         )
@@ -316,9 +323,6 @@ class Sac(ModelFree):
         actor, log_std = model.actor, cast(torch.nn.Linear, model.actor.log_std)
         torch.nn.init.zeros_(log_std.weight)
         torch.nn.init.constant_(log_std.bias, math.log(config.std))
-        if not config.products:
-            for critic in (*model.critic.q_networks, *model.critic_target.q_networks):
-                torch.nn.init.constant_(last_bias(critic), value)
         # Critics overestimate, more and more, because they learn from their own estimates. Costs are not negative, so there
         # is a limit, and values drift no farther.
         model.critic_target.register_forward_hook(
@@ -326,31 +330,26 @@ class Sac(ModelFree):
         )
         if not warm:
             model.critic.register_forward_hook(self._weigh)
-        self._model: SAC
+        critics = (*model.critic.q_networks, *model.critic_target.q_networks)
         self._set_model(
             model,
             actor.mean
             if isinstance(actor, CentredActor)
             else torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
             (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
+            self._replay,
+            [last_bias(critic) for critic in critics],
         )
         if start is not None:
-            self._start_from(start)
-
-    def _start_from(self, start: PolicyNetwork) -> None:
-        """Takes the weights of a policy."""
-        check_start(start.spec, self.network.spec)
-        given = [layer for layer in start.mlp if isinstance(layer, torch.nn.Linear)]
-        for module in (self._actor, self._average.module):
-            own = [layer for layer in module.modules() if isinstance(layer, torch.nn.Linear)]
-            for layer, other in zip(own, given, strict=True):
-                layer.load_state_dict(other.state_dict())
+            check_start(start.spec, self._spec)
+            for module in (self._actor, self._average.module):
+                copy_layers(start.mlp, module)
 
     @property
     def network(self) -> PolicyNetwork:
-        squash = "tanh" if self._spec.frame is None else "tanh_in_frame"
-        symmetry = {"frame": self._spec.frame, "centred": self._spec.centred, "mirrors": self._spec.mirrors}
-        return as_policy(self._kept.modules(), self._task, activation="silu", squash=squash, **symmetry)
+        network = PolicyNetwork(self._spec)
+        copy_layers(self._kept, network)
+        return network
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {"log_ent_coef": self._log_ent_coef.detach()} | state_of(self, ["_replay"])
@@ -363,18 +362,6 @@ class Sac(ModelFree):
     def _highest(self) -> float:
         """The most that a value can be."""
         return highest_value(self._trained, self._reward_scale, self._model.gamma) if self._pay else 0.0
-
-    def _value_biases(self) -> list[torch.Tensor]:
-        critics = (*self._model.critic.q_networks, *self._model.critic_target.q_networks)
-        return [last_bias(critic) for critic in critics]
-
-    def _take_gamma(self, gamma: float) -> None:
-        super()._take_gamma(gamma)
-        self._replay.gamma = gamma
-
-    @property
-    def _imitation_weight(self) -> float:
-        return _IMITATION_WEIGHT
 
 
 make = Sac
