@@ -75,7 +75,10 @@ class QuadraticCritic(torch.nn.Module):
 
     def start_at(self, value: float) -> None:
         """Makes all values about `value`."""
-        start_at(value, self.linear, cast(torch.nn.Linear, self.mlp[-1]))
+        with torch.no_grad():
+            self.linear.weight.zero_()
+            self.linear.bias.fill_(value)
+            cast(torch.nn.Linear, self.mlp[-1]).weight.mul_(0.1)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(B, observations) to values (B, 1)."""
@@ -136,11 +139,3 @@ def cost_to_go(values: torch.Tensor, living: float) -> torch.Tensor:
     """
     cost = living - values
     return torch.maximum(cost, _LEAST_COST * cost.mean().clamp_min(1e-6))
-
-
-def start_at(value: float, linear: torch.nn.Linear, last: torch.nn.Linear) -> None:
-    """Makes the sum of a linear path and a network about `value` everywhere, by the path and the network's last layer."""
-    with torch.no_grad():
-        linear.weight.zero_()
-        linear.bias.fill_(value)
-        last.weight.mul_(0.1)

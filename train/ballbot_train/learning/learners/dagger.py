@@ -17,9 +17,9 @@ half from states that the learner reaches from there. They bring the feedback ab
 too.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ballbot_baselines import batched
-from ballbot_baselines.optimum import Backoff, Optimum, find_optimum
+from ballbot_baselines.optimum import Backoff, find_optimum
 from ballbot_baselines.trajopt import EXECUTED
 from ballbot_baselines.tvlqr import tube_gains
 from ballbot_gym import dynamics
@@ -57,10 +57,17 @@ _MIN_STEPS = 2  # plans with fewer remaining control steps are not used as a gue
 
 
 class _Plan(NamedTuple):
-    """An episode: its optimum, and its constants (nc,)."""
+    """An optimum of n control steps."""
 
-    optimum: Optimum
+    x: np.ndarray
+    """(n+1, 8) states."""
+    u: np.ndarray
+    """(n, 2) N, forces."""
+    gains: np.ndarray
+    """(n, 2, 8) feedback about it."""
     c: np.ndarray
+    """(nc,) constants of its episode."""
+    cost: float
 
 
 @dataclass(frozen=True)
@@ -254,20 +261,18 @@ class Dagger:
         if self.config.batch_episodes:
             return self._gather_batch(rng)
         plans = self._planned(rng)
-        gains = [tube_gains(self._task, self._params, plan.trajectory, c) for plan, c in plans]
-        for (plan, c), k in zip(plans, gains, strict=True):
-            self._samples.add(self._labelled(plan, k, c, plan.cost, rng))
+        for plan in plans:
+            self._label(plan, plan.cost, rng)
         if self.config.tracked_rollouts_per_plan and plans:
-            self._track(plans, gains, rng)
-        starts = [episode for episode in plans for _ in range(self.config.rollouts_per_plan)]
+            self._track(plans, rng)
+        starts = [plan for plan in plans for _ in range(self.config.rollouts_per_plan)]
         labelled = 0
         explored = self._explore(starts, rng) if starts else ()
-        for (plan, c), (x, elapsed) in zip(starts, explored, strict=True):
-            found = self._optimum(x, c, plan.trajectory.x[elapsed:, :2])
+        for plan, (x, elapsed) in zip(starts, explored, strict=True):
+            found = self._plan(x, plan.c, self._onwards(plan.x[elapsed:, :2]))
             if found is not None:
                 labelled += 1
-                k = tube_gains(self._task, self._params, found.trajectory, c)
-                self._samples.add(self._labelled(found, k, c, plan.cost, rng))
+                self._label(found, plan.cost, rng)
         return {"train/labelled": labelled / max(1, len(starts))}
 
     def _gather_batch(self, rng: np.random.Generator) -> dict[str, float]:
@@ -290,8 +295,7 @@ class Dagger:
         x, u, gains = optima.states[rows, steps], optima.forces[rows, steps], optima.gains[rows, steps]
         near_x, near_u, of = self._around(x, u, gains, rng)
         of = np.concatenate([rows, rows[of]])
-        forces = np.concatenate([u, near_u])
-        self._samples.add(self._samples_of(np.concatenate([x, near_x]), forces, c[of % len(x0)], costs[of]))
+        self._add(np.concatenate([x, near_x]), np.concatenate([u, near_u]), c[of % len(x0)], costs[of])
         return {"train/labelled": float(optima.solved.mean())}
 
     def _gather_track(self, randomization: Randomization, rng: np.random.Generator) -> dict[str, float]:
@@ -302,10 +306,7 @@ class Dagger:
         state that they came to.
         """
         task, each = self._task, -(-self.config.batch_episodes // (2 * _ROBOTS))
-        x, c = (
-            np.array(part)
-            for part in zip(*(task.sample(rng, self._params) for _ in range(each * _ROBOTS)), strict=True)
-        )
+        x, c = self._drawn(each * _ROBOTS, rng)
         draws = rng.random((_ROBOTS, len(Randomization.DRAWN)))
         drawn = np.array([randomization.draw(tuple(z), task.control_dt) for z in draws]).repeat(each, axis=0)
         batch = BallbotBatch(
@@ -364,21 +365,12 @@ class Dagger:
         return states, lasted, optima.costs
 
     def _optima_of(self, robots: Sequence[BallbotParams], x: np.ndarray, c: np.ndarray) -> batched.BatchOptima:
-        """The optima of B episodes, each with its robot, from states x (B, 8) with constants c (B, nc)."""
-        rows: dict[BallbotParams, list[int]] = {}
-        for i, robot in enumerate(robots):
-            rows.setdefault(robot, []).append(i)
-        found = [
-            batched.find_optima(self._task, robot, x[of], c[of], backoff=self.config.backoff)
-            for robot, of in rows.items()
-        ]
-        back = np.argsort(np.concatenate(list(rows.values())))
-        return batched.BatchOptima(
-            **{
-                f.name: np.concatenate([getattr(part, f.name) for part in found])[back]
-                for f in fields(batched.BatchOptima)
-            }
-        )
+        """The optima of B episodes from states x (B, 8) with constants c (B, nc); those of one robot are neighbours."""
+        found = []
+        for robot, rows in itertools.groupby(range(len(robots)), robots.__getitem__):
+            of = list(rows)
+            found.append(vars(batched.find_optima(self._task, robot, x[of], c[of], backoff=self.config.backoff)))
+        return batched.BatchOptima(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
 
     def _ahead(self, batch: BallbotBatch, state: BatchState) -> np.ndarray:
         """(B, 8) where the robots will be when a force of now arrives, after those that are on their way."""
@@ -392,11 +384,15 @@ class Dagger:
             x = tuple(torch.where(state.drawn[5] >= age, new, old) for new, old in zip(later, x, strict=True))
         return torch.stack(x, 1).double().numpy()
 
+    def _drawn(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Initial states (count, 8) and constants (count, nc) as the task draws them."""
+        x, c = zip(*(self._task.sample(rng, self._params) for _ in range(count)), strict=True)
+        return np.array(x), np.array(c)
+
     def _beginnings(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Initial states (count, 8) and constants (count, nc); some of them are those of many that cost the learner most."""
         hard = round(_HARD_SHARE * count) if self.iteration else 0
-        drawn = [self._task.sample(rng, self._params) for _ in range(count - hard + _HARD_AMONG * hard)]
-        x, c = (np.array(part) for part in zip(*drawn, strict=True))
+        x, c = self._drawn(count - hard + _HARD_AMONG * hard, rng)
         if not hard:
             return x, c
         among = slice(count - hard, None)
@@ -435,32 +431,33 @@ class Dagger:
     def _planned(self, rng: np.random.Generator) -> list[_Plan]:
         """Draws episodes, up to half of them ones that the learner fails, and plans them."""
         config = self.config
-        drawn = [
-            self._task.sample(rng, self._params)
-            for _ in range(max(config.candidate_episodes, config.episodes_per_iteration))
-        ]
+        x, c = self._drawn(max(config.candidate_episodes, config.episodes_per_iteration), rng)
+        first = []
         if self.iteration and config.candidate_episodes:
-            x, c = (np.array(part) for part in zip(*drawn, strict=True))
             _, over, failed = self._roll(x, c, round(config.label_seconds / self._task.control_dt))
             bad = failed | ~over[-1] if self._task.first_exit else failed
             first = np.flatnonzero(bad)[: (config.episodes_per_iteration + 1) // 2].tolist()
-            drawn = [drawn[i] for i in first] + [episode for i, episode in enumerate(drawn) if i not in first]
-        plans = []
-        for x, c in drawn:
-            if len(plans) < config.episodes_per_iteration:
-                with suppress(PlanError):
-                    found = self._plan(x, c)
-                    plans += [_Plan(found, c)] if found.is_optimal else []
-        return plans
+        planned = (self._plan(x[i], c[i], self._routed(x[i], c[i])) for i in dict.fromkeys([*first, *range(len(x))]))
+        found = (plan for plan in planned if plan is not None)
+        return list(itertools.islice(found, config.episodes_per_iteration))
 
-    def _plan(self, x: np.ndarray, c: np.ndarray) -> Optimum:
-        """The optimum of an episode from state x (8,).
+    def _plan(self, x: np.ndarray, c: np.ndarray, paths: list[np.ndarray] | None) -> _Plan | None:
+        """The optimum from state x (8,), or None; guessed from ground paths (n, 2), or by the task without them."""
+        config, task, params = self.config, self._task, self._params
+        try:
+            found = find_optimum(task, params, x, c, config.backoff, config.max_guesses, paths)
+        except PlanError:
+            return None
+        if not found.is_optimal:
+            return None
+        plan = found.trajectory
+        return _Plan(plan.x, plan.u, tube_gains(task, params, plan, c), c, found.cost)
 
-        Raises:
-            PlanError: there is none.
-        """
-        config, paths = self.config, self._routed(x, c)
-        return find_optimum(self._task, self._params, x, c, config.backoff, guesses=config.max_guesses, paths=paths)
+    def _onwards(self, path: np.ndarray) -> list[np.ndarray] | None:
+        """The rest (n, 2) of a plan's ground path as a path to guess from, or None where it is too short for one."""
+        if len(path) <= _MIN_STEPS:
+            return None
+        return [path if self._task.first_exit else then_stay(path, self._task.steps)]
 
     def _routed(self, x: np.ndarray, c: np.ndarray) -> list[np.ndarray] | None:
         """The path on the sides that the learner's routes choose, or None where it has none."""
@@ -470,35 +467,20 @@ class Dagger:
             sides = self.network.routes(torch.as_tensor(np.asarray(self._task.observe(x, c)), dtype=torch.float32))
         return [self._task.routed_path(x, c, tuple(map(int, sides.tolist())))]
 
-    def _track(self, plans: Sequence[_Plan], gains: Sequence[np.ndarray], rng: np.random.Generator) -> None:
+    def _track(self, plans: Sequence[_Plan], rng: np.random.Generator) -> None:
         """Rolls the learner out along plans; TVLQR at the nearest point of the plan labels each state."""
         config = self.config
-        tracked = [episode for episode in plans for _ in range(config.tracked_rollouts_per_plan)]
-        x = np.array([plan.trajectory.x[0] for plan, _ in tracked])
+        tracked = [plan for plan in plans for _ in range(config.tracked_rollouts_per_plan)]
+        x = np.array([plan.x[0] for plan in tracked])
         x += config.start_noise * self._spread * rng.standard_normal(x.shape)
-        steps = min(
-            max(len(plan.trajectory.u) for plan, _ in plans), round(config.label_seconds / self._task.control_dt)
-        )
-        history, over, _ = self._roll(x, np.array([c for _, c in tracked]), steps)
-        for i, (plan, c) in enumerate(tracked):
+        steps = min(max(len(plan.u) for plan in plans), round(config.label_seconds / self._task.control_dt))
+        history, over, _ = self._roll(x, np.array([plan.c for plan in tracked]), steps)
+        for i, plan in enumerate(tracked):
             met = history[:, i][~over[:, i]]
-            distance, nearest = map(np.asarray, KDTree(plan.trajectory.x[:-1] / self._spread).query(met / self._spread))
+            distance, nearest = map(np.asarray, KDTree(plan.x[:-1] / self._spread).query(met / self._spread))
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
-            off, k = met - plan.trajectory.x[nearest], gains[i // config.tracked_rollouts_per_plan]
-            forces = plan.trajectory.u[nearest] - np.einsum("tij,tj->ti", k[nearest], off)
-            self._samples.add(self._samples_of(met, forces, np.broadcast_to(c, (len(met), len(c))), plan.cost))
-
-    def _optimum(self, x: np.ndarray, c: np.ndarray, path: np.ndarray) -> Optimum | None:
-        """The optimum from state x (8,), or None; guessed from a ground path (n, 2), or by the task if that is too short."""
-        task = self._task
-        paths = None
-        if len(path) > _MIN_STEPS:
-            paths = [path if task.first_exit else then_stay(path, task.steps)]
-        try:
-            found = find_optimum(task, self._params, x, c, self.config.backoff, self.config.max_guesses, paths)
-        except PlanError:
-            return None
-        return found if found.is_optimal else None
+            change = np.einsum("tij,tj->ti", plan.gains[nearest], met - plan.x[nearest])
+            self._add(met, plan.u[nearest] - change, plan.c, plan.cost)
 
     def _explore(self, plans: Sequence[_Plan], rng: np.random.Generator) -> list[tuple[np.ndarray, int]]:
         """Rolls the learner out once from each plan.
@@ -510,19 +492,17 @@ class Dagger:
         config, dt = self.config, self._task.control_dt
         longest = max(1, round(self._share * config.max_rollout_seconds / dt))
         on_plan = rng.random(len(plans)) < _BETA * (1 - 0.8 * self._share)
-        starts = [
-            int(rng.integers(len(plan.trajectory.u))) if on else 0 for (plan, _), on in zip(plans, on_plan, strict=True)
-        ]
+        starts = [int(rng.integers(len(plan.u))) if on else 0 for plan, on in zip(plans, on_plan, strict=True)]
         steps = rng.integers(1, longest + 1, len(plans))
-        x = np.array([plan.trajectory.x[start] for (plan, _), start in zip(plans, starts, strict=True)])
+        x = np.array([plan.x[start] for plan, start in zip(plans, starts, strict=True)])
         x += config.start_noise * self._spread * rng.standard_normal(x.shape)
-        history, over, _ = self._roll(x, np.array([c for _, c in plans]), longest)
+        history, over, _ = self._roll(x, np.array([plan.c for plan in plans]), longest)
         reached = []
-        for i, (plan, _) in enumerate(plans):
+        for i, plan in enumerate(plans):
             # the states before a failure teach most, so any of them may be chosen
             lasted = int(np.argmax(over[:, i])) if over[-1, i] else longest + 1
             k = int(steps[i]) if steps[i] < lasted else int(rng.integers(lasted))
-            reached.append((history[k, i], min(starts[i] + k, len(plan.trajectory.u))))
+            reached.append((history[k, i], min(starts[i] + k, len(plan.u))))
         return reached
 
     def _roll(self, x: np.ndarray, c: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -544,31 +524,20 @@ class Dagger:
         batch = BallbotBatch(task, len(x), compile=False, params=self._params)
         return run_episodes(batch, self.network, x, c, record=record)
 
-    def _labelled(
-        self, plan: Optimum, gains: np.ndarray, c: np.ndarray, cost: float, rng: np.random.Generator
-    ) -> Samples:
-        """Labels the states of an optimum and others drawn around them.
+    def _label(self, plan: _Plan, cost: float, rng: np.random.Generator) -> None:
+        """Labels the states of an optimum and others drawn around them; cost: of the optimum from the episode's start."""
+        n = min(len(plan.u), round(self.config.label_seconds / self._task.control_dt))
+        x, u = plan.x[:n], plan.u[:n]
+        near_x, near_u, _ = self._around(x, u, plan.gains[:n], rng)
+        self._add(np.concatenate([x, near_x]), np.concatenate([u, near_u]), plan.c, cost)
 
-        Args:
-            plan: the optimum.
-            gains: (n, 2, 8) feedback about it.
-            c: (nc,) constants of the episode.
-            cost: of the optimum from the episode's start.
-            rng: of the states around it.
+    def _add(self, x: np.ndarray, u: np.ndarray, c: np.ndarray, cost: float | np.ndarray) -> None:
+        """Adds samples of states (n, 8) and forces (n, 2), N, of episodes with constants (nc,) or (n, nc) whose optima cost
+        `cost`, one number or (n,).
         """
-        config, task = self.config, self._task
-        n = min(len(plan.trajectory.u), round(config.label_seconds / task.control_dt))
-        x, u = plan.trajectory.x[:n], plan.trajectory.u[:n]
-        if config.tube_samples:
-            near_x, near_u, _ = self._around(x, u, gains[:n], rng)
-            x, u = np.concatenate([x, near_x]), np.concatenate([u, near_u])
-        return self._samples_of(x, u, np.broadcast_to(c, (len(x), len(c))), cost)
-
-    def _samples_of(self, x: np.ndarray, u: np.ndarray, c: np.ndarray, cost: float | np.ndarray) -> Samples:
-        """Samples of states (n, 8) and forces (n, 2), N, with constants (n, nc), of episodes whose optima cost `cost`."""
-        observations = np.asarray(self._task.seen(x, c))
+        observations = np.asarray(self._task.seen(x, np.broadcast_to(c, (len(x), c.shape[-1]))))
         weights = np.broadcast_to(1 / np.maximum(cost, _MIN_COST), len(x))
-        return Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights)
+        self._samples.add(Samples.of(observations, np.clip(u / self._params.force_limit, -1, 1), weights))
 
 
 def _first_samples(

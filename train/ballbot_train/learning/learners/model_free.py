@@ -167,7 +167,7 @@ class ModelFree(ABC):
         model._last_episode_starts = np.ones(self._settings.num_envs, bool)
         self._imitation = None if self._demos is None else Imitation(actor, self._demos)
         optimizers[0].register_step_pre_hook(self._add_imitation)
-        self._random = ScopedRng()
+        self._random = _global_random()
 
     def _per_step(self, gamma: float) -> float:
         """The discount factor for a control step in training, from that for a control step of the task."""
@@ -215,8 +215,11 @@ class ModelFree(ABC):
         return self._env.batch.difficulty
 
     def iterate(self) -> dict[str, float]:
-        with self._random:
-            figures = self._clone() if self.iteration < self._clone_iterations else self._improve()
+        # Stable-Baselines3 draws from the global generators, from which others may have drawn since the last iteration
+        torch.set_rng_state(self._random["torch"])
+        np.random.set_state(self._random["numpy"])
+        figures = self._clone() if self.iteration < self._clone_iterations else self._improve()
+        self._random = _global_random()
         self.iteration += 1
         return figures
 
@@ -391,35 +394,7 @@ class Imitation(Fit):
         return {"loss/cloning": self.run(self._samples, _CLONE_STEPS, _CLONE_BATCH, learning_rate, rng)}
 
 
-class ScopedRng:
-    """Random numbers of a learner's own, although Stable-Baselines3 draws from the global generators of torch and NumPy.
-
-    Within `with rng:` the global generators continue where they stopped at the end of the last such block, whatever was
-    drawn in between.
-    """
-
-    _torch: torch.Tensor
-    _numpy: tuple[str, np.ndarray, int, int, float]
-
-    def __init__(self):
-        self._capture()
-
-    def __enter__(self) -> None:
-        torch.set_rng_state(self._torch)
-        np.random.set_state(self._numpy)
-
-    def __exit__(self, *_: object) -> None:
-        self._capture()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain values."""
-        kind, words, *rest = self._numpy
-        return {"torch": self._torch, "numpy": [kind, words.tolist(), *rest]}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes back to a state."""
-        kind, words, *rest = state["numpy"]
-        self._torch, self._numpy = state["torch"], (kind, np.array(words, np.uint32), *rest)
-
-    def _capture(self) -> None:
-        self._torch, self._numpy = torch.get_rng_state(), cast(Any, np.random.get_state())
+def _global_random() -> dict[str, Any]:
+    """The state of the global generators of torch and NumPy: tensors and plain values."""
+    kind, words, *rest = cast(Any, np.random.get_state())
+    return {"torch": torch.get_rng_state(), "numpy": [kind, words.tolist(), *rest]}

@@ -33,6 +33,7 @@ from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.learning.whole_episodes import WholeEpisodes, grip_penalty
 from ballbot_train.policy import PolicyNetwork
 from ballbot_train.routes import Routes
+from ballbot_train.weights import linear_layers
 
 
 @dataclass(frozen=True)
@@ -139,15 +140,9 @@ class Critic(torch.nn.Module):
         super().__init__()
         own = task.observation_size(params)
         self._inputs = CriticInputs(own, products=False, frame=frame, routes=routes, past=past)
-        layers: list[torch.nn.Module] = []
-        size = self._inputs.size
-        for width in hidden:
-            layers += [torch.nn.Linear(size, width), torch.nn.Tanh()]
-            size = width
-        last = torch.nn.Linear(size, 1)
-        torch.nn.init.zeros_(last.weight)
-        torch.nn.init.zeros_(last.bias)
-        self.mlp = torch.nn.Sequential(*layers, last)
+        self.mlp = linear_layers((self._inputs.size, *hidden, 1), torch.nn.Tanh)
+        for part in self.mlp[-1].parameters():
+            torch.nn.init.zeros_(part)
         gain = equilibrium_gain(task, params)
         self.p: torch.Tensor | None
         self.register_buffer("p", None if gain is None else torch.tensor(gain[1], dtype=torch.float32))
