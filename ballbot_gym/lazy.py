@@ -28,11 +28,11 @@ def load(entry: str) -> Any:
         raise missing(entry.replace(":", "."), error.name) from error
 
 
-def need(package: str, *libraries: str) -> None:
-    """Raises a ModuleNotFoundError that names the extra of a package, if a library is not installed. Imports nothing."""
+def need(package: str, *libraries: str, extra: str | None = None) -> None:
+    """Raises the error of `missing` if a library is not installed. Imports nothing."""
     for name in libraries:
         if find_spec(name) is None:
-            raise missing(package, name)
+            raise missing(package, name, extra)
 
 
 def missing(package: str, library: str | None, extra: str | None = None) -> ModuleNotFoundError:

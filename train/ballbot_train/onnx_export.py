@@ -16,7 +16,7 @@ import numpy as np
 
 import ballbot_gym
 from ballbot_gym import files
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import missing, need
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicyNetwork, load_network
@@ -99,8 +99,7 @@ def observation_table(task: Task) -> str:
 
 def _traced(network: PolicyNetwork) -> Any:
     """The network as an `onnx.ModelProto`, for batches of any size."""
-    for library in ("onnx", "onnxscript"):
-        _require(library)
+    need("an ONNX file", "onnx", "onnxscript", extra="onnx")
     example = torch.zeros(2, network.spec.seen)
     silence = logging.getLogger("torch.onnx")
     level, silence.level = silence.level, logging.ERROR  # it lists libraries that are not installed
@@ -144,10 +143,3 @@ def _check(model: Any, network: PolicyNetwork) -> None:
     error = float(np.abs(found - expected).max())
     if not error < _LARGEST_ERROR:
         raise RuntimeError(f"the ONNX graph's actions differ from the policy's by {error:g}: not written")
-
-
-def _require(library: str) -> None:
-    try:
-        __import__(library)
-    except ModuleNotFoundError as error:
-        raise missing("an ONNX file", library, "onnx") from error

@@ -32,15 +32,7 @@ try:
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
-_ACTIVATIONS = {
-    "elu": "ELU",
-    "gelu": "GELU",
-    "leakyrelu": "LeakyReLU",
-    "relu": "ReLU",
-    "selu": "SELU",
-    "silu": "SiLU",
-    "tanh": "Tanh",
-}
+_ACTIVATIONS = {name.lower(): name for name in ("ELU", "GELU", "LeakyReLU", "ReLU", "SELU", "SiLU", "Tanh")}
 _MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # whose policies act as it is written here
 _DATA_LIMIT = 2**24  # bytes of JSON
 _SUPPORTED = "give a model with MlpPolicy, or load the model yourself and give it to ballbot_train.evaluate"

@@ -191,77 +191,42 @@ def train(
     for name in ("iterations", "evaluations"):
         if getattr(learner, name) < 1:
             raise ValueError(f"{name} must be at least 1, not {getattr(learner, name)}")
-    run = _Run(learner, task, config, out, resume)
+    run = _Run(learner, task, config, out)
+    if (out / _CONFIG).exists() and not resume:
+        raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
+    # a command names the folder, which may have been moved or copied, and every setting is compared without it
+    compared = {name: value for name, value in config.items() if name != "command"}
+    jobs.claim(out, compared, _CONFIG, {"command": config.get("command"), "about": provenance()})
     try:
-        return _learn(run, learner, config, test_episodes)
+        run.restore()
+        run.learn()
+        return run.measure(test_episodes)
     finally:
         jobs.unlock(out)
-
-
-def _learn(run: "_Run", learner: Learner, config: Mapping[str, Any], test_episodes: int) -> evaluate.Row:
-    writer = SummaryWriter(str(run.out / "tensorboard"), purge_step=learner.iteration)
-    every = max(1, learner.iterations // learner.evaluations)
-    saved = time.monotonic()
-    console.print(
-        f"to watch it learn: tensorboard --logdir {shlex.quote(str(run.out / 'tensorboard'))}", soft_wrap=True
-    )
-    with _interruptible() as interrupted, progress_bar() as progress:
-        bar = progress.add_task(config["learner"], total=learner.iterations, completed=learner.iteration)
-        if learner.iteration == 0:
-            run.score()  # so that there is a policy, and learning curves show the start
-        while learner.iteration < learner.iterations:
-            start, cpu_start = time.monotonic(), time.process_time()
-            figures = learner.iterate()
-            run.seconds += time.monotonic() - start
-            run.cpu_seconds += time.process_time() - cpu_start
-            run.env_steps = figures.get("train/env_steps", math.nan)
-            progress.update(bar, completed=learner.iteration)
-            for name, value in figures.items():
-                writer.add_scalar(name, value, learner.iteration)
-            if learner.iteration % every == 0 or learner.iteration >= learner.iterations:
-                for name, value in run.score().items():
-                    writer.add_scalar(name, value, learner.iteration)
-                progress.update(bar, description=f"{config['learner']} {run.best_text}")
-            if time.monotonic() - saved > _CHECKPOINT_SECONDS or interrupted():
-                run.save()
-                saved = time.monotonic()
-            if interrupted():
-                raise KeyboardInterrupt
-    run.save()
-    writer.close()
-    return run.measure(test_episodes)
 
 
 class _Run:
     """The folder of a run."""
 
-    def __init__(self, learner: Learner, task: Task, config: Mapping[str, Any], out: Path, resume: bool):
+    def __init__(self, learner: Learner, task: Task, config: Mapping[str, Any], out: Path):
         self.learner, self.task, self.config, self.out = learner, task, dict(config), out
         self.seconds, self.cpu_seconds, self.env_steps = 0.0, 0.0, 0.0
         self.rows: list[dict[str, Any]] = []
         self.robot = self.config.get("robot", PAPER)
         self.randomization = checked_randomization(self.config.get("randomization"))
         self.validation_episodes = self.config.get("validation_episodes", VALIDATION_EPISODES)
-        if (out / _CONFIG).exists() and not resume:
-            raise ValueError(f"{out} already holds a run; give --resume to continue it, or another --out")
-        compared = {name: value for name, value in self.config.items() if name != "command"}
-        # a command names the folder, which may have been moved or copied, and every setting is compared without it
-        jobs.claim(out, compared, _CONFIG, {"command": self.config.get("command"), "about": provenance()})
-        try:
-            if (out / "checkpoint.pt").exists():
-                self._restore()
-        except BaseException:
-            jobs.unlock(out)
-            raise
 
-    def _restore(self) -> None:
-        """Goes back to the checkpoint; a damaged one is a ValueError."""
+    def restore(self) -> None:
+        """Goes back to the checkpoint, if there is one; a damaged one is a ValueError."""
         path = self.out / "checkpoint.pt"
+        if not path.exists():
+            return
         try:
             # tensors and plain values: nothing in it is executed
             state = saved_by_torch(files.read(path, _CHECKPOINT_LIMIT), path, _CHECKPOINT_LIMIT)
             self.learner.load_state_dict(state["learner"])
-            best = self._restored(state["policy"])
+            best = PolicyNetwork(self.learner.network.spec)
+            best.load_state_dict(state["policy"])
             self.seconds = float(state["seconds"])
             self.rows = [{name: row[name] for name in _COLUMNS} for row in state["rows"]]
             self.cpu_seconds = float(state["cpu_seconds"])
@@ -271,6 +236,38 @@ class _Run:
             raise ValueError(f"{path} is damaged; give another --out or delete the folder ({error!r})") from error
         self._save_policy(best)
         self._write_rows()
+
+    def learn(self) -> None:
+        """Goes through the iterations that are left; Ctrl-C saves and raises a KeyboardInterrupt."""
+        learner, name = self.learner, self.config["learner"]
+        folder = str(self.out / "tensorboard")
+        writer = SummaryWriter(folder, purge_step=learner.iteration)
+        every = max(1, learner.iterations // learner.evaluations)
+        saved = time.monotonic()
+        console.print(f"to watch it learn: tensorboard --logdir {shlex.quote(folder)}", soft_wrap=True)
+        with _interruptible() as interrupted, progress_bar() as progress:
+            bar = progress.add_task(name, total=learner.iterations, completed=learner.iteration)
+            if learner.iteration == 0:
+                self.score()  # so that there is a policy, and learning curves show the start
+            while learner.iteration < learner.iterations:
+                start, cpu_start = time.monotonic(), time.process_time()
+                figures = learner.iterate()
+                self.seconds += time.monotonic() - start
+                self.cpu_seconds += time.process_time() - cpu_start
+                self.env_steps = figures.get("train/env_steps", math.nan)
+                progress.update(bar, completed=learner.iteration)
+                if learner.iteration % every == 0 or learner.iteration >= learner.iterations:
+                    figures = figures | self.score()
+                    progress.update(bar, description=f"{name} {self.best_text}")
+                for figure, value in figures.items():
+                    writer.add_scalar(figure, value, learner.iteration)
+                if time.monotonic() - saved > _CHECKPOINT_SECONDS or interrupted():
+                    self.save()
+                    saved = time.monotonic()
+                if interrupted():
+                    raise KeyboardInterrupt
+        self.save()
+        writer.close()
 
     def score(self) -> dict[str, float]:
         """Scores the present policy on both sets, and keeps it if it is the best on the validation set.
@@ -294,13 +291,10 @@ class _Run:
         return figures
 
     @property
-    def _preparation(self) -> int:
-        return getattr(self.learner, "preparation", 0)
-
-    @property
     def _chosen(self) -> dict[str, Any]:
         """The evaluation whose policy is kept."""
-        later = [row for row in self.rows if row["iteration"] > self._preparation] if self._preparation else self.rows
+        preparation = getattr(self.learner, "preparation", 0)
+        later = [row for row in self.rows if not preparation or row["iteration"] > preparation]
         return min(later or self.rows, key=lambda row: (row["validation_cost"], row["validation_mean_cost"]))
 
     @property
@@ -332,30 +326,15 @@ class _Run:
         results = evaluate.run_episodes(env, controller, self.config["learner"], self.config["task"], range(count))
         env.close()
         row = evaluate.summarize(results)
-        measured = {
-            "episodes_are": "certified",
-            "physics": env.physics,
-            "episodes": row.episodes,
-            "success": row.success,
-            "falls": row.falls,
-            "regret_mean": row.regret_mean,
-            "regret_median": row.regret_median,
-        }
-        self._save_policy(network, measured=measured)
+        figures = ("episodes", "success", "falls", "regret_mean", "regret_median")
+        measured = {name: getattr(row, name) for name in figures}
+        self._save_policy(network, measured={"episodes_are": "certified", "physics": env.physics} | measured)
         return row
-
-    def _restored(self, weights: Mapping[str, torch.Tensor]) -> PolicyNetwork:
-        network = PolicyNetwork(self.learner.network.spec)
-        network.load_state_dict(weights)
-        return network
 
     def _save_policy(self, network: PolicyNetwork, **more: Any) -> None:
         network.spec = replace(network.spec, robot=self.robot)
-        save_policy(self.out / "policy", network, self._about() | more)
-
-    def _about(self) -> dict[str, Any]:
         reached = getattr(self.learner, "difficulty", {})
-        return {
+        about = {
             "training": self.config,
             "chosen_by": {
                 "episodes": f"{self.validation_episodes} fresh, for validation",
@@ -365,6 +344,7 @@ class _Run:
             "training_seconds": round(self.cpu_seconds, 1),
             **({"curriculum_reached": reached} if reached else {}),
         }
+        save_policy(self.out / "policy", network, about | more)
 
     def _write_rows(self) -> None:
         files.write_csv(self.out / "evaluations.csv", self.rows)
