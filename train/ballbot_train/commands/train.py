@@ -12,6 +12,7 @@ from ballbot_gym import certified
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER, file_name, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
+from ballbot_train.commands.options import UNNAMED
 from ballbot_train.console import RobotName, check_names, console, option, physics_or_default
 from ballbot_train.executors import Workers
 from ballbot_train.learning import VALIDATION_EPISODES
@@ -129,7 +130,7 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
                 f"{run.start} does not say by which command it was trained; give a policy of ballbot train"
             )
         inputs.append(trained["command"])
-    more = run.validation_episodes
+    optional = ("randomization", "history", "informed", "validation_episodes")
     return {
         "learner": learner,
         "task": run.task,
@@ -140,10 +141,7 @@ def _config(learner: str, run: Run, settings: Any, command: str) -> dict[str, An
         "command": " && ".join([*reversed(inputs), command]),
         **({"inputs": inputs} if inputs else {}),
         **robot_setting(run.robot),
-        **({} if run.randomization is None else {"randomization": run.randomization}),
-        **({"history": run.history} if run.history else {}),
-        **({"informed": True} if run.informed else {}),
-        **({} if more == VALIDATION_EPISODES else {"validation_episodes": more}),
+        **{name: value for name in optional if (value := getattr(run, name)) != getattr(Run, name)},
     }
 
 
@@ -177,21 +175,36 @@ def parse(arguments: Sequence[str], call: Callable[[str, Run, Any], None]) -> No
     for name in ("--demos", "--start"):
         early.add_argument(name, nargs="?", const="")
     known = early.parse_known_args(arguments)[0]
-    task, warm = known.task, {known.demos, known.start} - {None, "None"} != set()
     named = arguments[0] if arguments and not arguments[0].startswith("-") else None
-    if named is not None:
-        check_names("learner", [named], LEARNERS)
-        check_names("task", [task], TASKS)
-        command = _command(named, task, warm, call)
-        tyro.cli(command, prog=f"ballbot train {named}", args=list(arguments[1:]), compact_help=True)
+    if named is None:
+        listed: dict[str, Callable[..., None]] = {}
+        for name in LEARNERS:
+            listed[name] = lambda: None
+            listed[name].__doc__ = _description(name)
+        tyro.extras.subcommand_cli_from_dict(
+            listed,
+            prog="ballbot train",
+            description="Trains a policy on the batched model, and measures it in PyBullet on the certified episodes. "
+            "`ballbot train LEARNER --help` lists the settings of a learner, with the defaults tuned for --task.",
+            args=list(arguments),
+        )
         return
-    tyro.extras.subcommand_cli_from_dict(
-        {name: _command(name) for name in LEARNERS},
-        prog="ballbot train",
-        description="Trains a policy on the batched model, and measures it in PyBullet on the certified episodes. "
-        "`ballbot train LEARNER --help` lists the settings of a learner, with the defaults tuned for --task.",
-        args=list(arguments),
-    )
+    check_names("learner", [named], LEARNERS)
+    check_names("task", [known.task], TASKS)
+    settings = LEARNERS[named].settings(known.task, {known.demos, known.start} - {None, "None"} != set())
+
+    def command(run: Any = Run(), settings: Any = settings) -> None:
+        call(named, run, settings)
+
+    # options are --task and --num-envs, and not --run.task and --settings.num-envs
+    command.__annotations__ = {"run": Annotated[Run, UNNAMED], "settings": Annotated[type(settings), UNNAMED]}
+    command.__doc__ = _description(named)
+    tyro.cli(command, prog=f"ballbot train {named}", args=list(arguments[1:]), compact_help=True)
+
+
+def _description(learner: str) -> str:
+    described = LEARNERS[learner].description
+    return f"{described[:1].upper()}{described[1:]}."
 
 
 def command_with(learner: str, run: Run, settings: Any) -> str:
@@ -203,27 +216,3 @@ def command_with(learner: str, run: Run, settings: Any) -> str:
     for name, value in asdict(settings).items():
         words += option(name.replace("_", "-"), value)
     return shlex.join(words)
-
-
-def _command(
-    name: str, task: str = "", warm: bool = False, call: Callable[[str, Run, Any], None] | None = None
-) -> Callable[..., None]:
-    """A learner's command as a function whose signature tyro reads; one that is not to be called has no options."""
-
-    def without_options() -> None:
-        raise AssertionError("only a learner that is named is called")
-
-    import tyro
-
-    function: Callable[..., None] = without_options
-    if call is not None:
-        settings = LEARNERS[name].settings(task, warm)
-
-        def with_options(run: Any = Run(), settings: Any = settings) -> None:
-            call(name, run, settings)
-
-        flat = tyro.conf.arg(name="")  # options are --task and --num-envs, and not --run.task and --settings.num-envs
-        with_options.__annotations__ = {"run": Annotated[Run, flat], "settings": Annotated[type(settings), flat]}
-        function = with_options
-    function.__doc__ = f"{LEARNERS[name].description[:1].upper()}{LEARNERS[name].description[1:]}."
-    return function

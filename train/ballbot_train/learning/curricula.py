@@ -27,7 +27,6 @@ import torch
 from ballbot_gym.batch import BallbotBatch, BatchStep
 from ballbot_gym.ops import Vector
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.console import console
@@ -115,8 +114,7 @@ class CurriculumBatch(BallbotBatch):
         short_episodes: tuple[float, float] = (0.0, 0.6),
         backwards: bool = False,
         pay: bool = True,
-        randomization: Randomization | None = None,
-        history: int = 0,
+        **world: Any,
     ):
         """Makes the batch.
 
@@ -129,7 +127,7 @@ class CurriculumBatch(BallbotBatch):
             short_episodes: share of the episodes that is cut, and how long these last, s.
             backwards: whether training goes from the goal backwards.
             pay: whether living pays; else, and backwards, the reward is minus the running cost, and a failure has a price.
-            randomization, history: as of `BallbotBatch`.
+            world: randomization and history, as of `BallbotBatch`.
 
         Raises:
             ValueError: the task has not what this asks for.
@@ -141,7 +139,7 @@ class CurriculumBatch(BallbotBatch):
             raise ValueError(f"short_episodes must be a share of 0 to 1 and seconds above 0, not {short_episodes}")
         if short_episodes[0] and task.first_exit:
             raise ValueError(f"{task.id} pays at its goal for the time that is left, so short_episodes must be 0")
-        super().__init__(task, num_envs, compile=False, params=params, randomization=randomization, history=history)
+        super().__init__(task, num_envs, compile=False, params=params, **world)
         self.gamma, self.own_task, self._full = gamma, task, task if full is None else full
         self._short, self.backwards, self._pay = short_episodes, backwards, pay and not backwards
         self._goal_factor = _GOAL_FACTOR if backwards else 1.0

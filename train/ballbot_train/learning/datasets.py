@@ -76,13 +76,16 @@ class Demos:
 class StreamedDemos:
     """Demonstrations that are read shard by shard, for datasets that do not fit into memory."""
 
-    def __init__(self, url: str | Path, task: Task, seed: int):
+    def __init__(self, url: str | Path, task: Task, seed: int = 0):
         """Args: url: of a set of `ballbot demos --shards`; task: the set must be made for it; seed: of the order of shards.
 
         Raises:
             ValueError: there is no such set, or it is of another task or observation version.
         """
-        self._shards, self._task, self._seed = _opened(url, task), task, seed
+        self._shards, self._task, self._seed = shards.Shards(url), task, seed
+        if self._shards.about is None or "demos" not in self._shards.about or not self._shards.numbers:
+            raise ValueError(f'{url} is no dataset of "ballbot demos --shards", or an empty one')
+        _check_made_for(str(url), self._shards.about, task)
 
     def at(self, iteration: int) -> Demos:
         """The demonstrations of an iteration: one shard, which depends on seed and iteration alone.
@@ -92,24 +95,21 @@ class StreamedDemos:
         numbers = self._shards.numbers
         epoch, i = divmod(iteration, len(numbers))
         order = np.random.default_rng([self._seed, epoch, 2]).permutation(len(numbers))
-        return _of_shard(self._shards, numbers[order[i]], self._task)
+        return self._read(numbers[order[i]])
 
+    def all(self) -> Demos:
+        """The demonstrations of all shards."""
+        parts = [vars(self._read(number)) for number in self._shards.numbers]
+        return Demos(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
-def _opened(url: str | Path, task: Task) -> shards.Shards:
-    """The set of shards, made for a task."""
-    opened = shards.Shards(url)
-    if opened.about is None or "demos" not in opened.about or not opened.numbers:
-        raise ValueError(f'{url} is no dataset of "ballbot demos --shards", or an empty one')
-    _check_made_for(str(url), opened.about, task)
-    return opened
-
-
-def _of_shard(opened: shards.Shards, number: int, task: Task) -> Demos:
-    arrays = opened.read(number)
-    try:
-        return _demos(arrays, len(task.observation_scale))
-    except _UNFIT as error:
-        raise ValueError(f"shard {number} of {opened.url} is damaged; make the set anew ({error!r:.300})") from error
+    def _read(self, number: int) -> Demos:
+        arrays = self._shards.read(number)
+        try:
+            return _demos(arrays, len(self._task.observation_scale))
+        except _UNFIT as error:
+            raise ValueError(
+                f"shard {number} of {self._shards.url} is damaged; make the set anew ({error!r:.300})"
+            ) from error
 
 
 def load_demos(path: str | Path, task: Task) -> Demos:
@@ -123,9 +123,7 @@ def load_demos(path: str | Path, task: Task) -> Demos:
         ValueError: there is no such dataset, or it is damaged, or of another task or observation version.
     """
     if shards.is_set(path):
-        opened = _opened(path, task)
-        parts = [vars(_of_shard(opened, number, task)) for number in opened.numbers]
-        return Demos(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+        return StreamedDemos(path, task).all()
     path = Path(path)
     _check_made_for(str(path), metadata_of(path), task)
     try:

@@ -280,8 +280,7 @@ class Dagger:
         config, task = self.config, self._task
         x0, c = self._beginnings((config.batch_episodes + 1) // 2, rng)
         longest = max(1, round(self._share * config.max_rollout_seconds / task.control_dt))
-        history, over, _ = self._roll(x0, c, longest)
-        lasted = np.where(over[-1], over.argmax(0), longest + 1)
+        history, lasted, _ = self._roll(x0, c, longest)
         reached = history[rng.integers(lasted), np.arange(len(x0))]
         starts = np.concatenate([x0, reached])
         constants = np.tile(c, (2, 1))
@@ -434,8 +433,8 @@ class Dagger:
         x, c = self._drawn(max(config.candidate_episodes, config.episodes_per_iteration), rng)
         first = []
         if self.iteration and config.candidate_episodes:
-            _, over, failed = self._roll(x, c, round(config.label_seconds / self._task.control_dt))
-            bad = failed | ~over[-1] if self._task.first_exit else failed
+            history, lasted, failed = self._roll(x, c, round(config.label_seconds / self._task.control_dt))
+            bad = failed | (lasted == len(history)) if self._task.first_exit else failed
             first = np.flatnonzero(bad)[: (config.episodes_per_iteration + 1) // 2].tolist()
         planned = (self._plan(x[i], c[i], self._routed(x[i], c[i])) for i in dict.fromkeys([*first, *range(len(x))]))
         found = (plan for plan in planned if plan is not None)
@@ -474,9 +473,9 @@ class Dagger:
         x = np.array([plan.x[0] for plan in tracked])
         x += config.start_noise * self._spread * rng.standard_normal(x.shape)
         steps = min(max(len(plan.u) for plan in plans), round(config.label_seconds / self._task.control_dt))
-        history, over, _ = self._roll(x, np.array([plan.c for plan in tracked]), steps)
+        history, lasted, _ = self._roll(x, np.array([plan.c for plan in tracked]), steps)
         for i, plan in enumerate(tracked):
-            met = history[:, i][~over[:, i]]
+            met = history[: lasted[i], i]
             distance, nearest = map(np.asarray, KDTree(plan.x[:-1] / self._spread).query(met / self._spread))
             met, nearest = met[distance < config.max_distance], nearest[distance < config.max_distance]
             change = np.einsum("tij,tj->ti", plan.gains[nearest], met - plan.x[nearest])
@@ -496,12 +495,11 @@ class Dagger:
         steps = rng.integers(1, longest + 1, len(plans))
         x = np.array([plan.x[start] for plan, start in zip(plans, starts, strict=True)])
         x += config.start_noise * self._spread * rng.standard_normal(x.shape)
-        history, over, _ = self._roll(x, np.array([plan.c for plan in plans]), longest)
+        history, lasted, _ = self._roll(x, np.array([plan.c for plan in plans]), longest)
         reached = []
         for i, plan in enumerate(plans):
             # the states before a failure teach most, so any of them may be chosen
-            lasted = int(np.argmax(over[:, i])) if over[-1, i] else longest + 1
-            k = int(steps[i]) if steps[i] < lasted else int(rng.integers(lasted))
+            k = int(steps[i] if steps[i] < lasted[i] else rng.integers(lasted[i]))
             reached.append((history[k, i], min(starts[i] + k, len(plan.u))))
         return reached
 
@@ -509,14 +507,14 @@ class Dagger:
         """Runs B episodes under the learner from states x (B, 8) with constants c (B, nc).
 
         Returns:
-            States (steps+1, B, 8); whether the episode had ended by then (steps+1, B), so that the state has no meaning;
-            and whether it failed (B,).
+            States (steps+1, B, 8); how many of them each episode lasted (B,), and the others have no meaning; and whether
+            it failed (B,).
         """
         run = self._run(x, c, steps, record=True)
         assert run.states is not None
         history = np.concatenate([x[None], run.states.transpose(1, 2).double().numpy()])
-        over = (np.arange(steps + 1)[:, None] >= run.steps.numpy()) & run.terminated.numpy()
-        return history, over, run.failure.numpy()
+        lasted = np.where(run.terminated.numpy(), run.steps.numpy(), steps + 1)
+        return history, lasted, run.failure.numpy()
 
     def _run(self, x: np.ndarray, c: np.ndarray, steps: int, record: bool) -> BatchEpisodes:
         """B episodes of so many steps under the learner."""

@@ -15,7 +15,6 @@ from torch import nn
 
 from ballbot_gym.batch import BatchState
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import Frame
 from ballbot_gym.vector import BallbotVectorEnv
@@ -104,15 +103,15 @@ class ModelFree(ABC):
         frame: Frame | None = None,
         control_dt: float | None = None,
         backwards: bool = False,
-        randomization: Randomization | None = None,
-        history: int = 0,
+        **world: Any,
     ):
         """Args:
         demos: to imitate.
         warm: whether training starts from them or from a policy.
         frame: in which the envs show observations and take actions; demos must be of it already.
         control_dt: how long each force is held in training, s; default, as in the task.
-        backwards, randomization, history: as of `CurriculumBatch`.
+        backwards: as of `CurriculumBatch`.
+        world: what of it is as of `BallbotBatch`.
 
         Raises:
             ValueError: the task does not have what the settings ask for, or a discount factor is none.
@@ -120,7 +119,8 @@ class ModelFree(ABC):
         for name in ("gamma", "final_gamma"):
             if not 0 < getattr(config, name) < 1:
                 raise ValueError(f"{name} must be between 0 and 1, not {getattr(config, name):g}")
-        self.iteration, self._settings, self._task, self._demos, self._warm = 0, config, task, demos, warm
+        self.iteration, self._settings, self._task, self._warm = 0, config, task, warm
+        self._demos = None if demos is None else Samples.of(demos.observations, demos.actions)
         self._trained = task if control_dt is None else replace(task, control_dt=control_dt)
         self._pay = not (backwards or (warm and task.first_exit))
         self._reward_scale = _REWARD_SCALE if self._pay else _COST_SCALE
@@ -137,8 +137,7 @@ class ModelFree(ABC):
             config.short_episodes,
             backwards,
             self._pay,
-            randomization,
-            history,
+            **world,
         )
         self._env = TrainingEnv(batch, self._reward_scale, frame)
 
@@ -165,7 +164,7 @@ class ModelFree(ABC):
         model.set_logger(Logger(folder=None, output_formats=[]))
         model._last_obs = self._env.reset()
         model._last_episode_starts = np.ones(self._settings.num_envs, bool)
-        self._imitation = None if self._demos is None else Imitation(actor, self._demos)
+        self._imitation = None if self._demos is None else Fit(actor)
         optimizers[0].register_step_pre_hook(self._add_imitation)
         self._random = _global_random()
 
@@ -283,7 +282,10 @@ class ModelFree(ABC):
     def _clone(self) -> dict[str, float]:
         """One iteration of behaviour cloning."""
         assert self._imitation is not None
-        return self._imitation.clone(schedules.linear(_CLONE_RATE, 0.0, self.iteration / self._clone_iterations))
+        assert self._demos is not None
+        rng = np.random.default_rng(int(torch.randint(2**31, ())))
+        rate = schedules.linear(_CLONE_RATE, 0.0, self.iteration / self._clone_iterations)
+        return {"loss/cloning": self._imitation.run(self._demos, _CLONE_STEPS, _CLONE_BATCH, rate, rng)}
 
     def _improve(self) -> dict[str, float]:
         """One iteration of reinforcement learning."""
@@ -305,9 +307,12 @@ class ModelFree(ABC):
         }
 
     def _add_imitation(self, *_: object) -> None:
-        """Adds the gradient of the imitation loss to that of a step of the actor."""
-        if self._imitation is not None and not self._critic_only:
-            (self._imitation_weight * (1 - self._progress) * self._imitation.loss()).backward()
+        """Adds the gradient of the imitation loss, in demonstrated states that are drawn, to that of a step of the actor."""
+        if self._demos is not None and not self._critic_only:
+            drawn = torch.randint(len(self._demos), (_CLONE_BATCH,))
+            actions = self._actor(self._demos.observations[drawn])
+            loss = nn.functional.mse_loss(actions, self._demos.actions[drawn])
+            (self._imitation_weight * (1 - self._progress) * loss).backward()
 
 
 class TrainingEnv(BallbotVecEnv):
@@ -373,25 +378,6 @@ class TrainingEnv(BallbotVecEnv):
             return observation
         features, self._axes = seen_in(self._frame, observation)
         return features
-
-
-class Imitation(Fit):
-    """Imitation of an expert by an actor: behaviour cloning, and a loss to add to that of reinforcement learning."""
-
-    def __init__(self, actor: nn.Module, demos: Demos):
-        """Args: actor: observations (n, no) to mean actions (n, 2)."""
-        super().__init__(actor)
-        self._samples = Samples.of(demos.observations, demos.actions)
-
-    def loss(self) -> torch.Tensor:
-        """Mean squared difference from the expert's actions in demonstrated states, drawn at random."""
-        chosen = torch.randint(len(self._samples), (_CLONE_BATCH,))
-        return nn.functional.mse_loss(self.network(self._samples.observations[chosen]), self._samples.actions[chosen])
-
-    def clone(self, learning_rate: float) -> dict[str, float]:
-        """Takes gradient steps of behaviour cloning; returns figures to log."""
-        rng = np.random.default_rng(int(torch.randint(2**31, ())))
-        return {"loss/cloning": self.run(self._samples, _CLONE_STEPS, _CLONE_BATCH, learning_rate, rng)}
 
 
 def _global_random() -> dict[str, Any]:

@@ -18,7 +18,6 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
@@ -239,8 +238,7 @@ class Ppo(ModelFree):
         seed: int = 0,
         demos: str | Path | None = None,
         start: PolicyNetwork | None = None,
-        randomization: Randomization | None = None,
-        history: int = 0,
+        **world: Any,
     ):
         """As of `Algorithm.make`. A policy to start from says the shape of the actor."""
         warm = demos is not None or start is not None
@@ -248,11 +246,10 @@ class Ppo(ModelFree):
             raise ValueError("backwards goes from scratch alone; give --no-backwards with --demos or --start")
         if config.backwards and config.relative_advantages:
             raise ValueError("backwards shapes rewards, which tell no cost to go: give --no-relative-advantages too")
-        spec = spec_for(task, config.symmetry, config.hidden, history=history)
+        spec = spec_for(task, config.symmetry, config.hidden, history=world.get("history", 0))
         if start is not None:
             start = started(start, spec)
             spec = start.spec
-        world: dict[str, Any] = {"randomization": randomization, "history": history}
         given = None if demos is None else load_demos(demos, task)
         super().__init__(task, params, config, given, warm, backwards=config.backwards, **world)
         self.config = config
@@ -293,7 +290,7 @@ class Ppo(ModelFree):
     def _improve(self) -> dict[str, float]:
         std = schedules.geometric(self.config.std, self.config.final_std, self._progress)
         self._log_std.data.fill_(np.log(std))
-        # the likelihood's gradient with the mean, whose squared difference the imitation loss is
+        # by so much the gradient of the expert's likelihood is greater than that of the squared difference
         self._imitation_weight = self.config.imitation_weight * float(self._log_std.exp()[0]) ** -2
         return super()._improve()
 
