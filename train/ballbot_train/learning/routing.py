@@ -5,6 +5,7 @@ no optimum of a slalom is searched for this.
 """
 
 import math
+from typing import cast
 
 import numpy as np
 import torch
@@ -73,7 +74,7 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
     known = np.argsort(distances)[np.linspace(0, episodes - 1, _DISTANCES).astype(int)]
     motions = [find_optimum(task, params, x[i], task.without_obstacles(c[i]), guesses=1) for i in known]
     nearest = np.abs(distances[:, None] - distances[known]).argmin(1)
-    obstacles = [_passed(task, each) for each in c]
+    obstacles = [cast(np.ndarray, task.passed_obstacles(each)) for each in c]  # x, y and the distance to keep, m
     route = FRAMES[task.routed_frame].route
     assert route is not None
     farther = np.array(farther_choices(route.obstacles), int)
@@ -97,10 +98,3 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
                 picked = [row_of[tuple(side)] for side in (farther[column, :count] * nearer).tolist()]
                 regrets[rows, column] = relative[np.arange(len(rows)), picked]
     return np.asarray(task.observe(x, c)), regrets
-
-
-def _passed(task: Task, c: np.ndarray) -> np.ndarray:
-    """(n, 3) x, y and the distance to keep of the obstacles of an episode, m."""
-    obstacles = task.passed_obstacles(c)
-    assert obstacles is not None
-    return obstacles

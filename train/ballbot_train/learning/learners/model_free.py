@@ -111,7 +111,7 @@ class ModelFree(ABC):
         frame: in which the envs show observations and take actions; demos must be of it already.
         control_dt: how long each force is held in training, s; default, as in the task.
         backwards: as of `CurriculumBatch`.
-        world: what of it is as of `BallbotBatch`.
+        world: randomization and history, as of `BallbotBatch`.
 
         Raises:
             ValueError: the task does not have what the settings ask for, or a discount factor is none.
