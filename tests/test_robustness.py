@@ -23,7 +23,7 @@ def test_severity_0_is_no_disturbance_and_every_level_is_one(name):
 
 
 def run(stress, episodes, out, seed=0):
-    groups = robustness.groups_of({"stabilize": ["lqr"]}, robustness.conditions([stress]), "rk4")
+    groups = robustness.groups_of({"stabilize": ["lqr"]}, [stress], "rk4")
     return benchmark.run_groups(groups, episodes, out, 1, seed)
 
 

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("casadi")
 pytest.importorskip("torch")
 
+
 from ballbot_baselines import LqrController
 from ballbot_baselines.adaptive import adaptive_nmpc
 from ballbot_baselines.cautious import cautious_trajopt
@@ -26,7 +27,7 @@ from ballbot_train.commands.benchmark import benchmark
 from ballbot_train.evaluation.benchmark import controllers_of
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.evaluation.fresh import as_batch_policy, evaluate_fresh
-from ballbot_train.evaluation.tracks import EXPERTS, conditions, with_experts
+from ballbot_train.evaluation.robustness import EXPERTS, groups_of
 from ballbot_train.learning.actors import started
 from ballbot_train.onnx_export import export_onnx
 from ballbot_train.policy import load_network, save_policy
@@ -55,13 +56,13 @@ def test_table_of_tracks_splits_regret_and_says_what_evaluate_says(tmp_path):
 
 
 def test_experts_of_a_track_meet_that_track_alone_unless_they_are_named():
-    chosen, wanted = with_experts({"orbit": ["lqr", "shac-late"]}, conditions(["late", "noisy"]))
-    late, noisy = (condition.chosen(chosen)["orbit"] for condition in wanted)
-    assert late == ["lqr", "shac-late", "nmpc-adaptive"]
-    assert noisy == ["lqr", "nmpc-ekf"]
+    def met(controllers, experts):
+        groups = groups_of({"orbit": controllers}, ["late", "noisy"], "rk4", experts=experts)
+        return [[group.controller for group in groups if group.told["stress"] == track] for track in ("late", "noisy")]
+
+    assert met(["lqr", "shac-late"], EXPERTS) == [["lqr", "shac-late", "nmpc-adaptive"], ["lqr", "nmpc-ekf"]]
+    assert met(["nmpc-ekf"], {}) == [["nmpc-ekf"], ["nmpc-ekf"]]
     assert set(EXPERTS) == set(TRACKS)
-    named = {"orbit": ["nmpc-ekf"]}
-    assert conditions(["late"])[0].chosen(named) == named
 
 
 SHIPPED = [

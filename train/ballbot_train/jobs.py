@@ -6,7 +6,9 @@ jobs that have no file. A folder belongs to one configuration until it is releas
 """
 
 import json
+import re
 import shutil
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +43,7 @@ class Job:
     """
 
     name: str
-    """Of its file; different for every job of a run."""
+    """What tells it from the other jobs of a run; its file is named after it."""
     function: Callable[..., Iterator[Entry]]
     """Called as function(*arguments, items), perhaps elsewhere: a function of a module. Yields one entry per item."""
     arguments: tuple[Any, ...]
@@ -69,7 +71,8 @@ def unfinished(out: Path) -> Path:
 
 
 def _path_of(out: Path, name: str) -> Path:
-    return unfinished(out) / f"{name}.json"
+    plain = re.sub(r"[^\w-]", "-", name, flags=re.ASCII)[-100:]
+    return unfinished(out) / f"{plain if plain == name else f'{plain}-{zlib.crc32(name.encode()):08x}'}.json"
 
 
 def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Mapping[str, Any] | None = None) -> None:

@@ -35,7 +35,7 @@ def basins(
     chosen = controllers_of([maps.TASK], controllers, robot)
     physics = physics_or_default(physics, robot)
     names = chosen[maps.TASK]
-    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), robot=robot, physics=physics, points=points)
+    facts = open_run(out, workers, policy_digests(chosen, robot), robot, physics=physics, points=points)
     made = maps.run(names, points, physics, out, workers, robot)
     maps.write(made, facts, out)
     picture = figures.save(figures.basin_figure(made), out / "basins.png")

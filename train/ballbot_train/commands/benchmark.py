@@ -1,15 +1,15 @@
 """`ballbot benchmark`: controllers by their regret on the certified episodes."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym import certified
+from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, physics_or_default
-from ballbot_train.evaluation import optima, robustness, tracks
+from ballbot_train.evaluation import robustness
 from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import (
     controllers_of,
@@ -19,7 +19,7 @@ from ballbot_train.evaluation.benchmark import (
     run_groups,
 )
 from ballbot_train.evaluation.evaluate import checked_episodes
-from ballbot_train.evaluation.results import HEADER, cells, leaderboard, write_leaderboard, write_results
+from ballbot_train.evaluation.results import HEADER, TABLE, cells, leaderboard, write_leaderboard, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 from ballbot_train.report.page import write_report
@@ -55,16 +55,25 @@ def benchmark(
     """
     chosen = controllers_of(tasks, controllers, robot, tracks=bool(randomization))
     physics = physics_or_default(physics, robot)
-    settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes)}
+    settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     if randomization:
-        _benchmark_tracks(chosen, not controllers, seed, out, workers, robot, randomization, **settings)
+        for track in randomization:
+            checked_randomization(track)
+        settings["tracks"] = list(randomization)
+    facts = open_run(out, workers, policy_digests(chosen, robot), robot, **settings)
+    if randomization:
+        experts = {} if controllers else robustness.EXPERTS
+        groups = robustness.groups_of(chosen, randomization, physics, robot, experts)
+        results = run_groups(groups, episodes, out, workers, seed)
+        rows = robustness.track_rows(results, robot, seed)
+        write_results("tracks", rows, results, facts, out)
+        title = f"{episodes} certified episodes per task and track, physics={physics}"
+        publish(out, "tracks", title, robustness.TRACK_TABLE, rows)
         return
-    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
     done = run_benchmark(chosen, episodes, physics, out, workers, seed, robot)
     rows = leaderboard(done, seed=seed)
     write_leaderboard(rows, done, facts, out)
     regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
-    table = [cells(row) for row in rows]
     replays, pictures = [], []
     for task, names in chosen.items():
         episode = telling_episode(task, done)
@@ -76,36 +85,9 @@ def benchmark(
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    page = write_report(out / "report.html", title, HEADER, table, replays, shown, facts)
-    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", HEADER, table)
+    page = write_report(out / "report.html", title, HEADER, [cells(row) for row in rows], replays, shown, facts)
+    publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows)
     for result in done:
         if result.note:
             console.print(f"no plan: {result.task} episode {result.episode}: {result.note}")
     console.print(f"report: {page}")
-
-
-def _benchmark_tracks(
-    chosen: dict[str, list[str]],
-    with_experts: bool,
-    seed: int,
-    out: Path,
-    workers: Workers,
-    robot: str,
-    names: Sequence[str],
-    physics: str,
-    episodes: int,
-) -> None:
-    wanted = tracks.conditions(names)
-    if with_experts:
-        chosen, wanted = tracks.with_experts(chosen, wanted)
-    settings = {"physics": physics, "episodes": episodes, "tracks": list(names)}
-    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
-    for task in chosen:
-        for condition in wanted:
-            optima.known(task, robot, range(episodes), workers, condition.randomization)
-    groups = robustness.groups_of(chosen, wanted, physics, robot)
-    results = run_groups(groups, episodes, out, workers, seed)
-    rows = tracks.rows_of(results, robot, seed)
-    write_results("tracks", rows, results, facts, out)
-    title = f"{episodes} certified episodes per task and track, physics={physics}"
-    publish(out, "tracks", title, tracks.HEADER, [tracks.cells(row) for row in rows])

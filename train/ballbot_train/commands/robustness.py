@@ -1,6 +1,6 @@
 """`ballbot robustness`: the leaderboard under disturbances."""
 
-import math
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ballbot_gym.robots import PAPER
@@ -16,7 +16,7 @@ from ballbot_train.evaluation.benchmark import (
     run_groups,
 )
 from ballbot_train.evaluation.evaluate import checked_episodes
-from ballbot_train.evaluation.results import Row, leaderboard, write_results
+from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
 
@@ -50,36 +50,36 @@ def robustness(
         chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
     physics = physics_or_default(physics, robot)
     check_some("stress", stresses, stressed.STRESSES)
-    settings = {"physics": physics, "episodes": checked_episodes(episodes)}
-    facts = open_run(out, chosen, workers, policy_digests(chosen, robot), seed, robot, **settings)
-    groups = stressed.groups_of(chosen, stressed.conditions(stresses), physics, robot)
-    results = run_groups(groups, episodes, out, workers, seed)
+    settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
+    facts = open_run(out, workers, policy_digests(chosen, robot), robot, **settings)
+    results = run_groups(stressed.groups_of(chosen, stresses, physics, robot), episodes, out, workers, seed)
     rows = leaderboard(results, "stress", "level", seed=seed)
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
     write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:
         figures.save(figures.robustness_figure(rows, task), out / "figures" / f"robustness-{task}.png")
-    table = [
-        _cells(stressed.curve_of(rows, task, controller, name), name)
+    curves = [
+        stressed.curve_of(rows, task, controller, name)
         for task, group in chosen.items()
         for name in stresses
         for controller in group
     ]
-    header = ["task", "disturbance", "controller", "severity", "success, %", "falls, %", stressed.REGRET]
-    publish(out, "robustness", f"{episodes} certified episodes per task and severity, physics={physics}", header, table)
+    publish(
+        out, "robustness", f"{episodes} certified episodes per task and severity, physics={physics}", _TABLE, curves
+    )
     console.print(f"curves: {out / 'figures'}")
 
 
-def _cells(curve: list[Row], stress: str) -> list[str]:
-    def joined(values: list[float]) -> str:
-        return " · ".join(f"{value:.0f}" if math.isfinite(value) else "–" for value in values)
+def _joined(values: Iterable[float]) -> str:
+    return " · ".join(shown(value, ".0f") for value in values)
 
-    return [
-        curve[0].task,
-        stress,
-        curve[0].controller,
-        " · ".join(f"{row.told['level']:g}" for row in curve),
-        joined([100 * row.success for row in curve]),
-        joined([100 * row.falls / row.episodes for row in curve]),
-        joined([100 * row.regret_mean for row in curve]),
-    ]
+
+_TABLE: dict[str, Callable[[list[Row]], str]] = {
+    "task": lambda curve: curve[0].task,
+    "disturbance": lambda curve: curve[-1].told["stress"],
+    "controller": lambda curve: curve[0].controller,
+    "severity": lambda curve: " · ".join(f"{row.told['level']:g}" for row in curve),
+    "success, %": lambda curve: _joined(100 * row.success for row in curve),
+    "falls, %": lambda curve: _joined(100 * row.falls / row.episodes for row in curve),
+    stressed.REGRET: lambda curve: _joined(100 * row.regret_mean for row in curve),
+}

@@ -7,7 +7,7 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
 from ballbot_train.evaluation import transfer as matrix
-from ballbot_train.evaluation.benchmark import open_run, policy_digests, publish, run_groups
+from ballbot_train.evaluation.benchmark import controllers_by_robot, open_run, policy_digests, publish, run_groups
 from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import leaderboard, write_results
 from ballbot_train.executors import Workers
@@ -44,17 +44,16 @@ def transfer(
     floors = frictions or (None,)
     for friction in floors:
         matrix.floor(robot, friction)
-    chosen = matrix.controllers_of(tasks, controllers, made_for)
+    chosen = controllers_by_robot(tasks, controllers, made_for)
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
     engines, episodes = [physics_or_default(one, robot) for one in physics or (None,)], checked_episodes(episodes)
     digests = {f"{name}/{key}": d for name, group in chosen.items() for key, d in policy_digests(group, name).items()}
-    settings = {"controllers": chosen, "frictions": frictions, "physics": engines, "episodes": episodes}
-    facts = open_run(out, tasks, workers, digests, seed, robot, **settings)
+    settings = {"controllers": chosen, "frictions": frictions, "physics": engines, "episodes": episodes, "seed": seed}
+    facts = open_run(out, workers, digests, robot, **settings)
     groups = matrix.groups_of(chosen, robot, floors, engines)
     results = run_groups(groups, episodes, out, workers, seed)
     rows = leaderboard(results, "made_for", "robot", "friction", "physics", seed=seed)
     write_results("transfer", rows, results, facts, out, matrix.COLUMNS, regret=matrix.REGRET)
-    title, table = f"{episodes} certified episodes of {robot} per task", [matrix.cells(row) for row in rows]
-    publish(out, "transfer", title, matrix.HEADER, table)
+    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", matrix.TABLE, rows)
     console.print(f"matrix: {out / 'transfer.csv'}")

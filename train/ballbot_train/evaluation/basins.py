@@ -8,7 +8,6 @@ episode succeeds: at rest at the origin when it ends. It is recoverable if it li
 
 import json
 import math
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,7 +75,7 @@ def run(
         workers: a number of processes, or `Workers`.
         robot: by name.
     """
-    search = [jobs.Job(f"boundary-{_slug(name)}", _boundary, (robot,), (name,), "boundary") for name in AXES]
+    search = [jobs.Job(f"boundary-{name}", _boundary, (robot,), (name,), "boundary") for name in AXES]
     with progress_bars({"boundary": len(AXES)}) as advance:
         found = jobs.run(search, out, workers, advance)
     bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
@@ -124,7 +123,7 @@ def cell_jobs(
             arguments = name, controller, physics, points, packed(controller), robot
             for i in range(points // 2, points):
                 items = tuple((i, int(j)) for j in np.flatnonzero(worth[i]))
-                stem = f"{_slug(name)}-{_slug(controller)}-{zlib.crc32(controller.encode()):08x}-{physics}-{points}-{i:02d}"
+                stem = f"{name}-{controller}-{physics}-{points}-{i:02d}"
                 work.append(jobs.Job(stem, _cells, arguments, items, controller))
     return work
 
@@ -204,7 +203,3 @@ def write(maps: Sequence[BasinMap], facts: Mapping[str, Any], out: Path) -> None
         for j, lean in enumerate(basin.leans)
     ]
     files.write_csv(out / "basins.csv", lines)
-
-
-def _slug(text: str) -> str:
-    return "".join(sign if sign.isalnum() else "-" for sign in text)[-60:]

@@ -1,8 +1,7 @@
 """Every controller of every task on the certified episodes, in parallel processes and resumably."""
 
-import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -42,31 +41,36 @@ def controllers_of(
         ValueError: a name that none of the tasks has, a name that is given twice, or no task.
         PolicyError: a policy file that is missing or damaged.
     """
+    return controllers_by_robot(tasks, names, [robot], tracks)[robot]
+
+
+def controllers_by_robot(
+    tasks: Sequence[str], names: Sequence[str], robots: Sequence[str], tracks: bool = False
+) -> dict[str, dict[str, list[str]]]:
+    """As `controllers_of`, by the robots that controllers were made for. A name is of the robots that have it."""
     check_some("task", tasks, TASKS)
-    known = {task: registry.names(make_task(task, robot), robot, None if tracks or names else "") for task in tasks}
+    track = None if tracks or names else ""
+    known = {robot: {task: registry.names(make_task(task, robot), robot, track) for task in tasks} for robot in robots}
     if not names:
         return known
-    behind = ("", *registry.filters(named_robot(robot)))
-    known = {task: [*VARIANTS, *(name + each for name in group for each in behind)] for task, group in known.items()}
     if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"controller {', '.join(repeated)} is given more than once; give each once")
-    from_files = {name: registry.made_for(name) for name in names if registry.is_file(name)}
-    chosen = {
-        task: [
-            name
-            for name in names
-            if (
-                registry.is_made_for(name, make_task(task, robot), robot) if name in from_files else name in known[task]
-            )
-        ]
-        for task in tasks
-    }
-    unused = [name for name in names if not any(name in group for group in chosen.values())]
-    if unused:
-        if unused[0] in from_files:
-            raise ValueError(f"{unused[0]} was made for {from_files[unused[0]]}, which is none of {', '.join(tasks)}")
-        check_names("controller", unused, dict.fromkeys(name for group in known.values() for name in group))
-    return {task: group for task, group in chosen.items() if group}
+    chosen: dict[str, dict[str, list[str]]] = {}
+    for robot, by_task in known.items():
+        behind = ("", *registry.filters(named_robot(robot)))
+        for task, group in by_task.items():
+            by_task[task] = [*VARIANTS, *(name + each for name in group for each in behind)]
+            problem, given = make_task(task, robot), filter(registry.is_file, names)
+            made = [*by_task[task], *(name for name in given if registry.is_made_for(name, problem, robot))]
+            if found := [name for name in names if name in made]:
+                chosen.setdefault(robot, {})[task] = found
+    used = {name for by_task in chosen.values() for group in by_task.values() for name in group}
+    unused = [name for name in names if name not in used]
+    if unused and registry.is_file(unused[0]):
+        made_for = registry.made_for(unused[0])
+        raise ValueError(f"{unused[0]} was made for {made_for}, which is none of {', '.join(tasks)}")
+    check_names("controller", unused, dict.fromkeys(name for group in known[robots[0]].values() for name in group))
+    return chosen
 
 
 def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER) -> dict[str, str]:
@@ -80,24 +84,14 @@ def policy_digests(controllers: Mapping[str, Sequence[str]], robot: str = PAPER)
 
 
 def open_run(
-    out: Path,
-    tasks: Iterable[str],
-    workers: int | Workers,
-    policies: Mapping[str, str],
-    seed: int | None = None,
-    robot: str = PAPER,
-    **settings: Any,
+    out: Path, workers: int | Workers, policies: Mapping[str, str], robot: str = PAPER, **settings: Any
 ) -> dict[str, Any]:
     """Claims a folder for a run with some settings; `publish` or `jobs.release` ends the run.
 
-    The optima of the episodes of a run with `episodes` are computed, where the package has none.
-
     Args:
         out: the folder.
-        tasks: names.
         workers: a number of processes, or `Workers`; they change no result.
         policies: digests of the policies that are run, as `policy_digests` gives.
-        seed: of whatever is drawn, if anything is.
         robot: by name.
         settings: whatever else decides the results.
 
@@ -106,21 +100,18 @@ def open_run(
 
     Raises:
         ValueError: the folder holds an unfinished run with other settings, policies or code; another process is using it;
-            or a number is out of its range.
+            or the seed is negative.
     """
-    if seed is not None:
-        check_least(0, seed=seed)
-        settings["seed"] = seed
+    check_least(0, seed=settings.get("seed", 0))
     settings |= robot_setting(robot) | {"policies": policies}
     facts = provenance() | settings | {"workers": Workers.of(workers).named}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
-    for task in tasks if "episodes" in settings else ():
-        optima.known(task, robot, range(settings["episodes"]), workers)
     return facts
 
 
-def publish(out: Path, name: str, title: str, header: Sequence[str], table: Sequence[Sequence[str]]) -> None:
-    """Ends a run: writes its table as NAME.md, and prints it."""
+def publish(out: Path, name: str, title: str, shown: Mapping[str, Callable[[Any], str]], rows: Sequence[Any]) -> None:
+    """Ends a run: writes its table as NAME.md, and prints it. It has what is `shown` of each row, by header."""
+    header, table = list(shown), [[text(row) for text in shown.values()] for row in rows]
     files.write(out / f"{name}.md", markdown(header, table))
     jobs.release(out)
     print_table(title, header, table)
@@ -139,13 +130,18 @@ class Group:
     """Name of the robot that the controller is made for; default, `robot`."""
     variant: BallbotParams | None = None
     """A robot that runs in the place of `robot`; regret is over the optimum of `robot` then too."""
-    randomization: Randomization | None = None
+    randomization: Randomization = Randomization()
     own_optima: bool = False
-    """Whether regret is over the optimum of each episode's own robot."""
+    """Whether regret is over the optimum of each episode's own robot, and not over the undisturbed one."""
     told: Mapping[str, Any] = field(default_factory=dict)
     """What the results are told by."""
     counts_for: str = ""
     """What its progress counts for; default, the task."""
+
+    @property
+    def problem(self) -> tuple[str, str, Randomization]:
+        """Whose optima its regret is over."""
+        return self.task, self.robot, self.randomization if self.own_optima else Randomization()
 
 
 def run_groups(
@@ -157,6 +153,8 @@ def run_groups(
     record: bool = False,
 ) -> list[Result]:
     """Runs groups in parallel processes, with progress bars. What an interrupted run finished is not run again.
+
+    Optima that the package does not have are computed.
 
     Args:
         groups: what to run.
@@ -170,7 +168,26 @@ def run_groups(
     for group in groups:
         totals[group.counts_for or group.task] += episodes
     parts = [range(start, min(start + CHUNK, episodes)) for start in range(0, episodes, CHUNK)]
-    work = [_job(group, part, seed, record) for group in groups for part in parts]
+    # the optima go along, because workers on other machines do not have this user's cache
+    known = {
+        (task, robot, varied): replace(
+            optima.known(task, robot, range(episodes), workers, varied), trajectories=(), statuses=np.zeros(0, str)
+        )
+        for task, robot, varied in dict.fromkeys(group.problem for group in groups)
+    }
+    work = [
+        jobs.Job(
+            name="-".join(
+                [*map(str, (group.task, group.controller, group.physics, *group.told.values())), f"{part.start:03d}"]
+            ),
+            function=_episode_entries,
+            arguments=(group, registry.packed(group.controller), seed, known[group.problem], record),
+            items=tuple(part),
+            group=group.counts_for or group.task,
+        )
+        for group in groups
+        for part in parts
+    ]
     with progress_bars(totals) as advance:
         done = iter(jobs.run(work, out, workers, advance))
     results = []
@@ -203,24 +220,6 @@ def _write_recording(group: Group, motions: Sequence[recordings.Motion], out: Pa
     task, params = make_task(group.task, group.robot), named_robot(group.robot)
     digest = registry.policy_digest(group.controller, task, group.robot)
     recordings.write_in(out, motions, task, group.task, params, group.physics, group.controller, digest)
-
-
-def _job(group: Group, episodes: range, seed: int, record: bool) -> jobs.Job:
-    """Some episodes of a group, as a job whose entries are the fields of Results, and with record the "motion"."""
-    told = "-".join(f"{value:g}" if isinstance(value, float) else f"{value}" for value in group.told.values())
-    what = f"{group.task}-{group.controller}-{group.physics}-{told}"
-    # the optima go along, because workers on other machines do not have this user's cache
-    varied = (group.own_optima and group.randomization) or Randomization()
-    known = certified.load(group.task, group.robot, episodes=episodes, randomization=varied)
-    known = replace(known, trajectories=(), statuses=np.zeros(0, str))
-    slug = "".join(sign if sign.isalnum() else "-" for sign in what)
-    return jobs.Job(
-        name=f"{slug[-80:]}{zlib.crc32(what.encode()):08x}-{episodes.start:03d}-{episodes.stop:03d}",
-        function=_episode_entries,
-        arguments=(group, registry.packed(group.controller), seed, known, record),
-        items=tuple(episodes),
-        group=group.counts_for or group.task,
-    )
 
 
 def _episode_entries(

@@ -246,7 +246,7 @@ def with_interval(value: float, low: float, high: float, sign: Literal["", "+"] 
     return shown(100 * value, f"{sign}.2f", " %") + ends
 
 
-_COLUMNS: dict[str, Callable[[Row], str]] = {
+TABLE: dict[str, Callable[[Row], str]] = {
     "task": lambda row: row.task,
     "controller": lambda row: Path(row.controller).name,  # a policy may be a long path
     "success": lambda row: f"{100 * row.success:.1f} %",
@@ -259,9 +259,10 @@ _COLUMNS: dict[str, Callable[[Row], str]] = {
     "plan": lambda row: shown(row.plan_ms_median, ".0f", " ms"),
     "per step": lambda row: shown(row.step_us_median, ".0f", " µs"),
 }
-HEADER = list(_COLUMNS)
+"""What the leaderboard's table shows of a row: behind the mean regret its interval; what does not exist is a dash."""
+HEADER = list(TABLE)
 
 
 def cells(row: Row) -> list[str]:
-    """A row as text, under `HEADER`; behind the mean regret its interval, per cent; what does not exist is a dash."""
-    return [text(row) for text in _COLUMNS.values()]
+    """A row as text, under `HEADER`."""
+    return [text(row) for text in TABLE.values()]

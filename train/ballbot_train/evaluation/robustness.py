@@ -1,17 +1,31 @@
 """The leaderboard under disturbances: how success and regret change with their severity, and with tracks.
 
-No controller knows of the disturbance: experts plan for the nominal robot with ideal actuators and sensors. Under a stress,
-regret is measured against the undisturbed optimum, so no controller could avoid all of it. On a track (`tracks.py`) it is
-measured against the optimum of each episode's own robot. Every controller meets the same draws.
+No controller knows of the disturbance: experts plan for the nominal robot with ideal actuators and sensors. Every controller
+meets the same draws. Under a stress, regret is measured against the undisturbed optimum, so no controller could avoid all of
+it.
+
+The tracks of `ballbot_gym.randomization` are robots that nobody told. Every episode has an optimum of its own there: that of
+its robot, whose first forces are none while its delay lasts. Who reaches it would have to know what was drawn. In units of
+that optimum J, regret splits into what adds up:
+
+- what not knowing costs: how far the best controller of the table is from J in the same episode,
+- what the controller loses: how much dearer it is than that one.
+
+What delay costs is told beside them, because no controller could avoid it: J less the optimum without delay.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from ballbot_gym.randomization import Randomization
+import numpy as np
+
+from ballbot_gym.env import make_task
+from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.robots import PAPER
+from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.benchmark import Group
-from ballbot_train.evaluation.results import Row
+from ballbot_train.evaluation.results import Result, Row, shown, summarize
 from ballbot_train.policy_files import track_in
 
 
@@ -25,44 +39,43 @@ class Stress:
     at: Callable[[float], Randomization]
 
 
-def _push(impulse: float) -> Randomization:
-    return Randomization(push_impulse=(impulse, impulse), push_interval=2.0)
-
-
-def _noise(factor: float) -> Randomization:
-    return Randomization(
-        position_noise=0.01 * factor,
-        lean_noise=0.01 * factor,
-        velocity_noise=0.05 * factor,
-        lean_rate_noise=0.05 * factor,
-    )
-
-
-def _delay(milliseconds: float) -> Randomization:
-    return Randomization(actuator_delay=(1e-3 * milliseconds, 1e-3 * milliseconds))
-
-
-def _lag(milliseconds: float) -> Randomization:
-    return Randomization(actuator_lag=(1e-3 * milliseconds, 1e-3 * milliseconds))
-
-
-def _mass(percent: float) -> Randomization:
-    factor = 1 + 0.01 * percent
-    return Randomization(body_mass=(factor, factor), ball_mass=(factor, factor))
-
-
-def _com(percent: float) -> Randomization:
-    factor = 1 + 0.01 * percent
-    return Randomization(com_height=(factor, factor))
+def _both(value: float) -> tuple[float, float]:
+    """A range of one value."""
+    return value, value
 
 
 STRESSES: dict[str, Stress] = {
-    "push": Stress("impulse of pushes on the ball, one in 2 s, N·s", (1.0, 2.0, 4.0, 8.0), _push),
-    "noise": Stress("sensor noise × (1 cm, 0.01 rad, 5 cm/s, 0.05 rad/s)", (0.5, 1.0, 2.0, 4.0), _noise),
-    "delay": Stress("delay of the force, ms", (20.0, 40.0, 60.0), _delay),
-    "lag": Stress("time constant of the actuator, ms", (10.0, 20.0, 40.0, 60.0), _lag),
-    "mass": Stress("error of both masses, %", (-20.0, -10.0, 10.0, 20.0), _mass),
-    "com": Stress("error of the centre of mass's height, %", (-20.0, -10.0, 10.0, 20.0), _com),
+    "push": Stress(
+        "impulse of pushes on the ball, one in 2 s, N·s",
+        (1.0, 2.0, 4.0, 8.0),
+        lambda impulse: Randomization(push_impulse=_both(impulse), push_interval=2.0),
+    ),
+    "noise": Stress(
+        "sensor noise × (1 cm, 0.01 rad, 5 cm/s, 0.05 rad/s)",
+        (0.5, 1.0, 2.0, 4.0),
+        lambda factor: Randomization(
+            **dict.fromkeys(("position_noise", "lean_noise"), 0.01 * factor),
+            **dict.fromkeys(("velocity_noise", "lean_rate_noise"), 0.05 * factor),
+        ),
+    ),
+    "delay": Stress(
+        "delay of the force, ms", (20.0, 40.0, 60.0), lambda ms: Randomization(actuator_delay=_both(1e-3 * ms))
+    ),
+    "lag": Stress(
+        "time constant of the actuator, ms",
+        (10.0, 20.0, 40.0, 60.0),
+        lambda ms: Randomization(actuator_lag=_both(1e-3 * ms)),
+    ),
+    "mass": Stress(
+        "error of both masses, %",
+        (-20.0, -10.0, 10.0, 20.0),
+        lambda percent: Randomization(**dict.fromkeys(("body_mass", "ball_mass"), _both(1 + 0.01 * percent))),
+    ),
+    "com": Stress(
+        "error of the centre of mass's height, %",
+        (-20.0, -10.0, 10.0, 20.0),
+        lambda percent: Randomization(com_height=_both(1 + 0.01 * percent)),
+    ),
 }
 """Every disturbance by its name on the command line."""
 
@@ -73,54 +86,50 @@ NONE = "none"
 """The name of no disturbance, severity 0 of every stress."""
 
 
-@dataclass(frozen=True)
-class Condition:
-    """What controllers meet: a stress of some severity, or a track, whose level is 0."""
-
-    name: str
-    level: float
-    randomization: Randomization
-    own_optima: bool = False
-    """Whether regret is over the optimum of each episode's own robot, and not over the undisturbed one."""
-    left_out: tuple[str, ...] = ()
-    """Controllers that do not meet it."""
-
-    def chosen(self, controllers: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-        """Those controllers by task that meet it: not the policies that were trained on other tracks."""
-
-        def meets(name: str) -> bool:
-            return name not in self.left_out and track_in(name) in ("", self.name)
-
-        return {task: [name for name in group if meets(name)] for task, group in controllers.items()}
-
-
-def conditions(stresses: Sequence[str]) -> list[Condition]:
-    """Every level of some stresses in `STRESSES`, and the undisturbed once."""
-    levels = ((name, level) for name in stresses for level in STRESSES[name].levels)
-    return [
-        Condition(NONE, 0.0, Randomization()),
-        *(Condition(name, level, STRESSES[name].at(level)) for name, level in levels),
-    ]
+EXPERTS = {
+    "unknown": ("cautious", "nmpc-adaptive"),
+    "late": ("nmpc-adaptive",),
+    "noisy": ("nmpc-ekf",),
+    "real": ("nmpc-adaptive-ekf",),
+}
+"""The experts that are made for each track, which run there where no controllers are named."""
 
 
 def groups_of(
-    controllers: Mapping[str, Sequence[str]], wanted: Sequence[Condition], physics: str, robot: str = PAPER
+    controllers: Mapping[str, Sequence[str]],
+    names: Sequence[str],
+    physics: str,
+    robot: str = PAPER,
+    experts: Mapping[str, Sequence[str]] = {},
 ) -> list[Group]:
-    """Controllers by task under conditions, for `run_groups`, whose results are told by "stress" and "level"."""
+    """What to run, for `run_groups`, whose results are told by "stress" and "level". Tracks have level 0.
+
+    Args:
+        controllers: names by task. Policies that were trained on a track meet that track alone.
+        names: in `TRACKS`; or in `STRESSES`, of which every level is run, and the undisturbed once.
+        physics: "bullet", "mujoco" or "rk4".
+        robot: by name.
+        experts: more controllers, by the track that they meet.
+    """
+    stresses = [name for name in names if name not in TRACKS]
+    conditions = [(NONE, 0.0, Randomization())] if stresses else []
+    conditions += [(name, level, STRESSES[name].at(level)) for name in stresses for level in STRESSES[name].levels]
+    conditions += [(name, 0.0, TRACKS[name]) for name in names if name in TRACKS]
     return [
         Group(
             task,
-            name,
+            controller,
             physics,
             robot,
-            randomization=condition.randomization,
-            own_optima=condition.own_optima,
-            told={"stress": condition.name, "level": condition.level},
-            counts_for=condition.name,
+            randomization=randomization,
+            own_optima=name in TRACKS,
+            told={"stress": name, "level": level},
+            counts_for=name,
         )
-        for condition in wanted
-        for task, names in condition.chosen(controllers).items()
-        for name in names
+        for name, level, randomization in conditions
+        for task, group in controllers.items()
+        for controller in [*group, *experts.get(name, ())]
+        if track_in(controller) in ("", name)
     ]
 
 
@@ -129,3 +138,51 @@ def curve_of(rows: Sequence[Row], task: str, controller: str, stress: str) -> li
     chosen = [row for row in rows if (row.task, row.controller) == (task, controller)]
     chosen = [row for row in chosen if row.told["stress"] in (stress, NONE)]
     return sorted(chosen, key=lambda row: row.told["level"])
+
+
+def track_rows(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> list[Row]:
+    """One row per track, task and controller; seed is of the bootstrap.
+
+    A row is told by its "track" and by shares of the mean, in units of the episode's optimum, NaN without an episode:
+    "delay_costs", what delay adds to the optimum; "not_knowing_costs", the regret of the "best" controller in the episodes in
+    which neither fails; "controller_loses", the regret beyond that in the same episodes. The best controller is, of those
+    that succeed most often, the one of least mean regret.
+    """
+    groups: dict[tuple[str, str], dict[str, list[Result]]] = {}
+    for result in results:
+        groups.setdefault((result.told["stress"], result.task), {}).setdefault(result.controller, []).append(result)
+    rows = []
+    for (track, task), group in groups.items():
+        plain = {name: summarize(done, seed) for name, done in group.items()}
+        mean = {name: row.regret_mean if math.isfinite(row.regret_mean) else math.inf for name, row in plain.items()}
+        best = min(plain, key=lambda name: (-plain[name].success, mean[name]))
+        episodes = [result.episode for result in group[best]]
+        known = optima.known(make_task(task, robot), robot, episodes, randomization=TRACKS[track])
+        delay = float(np.mean(1 - known.ideal[episodes] / known.costs[episodes]))
+        of_best = {result.episode: result.regret for result in group[best]}
+        for name, done in group.items():
+            pairs = np.array([(of_best[result.episode], result.regret) for result in done])
+            pairs = pairs[np.isfinite(pairs).all(axis=1)]
+            unknown, own = pairs.mean(axis=0).tolist() if len(pairs) else (math.nan, math.nan)
+            costs = {"delay_costs": delay, "not_knowing_costs": unknown, "controller_loses": own - unknown}
+            rows.append(replace(plain[name], told={"track": track, **costs, "best": best}))
+    return rows
+
+
+def _percent(*values: float) -> str:
+    return " to ".join(shown(100 * value, ".2f") for value in values)
+
+
+TRACK_TABLE: dict[str, Callable[[Row], str]] = {
+    "track": lambda row: row.told["track"],
+    "task": lambda row: row.task,
+    "controller": lambda row: row.controller,
+    "success, %": lambda row: f"{100 * row.success:.4g}",
+    "failures": lambda row: f"{row.falls} of {row.episodes}",
+    "mean regret, %": lambda row: _percent(row.regret_mean),
+    "95 % interval": lambda row: _percent(row.regret_low, row.regret_high),
+    "delay costs, %": lambda row: _percent(row.told["delay_costs"]),
+    "not knowing costs, %": lambda row: _percent(row.told["not_knowing_costs"]),
+    "controller loses, %": lambda row: _percent(row.told["controller_loses"]),
+}
+"""What the table of tracks shows of a row of `track_rows`."""

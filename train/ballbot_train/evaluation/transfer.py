@@ -5,7 +5,7 @@ cost is compared with that robot's optimum on its own floor, on other floors too
 robot's contact, and its friction may differ from what the controller was made for.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from ballbot_gym.params import BallbotParams
@@ -26,29 +26,6 @@ def floor(robot: str, friction: float | None) -> BallbotParams:
     if not params.rolls:
         raise ValueError(f"the ball of {robot!r} does not roll, so its floor has no friction; give a rolling robot")
     return replace(params, friction=friction)
-
-
-def controllers_of(
-    tasks: Sequence[str], names: Sequence[str], made_for: Sequence[str]
-) -> dict[str, dict[str, list[str]]]:
-    """The controllers to run, by the robot that they were made for and by task; a name is of the robots that have it.
-
-    Raises:
-        ValueError: a name that no robot has, or that is given twice; or no task.
-        PolicyError: a policy file that is missing or damaged.
-    """
-    own = {robot: [name for name in names if _has(robot, tasks, name)] for robot in made_for}
-    unknown = [name for name in names if not any(name in group for group in own.values())]
-    if unknown:
-        benchmark.controllers_of(tasks, unknown, made_for[0])  # says why
-    return {robot: benchmark.controllers_of(tasks, own[robot], robot) for robot in made_for if own[robot] or not names}
-
-
-def _has(robot: str, tasks: Sequence[str], name: str) -> bool:
-    try:
-        return bool(benchmark.controllers_of(tasks, [name], robot))
-    except ValueError:
-        return False
 
 
 def groups_of(
@@ -89,20 +66,16 @@ COLUMNS = {
     name: f"{name}_on_own_floor" for name in ("regret_mean", "regret_low", "regret_high", "regret_median", "optimum")
 }
 """The same in CSV files."""
-HEADER = ["task", "made for", "controller", "runs on", "friction", "physics", "success", "falls", REGRET, "peak tilt"]
-
-
-def cells(row: Row) -> list[str]:
-    """A row that is told by the same and "physics" as text, under `HEADER`; what does not exist is a dash."""
-    return [
-        row.task,
-        row.told["made_for"],
-        row.controller,
-        row.told["robot"],
-        shown(row.told["friction"], "g"),
-        row.told["physics"],
-        f"{100 * row.success:.1f} %",
-        f"{row.falls}/{row.episodes}",
-        shown(row.regret_mean, ".2%"),
-        shown(row.peak_tilt_median, ".1f", "°"),
-    ]
+TABLE: dict[str, Callable[[Row], str]] = {
+    "task": lambda row: row.task,
+    "made for": lambda row: row.told["made_for"],
+    "controller": lambda row: row.controller,
+    "runs on": lambda row: row.told["robot"],
+    "friction": lambda row: shown(row.told["friction"], "g"),
+    "physics": lambda row: row.told["physics"],
+    "success": lambda row: f"{100 * row.success:.1f} %",
+    "falls": lambda row: f"{row.falls}/{row.episodes}",
+    REGRET: lambda row: shown(row.regret_mean, ".2%"),
+    "peak tilt": lambda row: shown(row.peak_tilt_median, ".1f", "°"),
+}
+"""What the table shows of a row that is told by the same and "physics"."""
