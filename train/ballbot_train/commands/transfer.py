@@ -1,16 +1,41 @@
 """`ballbot transfer`: controllers made for one robot, run on another, in one physics engine or in several."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from ballbot_gym.robots import PAPER, ROBOTS
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, check_some, console, physics_or_default
-from ballbot_train.evaluation import transfer as matrix
-from ballbot_train.evaluation.benchmark import controllers_by_robot, open_run, policy_digests, publish, run_groups
+from ballbot_train.evaluation.benchmark import (
+    Group,
+    controllers_by_robot,
+    floor,
+    open_run,
+    policy_digests,
+    publish,
+    run_groups,
+)
 from ballbot_train.evaluation.evaluate import checked_episodes
-from ballbot_train.evaluation.results import leaderboard, write_results
+from ballbot_train.evaluation.results import Row, leaderboard, shown, write_results
 from ballbot_train.executors import Workers
+
+_REGRET = "regret over the optimum on the robot's own floor"
+_IN_CSV = {
+    name: f"{name}_on_own_floor" for name in ("regret_mean", "regret_low", "regret_high", "regret_median", "optimum")
+}
+_TABLE: dict[str, Callable[[Row], str]] = {
+    "task": lambda row: row.task,
+    "made for": lambda row: row.told["made_for"],
+    "controller": lambda row: row.controller,
+    "runs on": lambda row: row.told["robot"],
+    "friction": lambda row: shown(row.told["friction"], "g"),
+    "physics": lambda row: row.told["physics"],
+    "success": lambda row: f"{100 * row.success:.1f} %",
+    "falls": lambda row: f"{row.falls}/{row.episodes}",
+    _REGRET: lambda row: shown(row.regret_mean, ".2%"),
+    "peak tilt": lambda row: shown(row.peak_tilt_median, ".1f", "°"),
+}
 
 
 def transfer(
@@ -41,9 +66,8 @@ def transfer(
         workers: who does the work.
     """
     check_some("robot", made_for, ROBOTS)
-    floors = frictions or (None,)
-    for friction in floors:
-        matrix.floor(robot, friction)
+    for friction in frictions:
+        floor(robot, friction)
     chosen = controllers_by_robot(tasks, controllers, made_for)
     if len(set(physics)) < len(physics):
         raise ValueError(f"a physics is given more than once: {' '.join(physics)}")
@@ -51,9 +75,24 @@ def transfer(
     digests = {f"{name}/{key}": d for name, group in chosen.items() for key, d in policy_digests(group, name).items()}
     settings = {"controllers": chosen, "frictions": frictions, "physics": engines, "episodes": episodes, "seed": seed}
     facts = open_run(out, workers, digests, robot, **settings)
-    groups = matrix.groups_of(chosen, robot, floors, engines)
+    groups = [
+        Group(
+            task,
+            name,
+            engine,
+            robot,
+            made_for=own,
+            friction=friction,
+            told={"made_for": own, "robot": robot, "friction": floor(robot, friction).friction},
+        )
+        for own, by_task in chosen.items()
+        for task, names in by_task.items()
+        for name in names
+        for friction in frictions or (None,)
+        for engine in engines
+    ]
     results = run_groups(groups, episodes, out, workers, seed)
     rows = leaderboard(results, "made_for", "robot", "friction", "physics", seed=seed)
-    write_results("transfer", rows, results, facts, out, matrix.COLUMNS, regret=matrix.REGRET)
-    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", matrix.TABLE, rows)
+    write_results("transfer", rows, results, facts, out, _IN_CSV, regret=_REGRET)
+    publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", _TABLE, rows)
     console.print(f"matrix: {out / 'transfer.csv'}")

@@ -19,7 +19,7 @@ from ballbot_train import jobs
 from ballbot_train.console import check_least, check_names, check_some, markdown, print_table, progress_bars
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
-from ballbot_train.evaluation.evaluate import iterate_episodes, shown_to
+from ballbot_train.evaluation.evaluate import run_episodes, shown_to
 from ballbot_train.evaluation.results import Result, columns
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
@@ -117,6 +117,20 @@ def publish(out: Path, name: str, title: str, shown: Mapping[str, Callable[[Any]
     print_table(title, header, table)
 
 
+def floor(robot: str, friction: float | None) -> BallbotParams:
+    """A robot by name on a floor with this friction; None is the robot's own.
+
+    Raises:
+        ValueError: a friction for a robot whose ball does not roll.
+    """
+    params = named_robot(robot)
+    if friction is None:
+        return params
+    if not params.rolls:
+        raise ValueError(f"the ball of {robot!r} does not roll, so its floor has no friction; give a rolling robot")
+    return replace(params, friction=friction)
+
+
 @dataclass(frozen=True)
 class Group:
     """One controller on the certified episodes of a task, in one world."""
@@ -127,9 +141,9 @@ class Group:
     robot: str = PAPER
     """Whose episodes they are, by name."""
     made_for: str | None = None
-    """Name of the robot that the controller is made for; default, `robot`."""
-    variant: BallbotParams | None = None
-    """A robot that runs in the place of `robot`; regret is over the optimum of `robot` then too."""
+    """Name of the robot that the controller is made for; default, `robot`. It plans and observes as for that one."""
+    friction: float | None = None
+    """Of the floor, as of `floor`; regret is over the optimum on the robot's own floor then too."""
     randomization: Randomization = Randomization()
     own_optima: bool = False
     """Whether regret is over the optimum of each episode's own robot, and not over the undisturbed one."""
@@ -230,15 +244,13 @@ def _episode_entries(
     record: bool,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
-    world: dict[str, Any] = {"randomization": group.randomization, "robot": group.variant or group.robot}
-    env = BallbotEnv(group.task, physics=group.physics, **world)
-    believed = env.task, env.params
-    if group.made_for is not None:
-        believed = make_task(group.task, group.made_for), named_robot(group.made_for)
+    robot, made_for = floor(group.robot, group.friction), group.made_for or group.robot
+    env = BallbotEnv(group.task, physics=group.physics, randomization=group.randomization, robot=robot)
+    believed = make_task(group.task, made_for), named_robot(made_for)
     made = registry.make_packed(group.controller, packed, *believed)
     env = shown_to(made, env)
     motions: list[recordings.Motion] = []
-    keep = motions.append if record else None
-    for result in iterate_episodes(env, made, group.controller, group.task, episodes, seed, known, keep):
-        yield columns(result) | ({"motion": recordings.to_text(motions.pop())} if record else {})
+    results = run_episodes(env, made, group.controller, group.task, episodes, seed, known, motions)
     env.close()
+    for result, motion in zip(results, motions, strict=True):
+        yield columns(result) | ({"motion": recordings.to_text(motion)} if record else {})

@@ -5,7 +5,7 @@ Importing this module is light: torch is imported for policy files, CasADi for e
 
 import math
 import numbers
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
 
@@ -130,14 +130,13 @@ def evaluate(
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), task_name(env.task)
         motions: list[recordings.Motion] = []
-        keep = None if out is None or env.params.wheels is not None else motions.append
-        results = list(iterate_episodes(env, controller, *named, indices, 0, known, keep))
+        results = run_episodes(env, controller, *named, indices, 0, known, motions)
         row = summarize(results)
         if out is not None:
             ran = {"physics": env.physics, "randomization": repr(env.randomization), "robot": repr(env.params)}
             facts = provenance() | ran
             write_leaderboard([row], results, facts, Path(out))
-            if keep is not None and not env.randomization.active:
+            if env.params.wheels is None and not env.randomization.active:
                 digest = policy_digest(str(policy), env.task, env.params) if isinstance(policy, str | Path) else ""
                 who = env.physics, named[0], digest
                 recordings.write_in(Path(out), motions, env.task, named[1], env.params, *who)
@@ -175,7 +174,14 @@ def task_name(task: Task) -> str:
 
 
 def run_episodes(
-    env: BallbotEnv, controller: Controller, name: str, task: str, episodes: Iterable[int], seed: int = 0
+    env: BallbotEnv,
+    controller: Controller,
+    name: str,
+    task: str,
+    episodes: Iterable[int],
+    seed: int = 0,
+    known: certified.EvaluationSet | None = None,
+    motions: list[recordings.Motion] | None = None,
 ) -> list[Result]:
     """Runs certified episodes under any controller; one that finds no plan has failed the episode.
 
@@ -186,30 +192,19 @@ def run_episodes(
         task: the task's name, in the results.
         episodes: their indices.
         seed: of what the env's randomization draws; no two seeds share what an episode draws.
+        known: the optima; default, those of the env's task, robot and randomization.
+        motions: gets what was done in each episode.
 
     Raises:
         PlanError: an episode has no optimum that can be found.
     """
-    indices = list(episodes)
-    known = optima.known(env.task, env.params, indices, randomization=env.randomization)
-    return list(iterate_episodes(env, controller, name, task, indices, seed, known))
-
-
-def iterate_episodes(
-    env: BallbotEnv,
-    controller: Controller,
-    name: str,
-    task: str,
-    episodes: Iterable[int],
-    seed: int,
-    episode_set: certified.EvaluationSet,
-    keep: Callable[[recordings.Motion], None] | None = None,
-) -> Iterator[Result]:
-    """As `run_episodes`, one by one, compared with the optima of any set; `keep` gets what was done in each."""
-    for i in episodes:
+    indices, results = list(episodes), []
+    if known is None:
+        known = optima.known(env.task, env.params, indices, randomization=env.randomization)
+    for i in indices:
         run = None
         try:
-            run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=episode_set.options(i))
+            run = rollout(env, controller, seed=seeding.of_episode(seed, i), options=known.options(i))
         except PlanError as error:
             measures: dict[str, Any] = UNMEASURED | {"cost": env.task.survival_pay, "note": str(error)}
             measures |= {"success": False, "failure": True}
@@ -225,6 +220,7 @@ def iterate_episodes(
                 "step_seconds": run.act_seconds,
                 "effort": float(np.hypot(*run.trajectory.u.T).mean()),
             }
-        if keep is not None:
-            keep(recordings.rounded(None if run is None else run.trajectory, env.params))
-        yield Result(task, name, i, env.physics, optimum=float(episode_set.costs[i]), **measures)
+        if motions is not None:
+            motions.append(recordings.rounded(None if run is None else run.trajectory, env.params))
+        results.append(Result(task, name, i, env.physics, optimum=float(known.costs[i]), **measures))
+    return results
