@@ -9,13 +9,16 @@ import json
 import re
 import shutil
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
+from ballbot_train.console import progress_bars
 from ballbot_train.executors import Workers, completed
 
 try:
@@ -167,7 +170,7 @@ def _lock(out: Path) -> None:
 
 
 def run(
-    jobs: Sequence[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None]
+    jobs: Sequence[Job], out: Path, workers: int | Workers, on_progress: Callable[[str, int], None] | None = None
 ) -> list[list[Entry]]:
     """Does what is not done yet. The calling process writes every result when it comes, whoever computed it.
 
@@ -176,7 +179,7 @@ def run(
         out: folder of the results, which the caller has claimed; unfinished ones are in a folder within.
         workers: a number of processes, or `Workers`. The calling process does no job itself, so that it outlives any of
             them; see `completed`.
-        on_progress: called with a job's group and a number of its items that are there.
+        on_progress: called with a job's group and a number of its items that are there; default, a bar for each group.
 
     Returns:
         The entries of each job, in the order of its items; every item has one.
@@ -186,19 +189,23 @@ def run(
         ValueError: there are no workers.
     """
     results: dict[int, list[Entry]] = {}
+    totals: Counter[str] = Counter()
+    for job in jobs:
+        totals[job.group] += len(job.items)
 
     def tasks() -> Iterator[Any]:
         for number, job in enumerate(jobs):
             if (done := _read(_path_of(out, job.name), len(job.items))) is None:
                 yield (number, job), _result, (job,)
             else:
-                on_progress(job.group, len(job.items))
+                advance(job.group, len(job.items))
                 results[number] = done
 
-    for (number, job), text in completed(tasks(), workers):
-        files.write(_path_of(out, job.name), text)
-        on_progress(job.group, len(job.items))
-        results[number] = json.loads(text)
+    with progress_bars(totals) if on_progress is None else nullcontext(on_progress) as advance:
+        for (number, job), text in completed(tasks(), workers):
+            files.write(_path_of(out, job.name), text)
+            advance(job.group, len(job.items))
+            results[number] = json.loads(text)
     return [results[i] for i in range(len(jobs))]
 
 

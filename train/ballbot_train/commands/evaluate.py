@@ -79,11 +79,9 @@ def evaluate(
         progress = partial(advance, "episodes")
         result = episodes.evaluate_fresh(policy, task, fresh, seed, None, progress, robot, varied)
     if optima:
-        with progress_bars({task: optima}) as advance:
-            track = f"-{track_of(varied)}" if varied.moves_optima else ""
-            folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
-            found = episodes.find_optima(task, optima, seed, folder, workers, advance, robot, varied)
-        result = replace(result, optima=found)
+        track = f"-{track_of(varied)}" if varied.moves_optima else ""
+        folder = out.parent / "optima" / f"{file_name(task, robot)}{track}-{seed}"
+        result = replace(result, optima=episodes.find_optima(task, optima, seed, folder, workers, robot, varied))
     worst = _worst(result, policy, task, out / "worst", robot, varied)
     episodes.write(result, worst, facts, out)
     _print(result, worst)

@@ -20,7 +20,6 @@ from ballbot_gym.env import BallbotEnv, make_task
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import PlanError, rollout
 from ballbot_train import jobs
-from ballbot_train.console import progress_bars
 from ballbot_train.evaluation.controllers import make_packed, packed
 from ballbot_train.executors import Workers
 
@@ -76,13 +75,9 @@ def run(
         robot: by name.
     """
     search = [jobs.Job(f"boundary-{name}", _boundary, (robot,), (name,), "boundary") for name in AXES]
-    with progress_bars({"boundary": len(AXES)}) as advance:
-        found = jobs.run(search, out, workers, advance)
+    found = jobs.run(search, out, workers)
     bounds = {name: np.array(entry["boundary"]) for name, (entry,) in zip(AXES, found, strict=True)}
-    work = cell_jobs(bounds, controllers, points, physics, robot)
-    totals = {name: sum(len(job.items) for job in work if job.group == name) for name in controllers}
-    with progress_bars(totals) as advance:
-        done = jobs.run(work, out, workers, advance)
+    done = jobs.run(cell_jobs(bounds, controllers, points, physics, robot), out, workers)
     return maps_of(bounds, (entry for entries in done for entry in entries), controllers, points)
 
 

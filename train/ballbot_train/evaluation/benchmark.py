@@ -16,7 +16,7 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
-from ballbot_train.console import check_least, check_names, check_some, markdown, print_table, progress_bars
+from ballbot_train.console import check_least, check_names, check_some, markdown, print_table
 from ballbot_train.evaluation import controllers as registry
 from ballbot_train.evaluation import optima, recordings
 from ballbot_train.evaluation.evaluate import run_episodes, shown_to
@@ -178,9 +178,6 @@ def run_groups(
         seed: of whatever is drawn: episode i draws the same in every group.
         record: whether to write what the controllers do, for `ballbot submit`.
     """
-    totals: Counter[str] = Counter()
-    for group in groups:
-        totals[group.counts_for or group.task] += episodes
     parts = [range(start, min(start + CHUNK, episodes)) for start in range(0, episodes, CHUNK)]
     # the optima go along, because workers on other machines do not have this user's cache
     known = {
@@ -202,9 +199,7 @@ def run_groups(
         for group in groups
         for part in parts
     ]
-    with progress_bars(totals) as advance:
-        done = iter(jobs.run(work, out, workers, advance))
-    results = []
+    done, results = iter(jobs.run(work, out, workers)), []
     for group in groups:
         entries = [entry for _ in parts for entry in next(done)]
         if record:

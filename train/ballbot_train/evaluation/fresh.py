@@ -384,7 +384,6 @@ def find_optima(
     seed: int,
     out: Path,
     workers: int | Workers,
-    on_progress: Callable[[str, int], None],
     robot: str = PAPER,
     randomization: Randomization = Randomization(),
 ) -> np.ndarray:
@@ -396,7 +395,6 @@ def find_optima(
         seed: of the episodes.
         out: folder in which the optima stay, so that a later call finds only those that are missing.
         workers: a number of processes, or `Workers`.
-        on_progress: called with the task's name and a number of optima that are there.
         robot: by name.
         randomization: what the robot and the delay of each episode are drawn from.
     """
@@ -408,7 +406,7 @@ def find_optima(
             for start in range(0, episodes, _CHUNK)
             for items in [tuple(range(start, min(start + _CHUNK, episodes)))]
         ]
-        done = jobs.run(work, out, workers, on_progress)
+        done = jobs.run(work, out, workers)
     finally:
         jobs.unlock(out)
     return np.array([entry.get("cost", math.nan) for entries in done for entry in entries])
