@@ -35,7 +35,6 @@ from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
 from ballbot_train.policy import PolicyController, PolicyNetwork
-from ballbot_train.weights import own_precision
 
 try:
     import torch
@@ -128,8 +127,6 @@ class FreshResult:
         success_low, success_high = share_interval(success, n)
         failures_low, failures_high = share_interval(failures, n)
         kinds = [name.partition(" ")[0] for name in self.violated if name]  # "obstacle 3" is an obstacle
-        costs = dict(zip(("mean", "median", "p99", "worst"), _spread(self.costs), strict=True))
-        regrets = dict(zip(("mean", "median", "p99", "worst"), _spread(self.regrets), strict=True))
         return Summary(
             episodes=n,
             success=success / n,
@@ -140,9 +137,9 @@ class FreshResult:
             failures_per_10000_low=1e4 * failures_low,
             failures_per_10000_high=1e4 * failures_high,
             failed_by={kind: kinds.count(kind) for kind in sorted(set(kinds))},
-            **{f"cost_{name}": value for name, value in costs.items()},
+            **_spread("cost", self.costs),
             optima=int(np.isfinite(self.optima).sum()),
-            **{f"regret_{name}": value for name, value in regrets.items()},
+            **_spread("regret", self.regrets),
         )
 
     def bins(self) -> list[dict[str, Any]]:
@@ -182,11 +179,12 @@ class FreshResult:
         }
 
 
-def _spread(values: np.ndarray) -> tuple[float, float, float, float]:
-    """Mean, median, 99th percentile and largest; NaN where there is no value."""
+def _spread(name: str, values: np.ndarray) -> dict[str, float]:
+    """Mean, median, 99th percentile and largest under their names in a Summary; nothing where there is no value."""
     if not len(values):
-        return math.nan, math.nan, math.nan, math.nan
-    return float(values.mean()), float(np.median(values)), float(np.percentile(values, 99)), float(values.max())
+        return {}
+    of = {"mean": values.mean(), "median": np.median(values), "p99": np.percentile(values, 99), "worst": values.max()}
+    return {f"{name}_{key}": float(value) for key, value in of.items()}
 
 
 def priced(costs: np.ndarray, success: np.ndarray, task: Task) -> np.ndarray:
@@ -265,13 +263,7 @@ def as_batch_policy(policy: Any, batch: BallbotBatch, robot: str = PAPER) -> Bat
         controller = _controller(str(policy), batch.task, robot)
         if not isinstance(controller, PolicyController):
             return _behind_filter(controller, batch)
-        network = controller.network
-
-        def act(observation: torch.Tensor) -> torch.Tensor:
-            with own_precision():
-                return network(observation.float())
-
-        return act
+        policy = controller
     if callable(getattr(policy, "predict", None)):
         predictor = Predictor(policy, batch.task, named_robot(robot))
         begins = itertools.chain([True], itertools.repeat(False))

@@ -25,7 +25,7 @@ from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.robots import PAPER
 from ballbot_train.evaluation import optima
 from ballbot_train.evaluation.benchmark import Group
-from ballbot_train.evaluation.results import Result, Row, shown, summarize
+from ballbot_train.evaluation.results import Result, Row, leaderboard, shown
 from ballbot_train.policy_files import track_in
 
 
@@ -148,24 +148,22 @@ def track_rows(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> 
     which neither fails; "controller_loses", the regret beyond that in the same episodes. The best controller is, of those
     that succeed most often, the one of least mean regret.
     """
-    groups: dict[tuple[str, str], dict[str, list[Result]]] = {}
+    regrets: dict[tuple[str, str, str], dict[int, float]] = {}
     for result in results:
-        groups.setdefault((result.told["stress"], result.task), {}).setdefault(result.controller, []).append(result)
-    rows = []
-    for (track, task), group in groups.items():
-        plain = {name: summarize(done, seed) for name, done in group.items()}
-        mean = {name: row.regret_mean if math.isfinite(row.regret_mean) else math.inf for name, row in plain.items()}
-        best = min(plain, key=lambda name: (-plain[name].success, mean[name]))
-        episodes = [result.episode for result in group[best]]
-        known = optima.known(make_task(task, robot), robot, episodes, randomization=TRACKS[track])
-        delay = float(np.mean(1 - known.ideal[episodes] / known.costs[episodes]))
-        of_best = {result.episode: result.regret for result in group[best]}
-        for name, done in group.items():
-            pairs = np.array([(of_best[result.episode], result.regret) for result in done])
-            pairs = pairs[np.isfinite(pairs).all(axis=1)]
-            unknown, own = pairs.mean(axis=0).tolist() if len(pairs) else (math.nan, math.nan)
-            costs = {"delay_costs": delay, "not_knowing_costs": unknown, "controller_loses": own - unknown}
-            rows.append(replace(plain[name], told={"track": track, **costs, "best": best}))
+        regrets.setdefault((result.told["stress"], result.task, result.controller), {})[result.episode] = result.regret
+    plain, rows = leaderboard(results, "stress", seed=seed), []
+    for row in plain:
+        track, task = row.told["stress"], row.task
+        rivals = [other for other in plain if (other.told["stress"], other.task) == (track, task)]
+        best = min(rivals, key=lambda other: (-other.success, np.nan_to_num(other.regret_mean, nan=np.inf))).controller
+        own, of_best = (regrets[track, task, name] for name in (row.controller, best))
+        known = optima.known(make_task(task, robot), robot, own, randomization=TRACKS[track])
+        delay = float(np.mean(1 - known.ideal[[*own]] / known.costs[[*own]]))
+        pairs = np.array([(of_best[episode], regret) for episode, regret in own.items()])
+        pairs = pairs[np.isfinite(pairs).all(axis=1)]
+        unknown, lost = pairs.mean(axis=0).tolist() if len(pairs) else (math.nan, math.nan)
+        costs = {"delay_costs": delay, "not_knowing_costs": unknown, "controller_loses": lost - unknown}
+        rows.append(replace(row, told={"track": track, **costs, "best": best}))
     return rows
 
 
