@@ -3,8 +3,9 @@
 Importing this module is light: CasADi is imported when an optimum is computed.
 """
 
+import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
 import numpy as np
@@ -30,7 +31,6 @@ except ModuleNotFoundError as error:
 
 
 _TASKS = 32  # at least, so that many workers have something to do
-_Solver = Callable[[Task, Sequence[int]], Iterator[jobs.Entry]]
 
 
 def known(
@@ -53,11 +53,8 @@ def known(
         PlanError: an episode has no optimum that can be found.
         ValueError: no task or robot of that name, or no optimum is known under such a randomization.
     """
-    task, params, needed = (
-        make_task(task, robot),
-        checked_robot(robot),
-        range(certified.EPISODES) if episodes is None else list(episodes),
-    )
+    task, params = make_task(task, robot), checked_robot(robot)
+    needed = range(certified.EPISODES) if episodes is None else list(episodes)
     try:
         return certified.load(task, params, episodes=needed, randomization=randomization)
     except certified.CertificateError:
@@ -106,10 +103,14 @@ def compute(
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
         with progress_bars({name: len(missing)}) as advance:
-            from ballbot_baselines.certification import entries
+            from ballbot_baselines.certification import AT_ONCE, entries
 
-            solve = partial(entries, robot=params, randomization=randomization)
-            for entry in solve(task, missing) if workers is None else _elsewhere(workers, solve, task, missing):
+            solve = partial(entries, task, robot=params, randomization=randomization)
+            each = min(AT_ONCE, -(-len(missing) // _TASKS))
+            parts = (missing[k : k + each] for k in range(0, len(missing), each))
+            work = ((part, _solved, (solve, part)) for part in parts)
+            solved = [solve(missing)] if workers is None else (entries for _, entries in completed(work, workers))
+            for entry in itertools.chain.from_iterable(solved):
                 advance(name, 1)
                 if "error" in entry:
                     failures.append(f"episode {entry['episode']}: {entry['error']}")
@@ -156,15 +157,5 @@ def _missing(task: Task, params: BallbotParams, episodes: list[int], randomizati
     return [index for index in episodes if index not in found]
 
 
-def _elsewhere(workers: int | Workers, solve: _Solver, task: Task, missing: list[int]) -> Iterator[jobs.Entry]:
-    """In other processes, in the order in which they finish."""
-    from ballbot_baselines.certification import AT_ONCE
-
-    each = min(AT_ONCE, -(-len(missing) // _TASKS))
-    parts = (missing[k : k + each] for k in range(0, len(missing), each))
-    for _, entries in completed(((part, _solved, (solve, task, part)) for part in parts), workers):
-        yield from entries
-
-
-def _solved(solve: _Solver, task: Task, part: list[int]) -> list[jobs.Entry]:
-    return list(solve(task, part))
+def _solved(solve: Callable[[list[int]], Iterator[jobs.Entry]], part: list[int]) -> list[jobs.Entry]:
+    return list(solve(part))
