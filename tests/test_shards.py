@@ -1,6 +1,7 @@
 """Data sets as shards hold what one file would hold, survive a kill, and are read one shard at a time."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import fsspec
@@ -21,20 +22,15 @@ CONFIG = DemoConfig("turn", "lqr", episodes=7, physics="rk4")
 
 
 def numbered(log, numbers):
-    for i in numbers:
-        with open(log, "a") as file:
-            file.write(f"{i}\n")
-        yield {"i": i}
-
-
-def arrays_of(entries):
-    return {"i": np.array([entry["i"] for entry in entries])}
+    with open(log, "a") as file:
+        file.writelines(f"{i}\n" for i in numbers)
+    return {"i": np.array(numbers)}
 
 
 def made(url, out, episodes, about=None, on_progress=lambda count: None):
     about = {"seed": 1} if about is None else about
     log = str(out.parent / "log")
-    return shards.make(url, about, episodes, numbered, (log,), arrays_of, out, 1, on_progress, per_shard=7)
+    return shards.make(url, about, episodes, partial(numbered, log), out, 1, on_progress, per_shard=7)
 
 
 @pytest.mark.parametrize("where", ["folder", "memory"])

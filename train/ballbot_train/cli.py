@@ -64,9 +64,7 @@ def _run(arguments: list[str]) -> int:
         hint = "" if "pip install" in str(error) else f"; the commands need {install('train')}"
         errors.print(f"ballbot: {error}{hint}", style="red")
         return 1
-    except (ValueError, TypeError, ImportError, OSError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and not _is_expected(error):
-            raise
+    except (ValueError, TypeError, ImportError, OSError, *_expected()) as error:
         errors.print(f"ballbot: {error}", style="red")
         return 1
     return 0
@@ -120,11 +118,12 @@ def _again(command: str, options: list[str]) -> str:
     return f"{does}:\n{shlex.join([*program, command, *options])}"
 
 
-def _is_expected(error: RuntimeError) -> bool:
+def _expected() -> tuple[type[RuntimeError], ...]:
+    """The other errors that a user can cause. An `except` asks for them when there is an error."""
     from ballbot_gym.rollout import PlanError
     from ballbot_train.executors import WorkerError
 
-    return isinstance(error, PlanError | WorkerError)
+    return PlanError, WorkerError
 
 
 def _print_help() -> None:

@@ -13,7 +13,7 @@ killed makes those that it does not name. A reader holds one shard in memory, an
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -168,9 +168,7 @@ def make(
     url: str,
     about: Mapping[str, Any],
     episodes: int,
-    function: Callable[..., Iterator[jobs.Entry]],
-    arguments: tuple[Any, ...],
-    arrays_of: Callable[[Sequence[jobs.Entry]], Arrays],
+    function: Callable[[range], Arrays],
     out: Path,
     workers: int | Workers,
     on_progress: Callable[[int], None],
@@ -182,9 +180,8 @@ def make(
         url: of the set.
         about: what decides the episodes besides their numbers; anything that JSON holds.
         episodes: how many, from number 0.
-        function: called as function(*arguments, numbers) on a worker; yields an entry for every episode.
-        arguments: of the function.
-        arrays_of: gives the arrays of some episodes by name, or none, on the worker. They are joined along their first axis.
+        function: of a module, or a partial of one. On a worker it gives the arrays of episodes of these numbers by name, or
+            none. They are joined along their first axis.
         out: folder of this machine for what is unfinished, by which a killed run continues.
         workers: a number of processes, or `Workers`.
         on_progress: called with a number of episodes that are there.
@@ -216,7 +213,7 @@ def make(
                 if path.exists():
                     on_progress(len(part))
                 else:
-                    yield part, _made, (function, arguments, arrays_of, part)
+                    yield part, function, (part,)
             join(shard)  # a killed run may have had all of it
 
     def join(shard: int) -> None:
@@ -236,13 +233,3 @@ def make(
         join(part.start // per_shard)
     jobs.release(out, "set.json")
     return shards
-
-
-def _made(
-    function: Callable[..., Iterator[jobs.Entry]],
-    arguments: tuple[Any, ...],
-    arrays_of: Callable[[Sequence[jobs.Entry]], Arrays],
-    part: range,
-) -> Arrays:
-    """The arrays of some episodes, on a worker."""
-    return arrays_of(list(function(*arguments, part)))

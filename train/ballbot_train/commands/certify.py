@@ -3,6 +3,8 @@
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from ballbot_baselines import certification
 from ballbot_gym import certified
 from ballbot_gym.env import make_task
@@ -82,16 +84,18 @@ def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, 
     settings = robot_setting(robot)
     with progress_bars(dict.fromkeys(tasks, episodes)) as advance:
         for name in tasks:
-            task, params = make_task(name, robot), named_robot(robot)
             made = make(
                 f"{url.rstrip('/')}/{name}",
-                {"certified": task.problem(), "version": provenance()["version"], **settings},
+                {"certified": make_task(name, robot).problem(), "version": provenance()["version"], **settings},
                 episodes,
-                partial(certification.entries, robot=robot),
-                (name,),
-                partial(certification.arrays, task=task, params=params),
+                partial(_optima, name, robot),
                 out / name,
                 workers,
                 partial(advance, name),
             )
             console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")
+
+
+def _optima(task: str, robot: str, episodes: range) -> dict[str, np.ndarray]:
+    found = list(certification.entries(task, episodes, robot))
+    return certification.arrays(found, make_task(task, robot), named_robot(robot))

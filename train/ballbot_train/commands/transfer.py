@@ -1,4 +1,8 @@
-"""`ballbot transfer`: controllers made for one robot, run on another, in one physics engine or in several."""
+"""`ballbot transfer`: controllers made for one robot, run on another, in one physics engine or in several.
+
+A controller plans and observes as for its own robot. Its cost is compared with the optimum of the robot that it runs on, on
+that robot's own floor, on other floors too.
+"""
 
 from collections.abc import Callable
 from pathlib import Path

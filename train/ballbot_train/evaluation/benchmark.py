@@ -239,7 +239,8 @@ def _episode_entries(
     record: bool,
     episodes: Sequence[int],
 ) -> Iterator[jobs.Entry]:
-    robot, made_for = floor(group.robot, group.friction), group.made_for or group.robot
+    robot = group.robot if group.friction is None else floor(group.robot, group.friction)
+    made_for = group.made_for or group.robot
     env = BallbotEnv(group.task, physics=group.physics, randomization=group.randomization, robot=robot)
     believed = make_task(group.task, made_for), named_robot(made_for)
     made = registry.make_packed(group.controller, packed, *believed)

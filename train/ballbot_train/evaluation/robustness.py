@@ -85,7 +85,6 @@ REGRET = "regret over the undisturbed optimum, %"
 NONE = "none"
 """The name of no disturbance, severity 0 of every stress."""
 
-
 EXPERTS = {
     "unknown": ("cautious", "nmpc-adaptive"),
     "late": ("nmpc-adaptive",),

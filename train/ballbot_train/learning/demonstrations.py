@@ -26,6 +26,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -277,14 +278,12 @@ def write_shards(
     described = asdict(config)
     del described["episodes"]
     about = {"demos": described, "task": repr(make_task(config.task)), "observation_version": OBSERVATION_VERSION}
-    return shards.make(
-        url, about, config.episodes, _record_episodes, (config,), _arrays_of, out, workers, on_progress, per_shard
-    )
+    return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, on_progress, per_shard)
 
 
-def _arrays_of(entries: Sequence[jobs.Entry]) -> dict[str, np.ndarray]:
+def _recorded(config: DemoConfig, episodes: range) -> dict[str, np.ndarray]:
     """Episodes as arrays of a shard: those of their recordings, one after another, with lengths and metadata (JSON)."""
-    made = [entry for entry in entries if "note" not in entry]
+    made = [entry for entry in _record_episodes(config, episodes) if "note" not in entry]
     recorded: list[Recording] = [entry.pop(_RECORDING) for entry in made]
     if not recorded:
         return {}
