@@ -15,7 +15,7 @@ from typing import Any
 try:
     from rich.table import Table
 
-    from ballbot_train.escaping import PlainConsole
+    from ballbot_train.console import PlainConsole
 except ModuleNotFoundError as error:
     from ballbot_gym.lazy import missing
 

@@ -1,18 +1,20 @@
-"""What every command shares: the console, its progress bars and tables, and checks of what was typed."""
+"""What every command shares: the console, its progress bars and tables, and checks of what was typed.
+
+Names and messages that come from files are data, and stay text in a terminal and in Markdown. The templates of the report
+escape HTML, `files.write_csv` what a spreadsheet takes for a formula.
+"""
 
 import sys
 import threading
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any, Literal, cast
 
-from ballbot_gym.engines import check_installed, default_physics
-from ballbot_gym.lazy import missing
-from ballbot_gym.robots import PAPER, named_robot
-
 try:
+    from rich.console import Console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -25,9 +27,9 @@ try:
     )
     from rich.table import Table
     from rich.text import Text
-
-    from ballbot_train.escaping import PlainConsole, markdown_text, printable
 except ModuleNotFoundError as error:
+    from ballbot_gym.lazy import missing  # which brings NumPy along: `ballbot --help` needs none
+
     raise missing(__name__, error.name) from error
 
 Physics = Literal["bullet", "mujoco", "rk4"]
@@ -35,6 +37,32 @@ Physics = Literal["bullet", "mujoco", "rk4"]
 
 RobotName = str
 """What options called --robot take: names in `ROBOTS`, among them those that the command line registers first."""
+
+_MARKDOWN = str.maketrans({sign: f"&#{ord(sign)};" for sign in "&<>|{}`\\*"} | {"\n": " ", "\r": " "})
+
+
+def printable(text: str) -> str:
+    """Text without control characters, which could rewrite the screen or turn the writing around; they are spelt out."""
+    return "".join(
+        sign if sign in "\n\t" or unicodedata.category(sign) not in ("Cc", "Cf", "Cs") else ascii(sign)[1:-1]
+        for sign in text
+    )
+
+
+def markdown_text(text: str) -> str:
+    """Text as Markdown shows it in a table or a line: no markup, link, HTML or expression of MDX."""
+    return printable(text.translate(_MARKDOWN)).replace("](", "]&#40;")
+
+
+class PlainConsole(Console):
+    """A console that prints text as it is: no markup, no emoji, no control characters."""
+
+    def __init__(self, **options: Any):
+        super().__init__(markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text), **options)
+
 
 # A file or pipe has no width of its own: give it one that holds the widest table.
 # Notebooks get lines of text as well: their bars need widgets.
@@ -86,12 +114,15 @@ class LineProgress(Progress):
                     )
 
 
-def physics_or_default(physics: Physics | None, robot: str = PAPER) -> Physics:
+def physics_or_default(physics: Physics | None, robot: str = "paper") -> Physics:
     """The physics that was typed; else the default of a robot where nothing is typed, with a line if it needs one.
 
     Raises:
         ImportError: it is not installed; the message says how to get it.
     """
+    from ballbot_gym.engines import check_installed, default_physics
+    from ballbot_gym.robots import named_robot
+
     if physics is not None:
         check_installed(physics)
         return physics

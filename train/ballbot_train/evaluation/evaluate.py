@@ -128,7 +128,7 @@ def evaluate(
         controller = as_controller(policy, env.task, env.params)
         env = shown_to(controller, env)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
-        named = name or _name(policy), task_name(env.task)
+        named = name or _name(policy), name_of(env.task) or type(env.task).__name__.lower()
         motions: list[recordings.Motion] = []
         results = run_episodes(env, controller, *named, indices, 0, known, motions)
         row = summarize(results)
@@ -166,11 +166,6 @@ def _name(policy: Any) -> str:
     if isinstance(policy, str | Path):
         return Path(policy).name
     return getattr(policy, "__name__", type(policy).__name__.lower())
-
-
-def task_name(task: Task) -> str:
-    """The task's name in `TASKS`, or its class's."""
-    return name_of(task) or type(task).__name__.lower()
 
 
 def run_episodes(

@@ -189,21 +189,11 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[Result]]:
     path = path / "leaderboard.json" if path.is_dir() else path
     try:
         document = files.read_json(path)
-        return dict(document["about"]), [_checked(_from_json(entry)) for entry in document["episodes"]]
+        return dict(document["about"]), [_from_json(entry) for entry in document["episodes"]]
     except files.FileError as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{path} holds no episodes of a benchmark: {error!r}") from error
-
-
-def _checked(result: Result) -> Result:
-    """The result, unless its costs make no sense."""
-    if not (math.isfinite(result.cost) and 0 < result.optimum < math.inf):
-        raise ValueError(
-            f"episode {result.episode} of {result.controller} on {result.task} has the cost {result.cost} and the optimum "
-            f"{result.optimum}"
-        )
-    return result
 
 
 def _from_json(entry: Mapping[str, Any]) -> Result:
@@ -214,7 +204,13 @@ def _from_json(entry: Mapping[str, Any]) -> Result:
         if not fits or (isinstance(value, bool) and kind is not bool):
             raise TypeError(f"{each.name} of an episode is {value!r:.200}")
         values[each.name] = kind(value)  # a whole number that no float holds is an OverflowError
-    return Result(**values)
+    result = Result(**values)
+    if not (math.isfinite(result.cost) and 0 < result.optimum < math.inf):
+        raise ValueError(
+            f"episode {result.episode} of {result.controller} on {result.task} has the cost {result.cost} and the optimum "
+            f"{result.optimum}"
+        )
+    return result
 
 
 def to_json(document: Mapping[str, Any]) -> str:

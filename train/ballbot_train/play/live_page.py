@@ -16,7 +16,7 @@ from ballbot_gym.drawing import PUSH_SCALE
 from ballbot_gym.robots import without_wheels
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
-from ballbot_train.escaping import markdown_text
+from ballbot_train.console import markdown_text
 from ballbot_train.evaluation.robustness import STRESSES
 from ballbot_train.play.simulation import LARGEST_PUSH, PLANT, Playground
 from ballbot_train.report import labels

@@ -22,7 +22,7 @@ from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.symmetry import FRAMES, REACH
-from ballbot_train.escaping import printable
+from ballbot_train.console import printable
 from ballbot_train.onnx_export import metadata
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network
 from ballbot_train.policy_files import PolicyError, PolicySpec
