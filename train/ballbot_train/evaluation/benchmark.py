@@ -203,7 +203,10 @@ def run_groups(
     for group in groups:
         entries = [entry for _ in parts for entry in next(done)]
         if record:
-            _write_recording(group, [recordings.from_text(entry.pop("motion")) for entry in entries], out)
+            motions = [recordings.from_text(entry.pop("motion")) for entry in entries]
+            task, params = make_task(group.task, group.robot), named_robot(group.robot)
+            who = group.physics, group.controller, registry.policy_digest(group.controller, task, group.robot)
+            recordings.write_in(out, motions, task, group.task, params, *who)
         results += [Result(**entry, told=group.told) for entry in entries]
     return results
 
@@ -223,12 +226,6 @@ def benchmark(
     """
     groups = [Group(task, name, physics, robot) for task, names in controllers.items() for name in names]
     return run_groups(groups, episodes, out, workers, seed, record=named_robot(robot).wheels is None)
-
-
-def _write_recording(group: Group, motions: Sequence[recordings.Motion], out: Path) -> None:
-    task, params = make_task(group.task, group.robot), named_robot(group.robot)
-    digest = registry.policy_digest(group.controller, task, group.robot)
-    recordings.write_in(out, motions, task, group.task, params, group.physics, group.controller, digest)
 
 
 def _episode_entries(
