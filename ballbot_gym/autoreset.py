@@ -1,14 +1,17 @@
 """What vector envs do where episodes end: a step of a `BallbotBatch` in each of Gymnasium's modes, and what infos say."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 
 from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep, tilt_of
+from ballbot_gym.checks import check_finite
 
 # isort: split
 import torch  # after our modules, whose errors name the extra that brings it
+
+_NOTHING_DONE = ("reward", "cost", "terminated", "truncated", "success", "failure", "force", "clipped", "grip")
+"""Fields of a `BatchStep` that are 0 of an env that waits."""
 
 
 class StepInfo(NamedTuple):
@@ -36,59 +39,99 @@ class StepInfo(NamedTuple):
     """(nc, B) constants."""
     grip: np.ndarray
     """(4, B), as of `BatchStep`; (0, B) where friction is unlimited."""
-    drawn: np.ndarray = np.zeros((0, 0))
+    drawn: np.ndarray
     """(6 or 14, B), as of `BatchState`; (0, B) where nothing is drawn."""
 
 
-def advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None, restart: bool) -> BatchStep:
-    """One control step of a batch.
+class VectorStep(NamedTuple):
+    """The result of one control step of B environments, in NumPy arrays; as of `BatchStep`."""
+
+    observation: np.ndarray
+    """(B, no) float32."""
+    reward: np.ndarray
+    """(B,) float64."""
+    terminated: np.ndarray
+    """(B,) bool."""
+    truncated: np.ndarray
+    """(B,) bool."""
+    ended: np.ndarray
+    """(n,) indices of the envs whose episode ended."""
+    final_observation: np.ndarray
+    """(n, no) float32, what these saw at its end."""
+    now: StepInfo
+    """Of the envs now."""
+    end: StepInfo
+    """Of the step even where its end began a new episode; else as `now`."""
+
+
+def step(batch: BallbotBatch, actions: np.ndarray, waiting: np.ndarray | None) -> VectorStep:
+    """One control step of a batch, with NumPy arrays in and out.
 
     Args:
-        batch: which goes on.
+        batch: which goes on. Where its `restarts` holds, episodes that end are followed by the next ones at once. Else the
+            envs stay at their ends.
         actions: (B, 2).
         waiting: (B,) bool, the envs that ignore their action and begin their next episode; None where there are none.
-        restart: whether episodes that end are followed by the next ones at once. Else the batch stays at their ends, and
-            `observation` and `tilt` are those of the end.
+
+    Raises:
+        ValueError: an action is not finite; the envs stay as they are.
+        gymnasium.error.ResetNeeded: before the first reset.
     """
-    if batch.state is None:
-        raise gymnasium.error.ResetNeeded("step() before reset()")
-    wait = None if waiting is None else torch.from_numpy(waiting).to(batch.device)
-    if wait is not None:
-        batch.state = batch.initial_state(None, wait)
-    before = batch.state
+    check_finite(actions)
+    actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
+    before: Any = batch.state
+    with torch.no_grad():
+        result: Any = _advance(batch, torch.from_numpy(actions).to(batch.device), waiting)
+    result = result._make(map(as_array, result))
+    reward, cost = (part.astype(np.float64, copy=False) for part in (result.reward, result.cost))
+    ended = (result.terminated | result.truncated).nonzero()[0]
+    parts, survive = np.empty((3, batch.num_envs)), batch.task.survival_reward * batch.task.control_dt
+    parts[0], parts[2] = survive, 0.0
+    np.negative(cost, out=parts[1])
+    if waiting is not None:
+        parts[:, waiting] = 0.0
+    if ended.size:
+        failed = np.flatnonzero(result.violated >= 0)
+        parts[1, failed] = reward[failed] - survive  # the cost has a failure's price too
+        if batch.task.first_exit:
+            parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * result.success[ended]
+    x, c, drawn = started(batch.state)
+    flags = result.success, result.violated >= 0, result.violated, result.clipped
+    end = now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip, drawn)
+    if batch.restarts and ended.size:
+        _, c, drawn = started(before)
+        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=c, drawn=drawn)
+        now = _begun(now, ended)
+    seen, last = (part.astype(np.float32, copy=False) for part in (result.observation, result.final_observation))
+    return VectorStep(seen, reward, result.terminated, result.truncated, ended, last[ended], now, end)
+
+
+def _advance(batch: BallbotBatch, actions: torch.Tensor, waiting: np.ndarray | None) -> BatchStep:
+    if waiting is None:
+        return batch.step(actions)
+    wait = torch.from_numpy(waiting).to(batch.device)
+    batch.state = begun = batch.initial_state(None, wait)
     result = batch.step(actions)
-    after = batch.state
-    if restart or after is None:
-        return result
-    ended = result.terminated | result.truncated
-    if wait is not None:
-        ended = ended & ~wait
-        no = ~wait
-        result = result._replace(
-            reward=result.reward * no,
-            cost=result.cost * no,
-            terminated=result.terminated & no,
-            truncated=result.truncated & no,
-            success=result.success & no,
-            failure=result.failure & no,
-            violated=torch.where(wait, -1, result.violated),
-            force=result.force * no,
-            clipped=result.clipped & no,
-            grip=torch.where(no, result.grip, 0.0),
-        )
-    held = ended if wait is None else ended | wait
-    if not held.any():
-        return result
-    x = torch.where(ended, result.final_x, before.x)
-    old = before._replace(x=x, steps=before.steps + ended)
-    batch.state = BatchState(*(torch.where(held, a, b) for a, b in zip(old, after, strict=True)))
-    observation = torch.where(ended[:, None], result.final_observation, result.observation)
-    if wait is not None:
-        observation = torch.where(wait[:, None], batch.observe(batch.state), observation)
-    return result._replace(observation=observation, tilt=tilt_of(batch.state.x.unbind(0)))
+    batch.state = BatchState(*(torch.where(wait, a, b) for a, b in zip(begun, batch.state, strict=True)))
+    return result._replace(
+        **{name: getattr(result, name).masked_fill(wait, 0) for name in _NOTHING_DONE},
+        violated=result.violated.masked_fill(wait, -1),
+        observation=torch.where(wait[:, None], batch.observe(batch.state), result.observation),
+        tilt=tilt_of(batch.state.x.unbind(0)),
+    )
 
 
-def begun(now: StepInfo, which: np.ndarray) -> StepInfo:
+def started(state: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States, constants and draws of a `BatchState`, whatever its arrays are."""
+    return as_array(state.x), as_array(state.c), as_array(state.drawn)
+
+
+def as_array(part: Any) -> np.ndarray:
+    """A tensor, or an array, as an array."""
+    return part if isinstance(part, np.ndarray) else part.cpu().numpy()
+
+
+def _begun(now: StepInfo, which: np.ndarray) -> StepInfo:
     """What infos say where episodes have begun in place of ended ones, as after `reset`."""
     cleared = ("cost", "reward_parts", "force", "success", "failure", "clipped", "grip")
     return now._replace(**{name: _without(getattr(now, name), which) for name in cleared})

@@ -192,6 +192,7 @@ class BallbotBatch:
         self.num_envs, self.device, self.dtype = int(num_envs), torch.device(device), dtype
         self.state: BatchState | None = None
         self.most_steps = self.task.steps  # fewer truncate episodes sooner; neither pay nor goal changes
+        self.restarts = True  # else envs stay at the ends of their episodes
         for name in ModelNumbers._fields:
             getattr(self.params, name)  # computed and kept, before torch.compile meets a lock there
         self._substeps = dynamics.substeps_for(self.task.control_dt)
@@ -398,7 +399,7 @@ class BallbotBatch:
         new, observed = after, self._observe(after)
         observation = observed
         # Drawing the next episodes takes as long as the dynamics. Compiled code has no branches that depend on numbers.
-        if torch.compiler.is_compiling() or bool(done.any()):
+        if self.restarts and (torch.compiler.is_compiling() or bool(done.any())):
             new = _select(done, self._start(state.seed, state.episode + 1), after)
             observation = self._observe(new)
         result = BatchStep(

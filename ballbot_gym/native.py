@@ -17,8 +17,8 @@ import gymnasium
 import numpy as np
 
 from ballbot_gym import codegen, machine_code
-from ballbot_gym.autoreset import StepInfo
-from ballbot_gym.batch import BallbotBatch, BatchState, BatchStep
+from ballbot_gym.autoreset import StepInfo, VectorStep, step
+from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
@@ -84,7 +84,7 @@ class BallbotNative:
         self.num_envs, self.dtype, self.task, self.params = check_num_envs(num_envs), dtype, task, params
         self.randomization, self.history, self.threads = Randomization(), 0, threads
         self.observation = "state"
-        self.most_steps = task.steps
+        self.most_steps, self.restarts = task.steps, True
         self._state: State = None
         self._code = _checked_code(task, params, dtype is np.float64) if code is None else code
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
@@ -137,12 +137,14 @@ class BallbotNative:
         which = self._all if old is None or mask is None else np.flatnonzero(mask)
         state.episode[which] += old is not None
         if seed is not None:
-            given = np.array([-1 if number is None else number for number in seeds_of(seed, self.num_envs)])
-            seeded = which[given[which] >= 0]
-            state.seed[seeded], state.episode[seeded] = given[seeded], 0
+            seeds = np.array([-1 if number is None else number for number in seeds_of(seed, self.num_envs)])
+            seeded = which[seeds[which] >= 0]
+            state.seed[seeded], state.episode[seeded] = seeds[seeded], 0
         if c is not None:
             state.c[:, which] = c[:, which]
-        self._start(which, state, given=c is not None)
+        arrays, given = _pointers(which, state.seed, state.episode), c is not None
+        self._code.start(self.num_envs, len(which), *arrays, given, *_pointers(state.x, state.c))
+        state.steps[which] = 0
         return state
 
     def observe(self, state: State) -> np.ndarray:
@@ -153,28 +155,12 @@ class BallbotNative:
         """(B,) rad, of a state."""
         return self._seen(state)[1]
 
-    def step(self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool) -> BatchStep:
-        """Holds forces for one control step; see `autoreset.advance`.
-
-        `final_observation` has the rows of ended episodes alone.
-        """
-        return self.step_with_infos(actions, waiting, restart)[0]
-
-    def step_with_infos(
-        self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
-    ) -> tuple[BatchStep, StepInfo, StepInfo, np.ndarray]:
-        """The same, with what infos say, and the indices of the envs whose episode ended.
-
-        The first info is of the envs now, the second of the step even where its end began a new episode. Without restart
-        they are the same.
-
-        Raises:
-            ValueError: an action is not finite; the envs stay as they are.
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
+    def step(self, actions: np.ndarray, waiting: np.ndarray | None = None) -> VectorStep:
+        """Holds forces for one control step; see `autoreset.step`."""
         old = self.state
         if old is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
+        restart = self.restarts
         begins = restart or waiting is not None
         spares = self._spares[: 12 if restart else 8 if begins else 6]
         made, addresses = zip(*(spare.take() for spare in spares), strict=True)
@@ -199,24 +185,8 @@ class BallbotNative:
         ended = done.nonzero()[0]
         now = self._info(told, pay[1:], flags[2:5], violated, c)
         end = self._info(end_told, end_pay, end_flags, violated, old.c) if restart else now
-        fields: Any = {
-            "observation": observation,
-            "reward": pay[0],
-            "cost": end.cost,
-            "terminated": terminated,
-            "truncated": truncated,
-            "final_observation": (observation if end_seen is None else end_seen).take(ended, 0),
-            "final_x": end.x,
-            "success": end.success,
-            "failure": end.failure,
-            "violated": violated,
-            "force": end.force,
-            "clipped": end.clipped,
-            "final_tilt": end.tilt,
-            "tilt": now.tilt,
-            "grip": end.grip,
-        }
-        return BatchStep(**fields), now, end, ended
+        last = (observation if end_seen is None else end_seen).take(ended, 0)
+        return VectorStep(observation, pay[0], terminated, truncated, ended, last, now, end)
 
     def _info(
         self, told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray, c: np.ndarray
@@ -226,9 +196,8 @@ class BallbotNative:
         tilt = self.params.state_size
         grip = tilt + 1 + self.params.action_size
         force = told[tilt + 1 : grip]
-        return StepInfo(
-            told[:tilt], pay[0], pay[1:], told[tilt], force, success, failure, violated, clipped, c, told[grip:]
-        )
+        marks, drawn = (success, failure, violated, clipped), self._state.drawn
+        return StepInfo(told[:tilt], pay[0], pay[1:], told[tilt], force, *marks, c, told[grip:], drawn)
 
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""
@@ -246,21 +215,12 @@ class BallbotNative:
         fields: Any = (x, c, np.zeros(size, np.int64), np.zeros(size, np.int64), seeds, none, none, none, none)
         return BatchState(*fields)
 
-    def _start(self, which: np.ndarray, state: State, given: bool = False) -> None:
-        """Starts the episodes of some envs, in arrays that nobody else has; their constants are drawn unless given."""
-        arrays = (which, state.seed, state.episode)
-        self._code.start(self.num_envs, len(which), *_pointers(*arrays), given, *_pointers(state.x, state.c))
-        state.steps[which] = 0
-
-    def _look(self, which: np.ndarray, state: State, seen: np.ndarray, tilt: np.ndarray) -> None:
-        """Writes what some envs see, and their tilts."""
-        self._code.observe(self.num_envs, len(which), *_pointers(which, state.steps, state.x, state.c, seen, tilt))
-
     def _seen(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """(no, B) what all envs see, and (B,) their tilts."""
         seen = np.empty((self._seen_rows, self.num_envs), self.dtype)
         tilt = np.empty(self.num_envs, self.dtype)
-        self._look(self._all, state, seen, tilt)
+        arrays = self._all, state.steps, state.x, state.c, seen, tilt
+        self._code.observe(self.num_envs, self.num_envs, *_pointers(*arrays))
         return seen, tilt
 
     def _written(self) -> list[Spares]:
@@ -347,12 +307,10 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
     batch.state = start = batch.initial_state(seed=0)
     found = {"first observation": own.observe(first), "start": first.x, "constants": first.c}
     expected = {"first observation": batch.observe(start), "start": start.x, "constants": start.c}
-    with torch.no_grad():
-        step = batch.step(torch.from_numpy(actions))
-    step = step._replace(final_observation=step.final_observation[step.terminated | step.truncated])
-    found |= own.step(actions, None, True)._asdict()
-    for name, value in (expected | step._asdict()).items():
-        if not np.allclose(found[name], value, rtol=1e-3, atol=1e-3, equal_nan=True):
+    for values, done in ((found, own.step(actions)), (expected, step(batch, actions, None))):
+        values |= done._asdict() | done.now._asdict() | {f"final {k}": part for k, part in done.end._asdict().items()}
+    for name in expected.keys() - {"now", "end"}:
+        if not np.allclose(found[name], expected[name], rtol=1e-3, atol=1e-3, equal_nan=True):
             raise NativeUnavailableError(f"{task.id} has another {name} with CasADi's symbols than with numbers")
     return code
 

@@ -41,14 +41,11 @@ except ImportError as error:
         'vectorization_mode="sync", physics="rk4"), which needs none'
     ) from error
 
-from ballbot_gym.autoreset import StepInfo, advance, begun
+from ballbot_gym.autoreset import StepInfo, as_array, started, step
 from ballbot_gym.batch import BallbotBatch, BatchState, dtype_named, tilt_of
 
 if TYPE_CHECKING:
     from ballbot_gym.native import BallbotNative
-
-_DTYPES = {"reward": np.float64, "cost": np.float64, "observation": np.float32, "final_observation": np.float32}
-"""Of arrays that do not have the batch's dtype."""
 
 _INFO_KEYS = tuple(
     (name, f"_{name}")
@@ -171,12 +168,12 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.batch.most_steps = _most_steps(max_episode_steps, self.task)
+        self.batch.restarts = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._none, self._nothing = np.full(self.num_envs, -1), np.zeros(self.num_envs)
         self._everywhere = np.ones(self.num_envs, np.bool_)
         self._ends = sparse_rows(self.num_envs, self.single_observation_space.shape[0])
         for array in (self._none, self._nothing, self._everywhere):
             array.flags.writeable = False
-        self._survive = self.task.survival_reward * self.task.control_dt
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -225,18 +222,14 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             observation = self.batch.observe(state)
             tilt: Any = tilt_of(state.x.unbind(0)) if isinstance(self.batch, BallbotBatch) else self.batch.tilt(state)
         self._ended = self._ended & ~mask
-        size, (x_now, c_now) = self.num_envs, self._x_and_c()
-        tilt = self._array(tilt).astype(self._dtype, copy=False)
-        force, grip = (
-            np.zeros((self.params.action_size, size), self._dtype),
-            np.zeros((4 * self.params.grips, size), self._dtype),
-        )
+        size, (x_now, c_now, drawn) = self.num_envs, started(state)
+        tilt = as_array(tilt).astype(self._dtype, copy=False)
+        force, grip = (np.zeros((rows, size), self._dtype) for rows in (self.params.action_size, 4 * self.params.grips))
         success, failure, clipped = np.zeros((3, size), bool)
         parts = np.zeros((4, size))
         flags = success, failure, self._none, clipped
-        now = StepInfo(x_now, parts[0], parts[1:], tilt, force, *flags, c_now, grip, self._drawn())
-        infos = self._info(now, mask)
-        return self._array(observation, np.float32), infos
+        infos = self._info(StepInfo(x_now, parts[0], parts[1:], tilt, force, *flags, c_now, grip, drawn), mask)
+        return as_array(observation).astype(np.float32, copy=False), infos
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Holds forces for one control step; `autoreset_mode` says what happens to episodes that end.
@@ -262,18 +255,18 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
                 f"the episodes of envs {np.flatnonzero(waiting)[:8].tolist()} have ended; reset them with "
                 'options={"reset_mask": mask}'
             )
-        restart = self.autoreset_mode is AutoresetMode.SAME_STEP
-        result, now, end, ended = self._advance(actions, waiting, restart)
+        batch = self.batch
+        result = step(batch, actions, waiting) if isinstance(batch, BallbotBatch) else batch.step(actions, waiting)
         done = result.terminated | result.truncated
         infos: dict[str, Any] = {}
-        if not restart:
+        if not batch.restarts:
             self._ended = done
-        elif ended.size:
-            infos["final_info"] = self._info(end, done)
-            infos["final_obs"] = fill(self._ends, ended, result.final_observation)
+        elif result.ended.size:
+            infos["final_info"] = self._info(result.end, done)
+            infos["final_obs"] = fill(self._ends, result.ended, result.final_observation)
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
-        infos |= self._info(now, self._everywhere)
+        infos |= self._info(result.now, self._everywhere)
         return result.observation, result.reward, result.terminated, result.truncated, infos
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -352,73 +345,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         """The array as the batch takes it."""
         return torch.from_numpy(array).to(self.batch.device) if isinstance(self.batch, BallbotBatch) else array
 
-    def _advance(
-        self, actions: np.ndarray, waiting: np.ndarray | None, restart: bool
-    ) -> tuple[Any, StepInfo, StepInfo, np.ndarray]:
-        """`advance` of the batch, with NumPy arrays in and out; `final_observation` has the rows of ended episodes alone.
-
-        Returns:
-            As `BallbotNative.step_with_infos`.
-        """
-        if not isinstance(self.batch, BallbotBatch):
-            return self.batch.step_with_infos(actions, waiting, restart)
-        check_finite(actions)
-        actions = np.asarray(actions, order="F")  # components contiguous, as everything in the batch
-        constants, drawn = self._x_and_c()[1], self._drawn()
-        with torch.no_grad():
-            result: Any = advance(self.batch, self._to_batch(actions), waiting, restart)
-        arrays: Any = {name: self._array(part, _DTYPES.get(name)) for name, part in result._asdict().items()}
-        ended = (arrays["terminated"] | arrays["truncated"]).nonzero()[0]
-        arrays["final_observation"] = arrays["final_observation"][ended]
-        result = result._replace(**arrays)
-        return result, *self._step_infos(result, constants, drawn, ended, waiting, restart), ended
-
-    def _step_infos(
-        self,
-        result: Any,
-        constants: np.ndarray,
-        drawn: np.ndarray,
-        ended: np.ndarray,
-        waiting: np.ndarray | None,
-        restart: bool,
-    ) -> tuple[StepInfo, StepInfo]:
-        """What infos say of the envs now, and of a step, before which they had those constants (nc, B) and draws."""
-        reward, cost, success, violated = result.reward, result.cost, result.success, result.violated
-        parts = np.empty((3, self.num_envs))
-        parts[0], parts[2] = self._survive, 0.0
-        np.negative(cost, out=parts[1])
-        if waiting is not None:
-            parts[:, waiting] = 0.0
-        if ended.size:
-            failed = np.flatnonzero(violated >= 0)
-            parts[1, failed] = reward[failed] - self._survive  # the cost has a failure's price too
-            if self.task.first_exit:
-                parts[2, ended] = (reward[ended] - parts[0, ended] - parts[1, ended]) * success[ended]
-        x, c = self._x_and_c()
-        flags = success, violated >= 0, violated, result.clipped
-        now = StepInfo(x, cost, parts, result.tilt, result.force, *flags, c, result.grip, self._drawn())
-        if not (restart and ended.size):
-            return now, now
-        end = now._replace(x=result.final_x, tilt=result.final_tilt, c=constants, drawn=drawn)
-        return begun(now, ended), end
-
-    def _x_and_c(self) -> tuple[np.ndarray, np.ndarray]:
-        """(8, B) states and (nc, B) constants."""
-        state: Any = self.batch.state
-        if state is None:
-            raise gymnasium.error.ResetNeeded("step() before reset()")
-        return self._array(state.x), self._array(state.c)
-
-    def _drawn(self) -> np.ndarray:
-        """What the randomization drew for the running episodes, as of `BatchState`."""
-        state = self.batch.state if self.randomization.varies_episodes else None
-        return np.zeros((0, 0)) if state is None else self._array(state.drawn)
-
-    @staticmethod
-    def _array(part: Any, dtype: Any = None) -> np.ndarray:
-        array = part if isinstance(part, np.ndarray) else part.cpu().numpy()
-        return array if dtype is None else array.astype(dtype, copy=False)
-
     def _info(self, told: StepInfo, mask: np.ndarray) -> dict[str, Any]:
         """An info with the keys of `BallbotEnv`'s, in the same order, each with Gymnasium's mask (B,) of valid entries.
 
@@ -445,7 +371,7 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
     def _constants(self, constants: Any, drawn: BatchState, mask: np.ndarray) -> Any:
         """(nc, B) constants: those given, and drawn ones for the rest."""
         names, task = self.task.constant_names, self.task
-        c = self._array(drawn.c).astype(np.float64)
+        c = as_array(drawn.c).astype(np.float64)
         if isinstance(constants, dict):
             check_constant_names(task, constants)
             for name, value in constants.items():
@@ -454,11 +380,11 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             c[:] = finite_array(constants, (self.num_envs, len(names)), "constants", broadcast=True).T
         for distinct in np.unique(c[:, mask], axis=1).T:
             task.check_constants(distinct, self.params)
-        return self._to_batch(c.astype(self._array(drawn.c).dtype))
+        return self._to_batch(c.astype(as_array(drawn.c).dtype))
 
     def _with_x(self, state: BatchState, given: Any, mask: np.ndarray) -> BatchState:
         """The state with the given initial x in the masked envs. Raises a ValueError if one violates a margin."""
-        drawn, c = self._array(state.x), self._array(state.c)
+        drawn, c = as_array(state.x), as_array(state.c)
         wanted = finite_array(given, (self.num_envs, self.params.state_size), "state", broadcast=True).T
         x = np.where(mask, wanted, drawn).astype(drawn.dtype, order="C")
         safe = np.all([limit >= 0 for limit in self.task.limits(tuple(x), self.task.at(tuple(c), 0.0))], axis=0)

@@ -45,7 +45,7 @@ def test_env_and_every_kind_of_batch_agree_on_rewards_and_observations(task, par
             if k == STEPS // 2:
                 mask = np.array([True, False])
                 batch.state = batch.initial_state(mask=torch.as_tensor(mask) if name == "torch" else mask)
-            step = batch.step(torch.as_tensor(action)) if name == "torch" else batch.step(action, None, True)
+            step = batch.step(torch.as_tensor(action) if name == "torch" else action)
             seen.append(np.asarray(step.observation))
             paid.append(np.asarray(step.reward))
         found[name] = np.array(seen), np.array(paid)

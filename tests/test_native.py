@@ -173,9 +173,9 @@ def test_a_state_of_another_shape_is_refused_before_machine_code_reads_it():
         with pytest.raises(ValueError, match=f"{name} of a state must have shape"):
             envs.state = state._replace(**{name: getattr(state, name)[..., :2]})
     envs.state = state._replace(x=np.asfortranarray(state.x, np.float64))  # another order and type are taken
-    first = envs.step(np.zeros((3, 2), np.float32, order="F"), None, True)
+    first = envs.step(np.zeros((3, 2), np.float32, order="F"))
     envs.state = state
-    np.testing.assert_array_equal(envs.step(np.zeros((3, 2), np.float32, order="F"), None, True).final_x, first.final_x)
+    np.testing.assert_array_equal(envs.step(np.zeros((3, 2), np.float32, order="F")).end.x, first.end.x)
 
 
 @needs_compiler
