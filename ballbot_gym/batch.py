@@ -29,7 +29,7 @@ from ballbot_gym import counter_rng, dynamics, sensors
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, ModelNumbers
-from ballbot_gym.randomization import Randomization, actuate, checked_randomization
+from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.seeding import seeds_of
 from ballbot_gym.tasks import Task
@@ -196,7 +196,7 @@ class BallbotBatch:
         for name in ModelNumbers._fields:
             getattr(self.params, name)  # computed and kept, before torch.compile meets a lock there
         self._substeps = dynamics.substeps_for(self.task.control_dt)
-        self._past_steps = self.randomization.delay_steps(self.task.control_dt)[1]
+        self.randomization.delay_steps(self.task.control_dt)  # raises an error where it is no whole number of these
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._compile = compile
         wanted = compile is True or (compile == "auto" and num_envs >= COMPILE_FROM and _has_compiler(self.device))
@@ -362,7 +362,7 @@ class BallbotBatch:
         x, c = now.x, now.c
         asked = actions.to(self.dtype).unbind(-1)
         command = tuple(part.clamp(-1.0, 1.0) * self.params.force_limit for part in asked)
-        force, actuator = self._actuate(now, command)
+        force, actuator = noise.actuate(command, now.drawn, now.actuator)
         total = force
         if noise.pushes:
             z = counter_rng.uniforms(
@@ -477,22 +477,10 @@ class BallbotBatch:
         drawn = noise.draw(z[task.state_draws :][: noise.episode_draws], task.control_dt) if varied else ()
         still = torch.zeros_like(seed, dtype=self.dtype)
         forces = self.params.action_size
-        actuator = (still,) * (forces + forces * self._past_steps) if noise.varies_actuator else ()
+        actuator = noise.resting((still,) * forces, task.control_dt)
         read = sensors.first(self.model(drawn), state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
         begun = _Rows(state, constants, zero, episode, seed, drawn, actuator, (), read)
         return begun._replace(past=self.history * (*self._seen(begun), *(still,) * forces)) if self.history else begun
-
-    def _actuate(self, now: _Rows, command: tuple) -> tuple[tuple, tuple]:
-        """Force (2) that the actuator applies, and its new memory."""
-        if not self.randomization.varies_actuator:
-            return command, now.actuator
-        forces = self.params.action_size
-        pairs = tuple(now.actuator[i : i + forces] for i in range(0, len(now.actuator), forces))
-        for strength in now.drawn[6:7]:
-            command = tuple(strength * part for part in command)
-        force = actuate(command, pairs[1:], pairs[0], now.drawn[4], now.drawn[5])
-        kept = (command, *pairs[1:])[: self._past_steps]
-        return force, tuple(part for pair in (force, *kept) for part in pair)
 
     def _observe(self, now: _Rows) -> torch.Tensor:
         """(B, no) observations, with those of the past behind the present one."""

@@ -24,7 +24,7 @@ from ballbot_gym.engines import PHYSICS, State, default_physics, make_simulator
 from ballbot_gym.engines.closed_form import Rk4Simulator
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import YAW, picture
-from ballbot_gym.randomization import Disturbance, DisturbanceState, Randomization, checked_randomization
+from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.registry import named_task, spec_of
 from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.step_code import Judge
@@ -49,8 +49,10 @@ class EnvState(NamedTuple):
     """Control steps to the end of the episode; 0 where it has ended."""
     rng: dict[str, Any]
     """State of the random number generator."""
-    disturbance: DisturbanceState | None
-    """Of the randomized robot and actuator; None where nothing varies."""
+    drawn: State = ()
+    """What the randomization drew for the episode; () where nothing varies."""
+    actuator: State = ()
+    """What the actuator remembers; see `Randomization.actuate`."""
     memory: tuple[float, ...] = ()
     """What the simulator remembers besides the state; see `Simulator.memory`."""
     past: tuple[float, ...] = ()
@@ -159,16 +161,16 @@ class BallbotEnv(gymnasium.Env):
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}
         self.action_space = spaces.Box(-1.0, 1.0, (self.params.action_size,), np.float32)
         self.randomization = checked_randomization(randomization, self.params)
-        self._disturbance = (
-            Disturbance(self.randomization, self.params, self.task.control_dt) if self.randomization.active else None
-        )
+        self._robot = self.params  # of the episode
+        self._drawn: State = ()
+        self._resting = self.randomization.resting((0.0,) * self.params.action_size, self.task.control_dt)
+        self._actuator = self._resting
         self.observation = sensors.check_observation(observation, self.params, self.randomization)
         self._sensors: tuple[float, ...] = ()
         self._noisy = self.randomization.is_noisy or self.observation == "sensors"
         self.history = check_history(history)
         self.observation_space = sensors.observation_space(self.task, self.params, self.history, self.observation)
-        self._own_size = sensors.observation_size(self.task, self.params, self.observation)
-        self._past = np.zeros(self.observation_space.shape, np.float32) if self.history else None
+        self._past = self._tried = np.zeros(0)  # the last observation with a history, and the action on it
         self._physics_dt = physics_dt
         self._simulator = make_simulator(physics, self.params, self.task.control_dt, physics_dt)
         self._judge: Judge | None = None  # in machine code
@@ -176,6 +178,8 @@ class BallbotEnv(gymnasium.Env):
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
         # read in every step
+        self._remembers, self._varies = self.history > 0, self.randomization.varies_episodes
+        self._action_shape = self.action_space.shape
         self._steps, self._survive = self.task.steps, self.task.survival_reward * self.task.control_dt
         self._grips, self._force_limit, self._human = self.params.grips, self.params.force_limit, render_mode == "human"
         self._steps_left = self._taken = 0
@@ -204,15 +208,13 @@ class BallbotEnv(gymnasium.Env):
         judge, tilt = self._start(x, c)
         self._set_constants(c)
         self._state = x
-        if self._disturbance is not None:
-            self._disturbance.reset(self.np_random)
+        if self.randomization.active:
+            z = tuple(self.np_random.random(self.randomization.episode_draws).tolist())
+            self._drawn, self._actuator = self.randomization.draw(z, self.task.control_dt), self._resting
             for given in drawn:
                 if given is not None:
-                    shape = (self.randomization.episode_draws,)
-                    self._disturbance.begin(_floats(finite_array(given, shape, "drawn")))
-            if self.randomization.varies_robot:
-                self._simulator.set_params(self._disturbance.params)
-        self._simulator.reset(self._state)
+                    self._drawn = _floats(finite_array(given, (len(z),), "drawn"))
+        self._restore_simulator()
         if self.observation == "sensors":
             z = tuple(self.np_random.random(sensors.FIRST_DRAWS).tolist())
             self._sensors = sensors.first(self.episode_params, x, z, self.task.control_dt)
@@ -240,11 +242,15 @@ class BallbotEnv(gymnasium.Env):
             )
         force, clipped = self._force(action)
         total = force
-        if self._disturbance is not None:
-            force = self._disturbance.actuate(force)
-            total = self._disturbance.pushed(force, self.np_random)
-        if self._past is not None:
-            self._note(action)
+        if self._drawn:
+            noise = self.randomization
+            force, self._actuator = noise.actuate(force, self._drawn, self._actuator)
+            total = force
+            if noise.pushes:
+                z = tuple(self.np_random.random(Randomization.PUSH_DRAWS).tolist())
+                total = tuple([f + push for f, push in zip(force, noise.push(z, self.task.control_dt), strict=True)])
+        if self._remembers:
+            self._tried = np.asarray(action, np.float64).clip(-1.0, 1.0).astype(_FLOAT32)
         before = self._state
         self._state = x = self._simulator.step(total)
         if self._sensors:
@@ -283,20 +289,6 @@ class BallbotEnv(gymnasium.Env):
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = spec_of(spec, self.task, self.params, self.randomization)
 
-    def _forget(self) -> None:
-        """Makes the past what it is when an episode begins."""
-        past, own = self._past, self._own_size
-        assert past is not None
-        past[own:] = np.tile(np.append(past[:own], (0.0,) * self.params.action_size), self.history)
-
-    def _note(self, action: Any) -> None:
-        """Moves what was observed, and the action on it, into the past."""
-        past, own, forces = self._past, self._own_size, self.params.action_size
-        assert past is not None
-        past[2 * own + forces :] = past[own : -(own + forces)].copy()
-        past[own : 2 * own] = past[:own]
-        past[2 * own : 2 * own + forces] = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
-
     @property
     def limit_names(self) -> tuple[str, ...]:
         """What can end an episode; `info["violated"]` is an index of it."""
@@ -305,7 +297,7 @@ class BallbotEnv(gymnasium.Env):
     @property
     def episode_params(self) -> BallbotParams:
         """The robot of the running episode: `params`, unless randomized."""
-        return self.params if self._disturbance is None else self._disturbance.params
+        return self._robot
 
     @property
     def slip(self) -> float:
@@ -349,12 +341,13 @@ class BallbotEnv(gymnasium.Env):
         self._check_open()
         if not self._state:
             raise gymnasium.error.ResetNeeded("get_state() before reset()")
-        disturbance = None if self._disturbance is None else self._disturbance.get_state()
-        rng = dict(self.np_random.bit_generator.state)
-        memory = self._simulator.memory()
-        past = () if self._past is None else tuple(self._past.tolist())
-        held = self._state, self._constants, self._steps_left, rng, disturbance, memory, past, self._sensors
-        return EnvState(self.task, *held)
+        rng, memory, past = (
+            dict(self.np_random.bit_generator.state),
+            self._simulator.memory(),
+            tuple(self._past.tolist()),
+        )
+        held = self._state, self._constants, self._steps_left, rng, self._drawn, self._actuator, memory, past
+        return EnvState(self.task, *held, self._sensors)
 
     def set_state(self, state: EnvState) -> None:
         """Goes back, or on, to a state that `get_state` returned, of this env or of one that was made alike.
@@ -370,21 +363,18 @@ class BallbotEnv(gymnasium.Env):
             raise TypeError(f"set_state() takes what get_state() returned, not {type(state).__name__}")
         if state.task != self.task:
             raise ValueError(f"the state is of {state.task}, and this env's task is {self.task}")
-        if (state.disturbance is None) != (self._disturbance is None):
+        if bool(state.drawn) != self.randomization.active:
             raise ValueError("the state is of an env with other randomization")
-        if len(state.past) != (0 if self._past is None else len(self._past)):
+        if len(state.past) != (self.observation_space.shape[0] if self.history else 0):
             raise ValueError("the state is of an env with another history")
         if bool(state.sensors) != (self.observation == "sensors"):
             raise ValueError("the state is of an env with another observation")
-        self._sensors = state.sensors
-        if self._past is not None:
-            self._past[:] = state.past
+        self._drawn, self._actuator, self._sensors = state.drawn, state.actuator, state.sensors
+        self._past = np.array(state.past, np.float32)
         self._set_constants(state.constants)
         self._state, self._steps_left = state.x, state.steps_left
         self._taken = self.task.steps - state.steps_left
         self.np_random.bit_generator.state = state.rng
-        if self._disturbance is not None and state.disturbance is not None:
-            self._disturbance.set_state(state.disturbance)
         self._restore_simulator(state.memory)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -434,8 +424,9 @@ class BallbotEnv(gymnasium.Env):
 
     def _restore_simulator(self, memory: tuple[float, ...] = ()) -> None:
         """Puts the simulator into the env's state, and what it remembers besides into its memory."""
-        if self._disturbance is not None and self.randomization.varies_robot:
-            self._simulator.set_params(self._disturbance.params)
+        if self.randomization.varies_robot:
+            self._robot = self.randomization.robot(self.params, self._drawn)
+            self._simulator.set_params(self._robot)
         self._simulator.reset(self._state, memory)
 
     def _grip(self, x: State, total: tuple[float, ...]) -> tuple[tuple[float, ...], bool]:
@@ -493,7 +484,7 @@ class BallbotEnv(gymnasium.Env):
 
     def _force(self, action: Sequence[float] | np.ndarray) -> tuple[tuple[float, ...], bool]:
         """The force, N, of an action, and whether it was clipped."""
-        parts = real_array(action, "action", self.action_space.shape).tolist()
+        parts = real_array(action, "action", self._action_shape).tolist()
         limit = self._force_limit
         if max(parts) <= 1.0 and min(parts) >= -1.0:
             return tuple([limit * part for part in parts]), False
@@ -506,8 +497,9 @@ class BallbotEnv(gymnasium.Env):
         x, c = self._state, self.task.at(self._constants, self._taken * self.task.control_dt)
         if self._sensors:
             return sensors.seen(self._sensors, c)
-        if self._disturbance is not None:
-            x = self._disturbance.sensed(x, self.np_random, self._taken * self.task.control_dt)
+        if self._noisy:
+            z = tuple(self.np_random.random(Randomization.NOISE_DRAWS).tolist())
+            x = self.randomization.sensed(x, z, self._drawn, self._taken * self.task.control_dt)
         return self.task.seen(x, c)
 
     def _shown(
@@ -526,10 +518,13 @@ class BallbotEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Observation and `info` of a step that a judge judged last, or of one that Python judged; by default of a start."""
         seen = np.array(self._observed(), np.float32) if judge is None or self._noisy else judge.seen.astype(_FLOAT32)
-        if self._past is not None:
-            self._past[: len(seen)] = seen
-            if not self._taken:
-                self._forget()
+        if self._remembers:
+            own, old = len(seen), self._past
+            if self._taken:
+                self._past = np.concatenate((seen, old[:own], self._tried, old[own:]))[: len(old)]
+            else:
+                still = np.zeros(self.params.action_size, np.float32)
+                self._past = np.append(seen, np.tile(np.append(seen, still), self.history))
             seen = self._past.copy()
         failure = violated >= 0
         info = {
@@ -550,8 +545,8 @@ class BallbotEnv(gymnasium.Env):
         }
         if self._grips:
             info["grip"] = np.array(grip)
-        if self._disturbance is not None and self.randomization.varies_episodes:
-            info["drawn"] = np.array(self._disturbance.get_state().drawn)
+        if self._varies:
+            info["drawn"] = np.array(self._drawn)
         return seen, info
 
 

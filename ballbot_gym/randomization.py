@@ -6,9 +6,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from ballbot_gym import ops
 from ballbot_gym.checks import from_fields
@@ -216,6 +214,33 @@ class Randomization:
             friction=params.friction * friction if params.grips else params.friction,
         )
 
+    def resting(self, none: tuple[Any, ...], control_dt: float) -> tuple[Any, ...]:
+        """What an actuator remembers that was asked for no force, none (2): the memory of `actuate`; () where it is ideal."""
+        return none * (1 + self.delay_steps(control_dt)[1]) if self.varies_actuator else ()
+
+    def actuate(
+        self, command: tuple[Any, ...], drawn: tuple[Any, ...], memory: tuple[Any, ...]
+    ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """The force (2), N, that the actuator applies in the next control step, and its new memory.
+
+        Args:
+            command: (2,) N, asked for now.
+            drawn: what `draw` drew for the episode.
+            memory: (2,) N, applied in the last control step, and (2 d) the commands before, the latest first, of as many
+                steps d as the longest delay.
+        """
+        if not memory:
+            return command, ()
+        gain, delay, size = drawn[4], drawn[5], len(command)
+        for strength in drawn[6:7]:
+            command = tuple([strength * part for part in command])
+        last, past, due = memory[:size], (*command, *memory[size:]), command
+        for age in range(1, len(memory) // size):
+            old = past[age * size : (age + 1) * size]
+            due = tuple([ops.where(delay == age, a, b) for a, b in zip(old, due, strict=True)])
+        force = tuple([gain * d + (1.0 - gain) * f for d, f in zip(due, last, strict=True)])
+        return force, (*force, *past[: len(memory) - size])
+
     def push(self, z: tuple[Any, ...], control_dt: float) -> tuple[Any, Any]:
         """The push (2), N, of a control step from 3 uniform numbers; zero in most steps."""
         strength = between(z[1], *self.push_impulse) / control_dt
@@ -269,87 +294,6 @@ def checked_randomization(randomization: Any, params: BallbotParams | None = Non
     if params is not None and params.wheels is not None and randomization.pushes:
         raise ValueError("pushes are forces Fx, Fy, which a robot with wheels does not have; leave out push_impulse")
     return randomization
-
-
-class DisturbanceState(NamedTuple):
-    """What a `Disturbance` remembers."""
-
-    drawn: tuple[float, ...]
-    """What `Randomization.draw` drew for the episode."""
-    force: tuple[float, ...]
-    """N, applied last."""
-    past: tuple[tuple[float, ...], ...]
-    """N, earlier commands, the latest first."""
-
-
-class Disturbance:
-    """The randomization of one environment: the robot and actuator of its episode, and the actuator's memory."""
-
-    def __init__(self, randomization: Randomization, params: BallbotParams, control_dt: float):
-        """Args: params: the nominal robot. control_dt: s."""
-        self._randomization, self._nominal, self._dt = randomization, params, control_dt
-        self._past_steps = randomization.delay_steps(control_dt)[1]
-        self.params = params
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Draws the episode's robot and actuator."""
-        z = tuple(rng.random(self._randomization.episode_draws).tolist())
-        self.begin(self._randomization.draw(z, self._dt))
-
-    def begin(self, drawn: tuple[float, ...]) -> None:
-        """Starts an episode with what `Randomization.draw` drew."""
-        none = (0.0,) * self._nominal.action_size
-        self.set_state(DisturbanceState(drawn, none, (none,) * self._past_steps))
-
-    def get_state(self) -> DisturbanceState:
-        """What it remembers, after `reset`."""
-        return DisturbanceState(self._drawn, self._force, self._past)
-
-    def set_state(self, state: DisturbanceState) -> None:
-        """Goes on from what another one remembered."""
-        self._drawn, self._force, self._past = state
-        self._gain, self._delay, self._strength = (*self._drawn, 1.0)[4:7]
-        if self._randomization.varies_robot:
-            self.params = self._randomization.robot(self._nominal, self._drawn)
-
-    def actuate(self, command: tuple[float, ...]) -> tuple[float, ...]:
-        """The force, N, that the actuator applies in the control step that begins with this command, N."""
-        command = tuple([self._strength * part for part in command])
-        self._force = actuate(command, self._past, self._force, self._gain, self._delay)
-        self._past = (command, *self._past)[: self._past_steps]
-        return self._force
-
-    def pushed(self, force: tuple[float, ...], rng: np.random.Generator) -> tuple[float, ...]:
-        """The force, N, plus the push of this control step, if there is one."""
-        if not self._randomization.pushes:
-            return force
-        push = self._randomization.push(tuple(rng.random(Randomization.PUSH_DRAWS).tolist()), self._dt)
-        return force[0] + push[0], force[1] + push[1]
-
-    def sensed(self, x: tuple[float, ...], rng: np.random.Generator, time: float) -> tuple[float, ...]:
-        """State (8) as the sensors report it at the episode's time, s."""
-        if not self._randomization.is_noisy:
-            return x
-        z = tuple(rng.random(Randomization.NOISE_DRAWS).tolist())
-        return self._randomization.sensed(x, z, self._drawn, time)
-
-
-def actuate(
-    command: tuple[Any, ...], past: tuple[tuple[Any, ...], ...], force: tuple[Any, ...], gain: Any, delay: Any
-) -> tuple[Any, ...]:
-    """Force (2), N, that the actuator applies in the next control step.
-
-    Args:
-        command: (2,) N, asked for now.
-        past: earlier commands, the latest first, as many as the longest delay in control steps.
-        force: (2,) N, applied in the last control step.
-        gain: fraction of the difference to the delayed command by which the force changes in one control step.
-        delay: dead time of commands, control steps.
-    """
-    due = command
-    for age, old in enumerate(past, start=1):
-        due = tuple(ops.where(delay == age, a, b) for a, b in zip(old, due, strict=True))
-    return tuple(gain * d + (1.0 - gain) * f for d, f in zip(due, force, strict=True))
 
 
 def normals(z: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -170,11 +170,10 @@ def rollout(
 
 def sensed(env: BallbotEnv, x: np.ndarray, t: float) -> np.ndarray:
     """State x (8,) as the env's sensors report it at time t, s. Each call draws new noise from the env's generator."""
-    state = env.get_state().disturbance if env.randomization.is_noisy else None
-    if state is None:
+    if not env.randomization.is_noisy:
         return x
     z = tuple(env.np_random.random(Randomization.NOISE_DRAWS).tolist())
-    return np.array(env.randomization.sensed(tuple(x.tolist()), z, state.drawn, t))
+    return np.array(env.randomization.sensed(tuple(x.tolist()), z, env.get_state().drawn, t))
 
 
 def simulate(
