@@ -28,7 +28,7 @@ except ImportError as error:
 from ballbot_gym import counter_rng, dynamics, sensors
 from ballbot_gym.checks import LARGEST, check_history, check_num_envs, fixed_error, shown
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams, ModelNumbers
+from ballbot_gym.params import DERIVED, BallbotParams
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.seeding import seeds_of
@@ -193,8 +193,10 @@ class BallbotBatch:
         self.state: BatchState | None = None
         self.most_steps = self.task.steps  # fewer truncate episodes sooner; neither pay nor goal changes
         self.restarts = True  # else envs stay at the ends of their episodes
-        for name in ModelNumbers._fields:
-            getattr(self.params, name)  # computed and kept, before torch.compile meets a lock there
+        for name in DERIVED:
+            getattr(
+                self.params, name
+            )  # else torch.compile would see another robot at the second step, and compile anew
         self._substeps = dynamics.substeps_for(self.task.control_dt)
         self.randomization.delay_steps(self.task.control_dt)  # raises an error where it is no whole number of these
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
@@ -455,10 +457,9 @@ class BallbotBatch:
             return self.params
         return self.randomization.robot(self.params, tuple(self.state.drawn[:, i].tolist()))
 
-    def model(self, drawn: tuple[torch.Tensor, ...]) -> Any:
-        """What `dynamics` reads of the robots for whose episodes the randomization drew this, (B,) each."""
-        noise = self.randomization
-        return ModelNumbers.of(noise.robot(self.params, drawn)) if noise.varies_robot else self.params
+    def model(self, drawn: tuple[torch.Tensor, ...]) -> BallbotParams:
+        """The robots for whose episodes the randomization drew this, (B,) each, as one whose numbers are (B,)."""
+        return self.randomization.robot(self.params, drawn) if self.randomization.varies_robot else self.params
 
     def _start(
         self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None

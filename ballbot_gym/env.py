@@ -365,7 +365,7 @@ class BallbotEnv(gymnasium.Env):
             raise ValueError(f"the state is of {state.task}, and this env's task is {self.task}")
         if bool(state.drawn) != self.randomization.active:
             raise ValueError("the state is of an env with other randomization")
-        if len(state.past) != (self.observation_space.shape[0] if self.history else 0):
+        if len(state.past) != (sum(self.observation_space.shape or ()) if self.history else 0):
             raise ValueError("the state is of an env with another history")
         if bool(state.sensors) != (self.observation == "sensors"):
             raise ValueError("the state is of an env with another observation")

@@ -2,14 +2,17 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, TypeVar
 
 from ballbot_gym import files
 from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number, is_positive
+
+_Value = TypeVar("_Value")
 
 _PACKAGE = Path(__file__).parent
 _IN_WHEEL, _IN_CHECKOUT = _PACKAGE / "urdf", _PACKAGE.parent / "urdf"
@@ -64,6 +67,20 @@ _COMPARED = {
 
 class UrdfError(ValueError):
     """A URDF that does not describe a ballbot; the message names the file, the element and the fault."""
+
+
+class _Kept(Generic[_Value]):
+    """A property that is computed once. functools has one that takes a lock, through which torch.compile cannot see."""
+
+    def __init__(self, compute: Callable[[Any], _Value]):
+        self._compute, self.__doc__ = compute, compute.__doc__
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: Any, owner: type | None = None) -> _Value:
+        value = instance.__dict__[self._name] = self._compute(instance)
+        return value
 
 
 @dataclass(frozen=True)
@@ -150,32 +167,32 @@ class BallbotParams:
         """Components of a force or action: x and y, or one for each wheel."""
         return 2 if self.wheels is None else 3
 
-    @cached_property
+    @_Kept
     def total_mass(self) -> float:
         """Ball and body, kg."""
         return self.ball_mass + self.body_mass
 
-    @cached_property
+    @_Kept
     def moving_mass(self) -> float:
         """What a horizontal acceleration of the upright robot moves: ball and body, and what the ball's rolling adds, kg."""
         return self.total_mass + self.ball_inertia / self.ball_radius**2 if self.rolls else self.total_mass
 
-    @cached_property
+    @_Kept
     def weight(self) -> float:
         """Of ball and body, N."""
         return self.total_mass * self.gravity
 
-    @cached_property
+    @_Kept
     def grips(self) -> bool:
         """Whether the floor's force is limited by friction, so that the robot can lose its grip."""
         return not (is_number(self.friction) and self.friction == math.inf)
 
-    @cached_property
+    @_Kept
     def first_moment(self) -> float:
         """m·l, the body's mass times its centre's height above the ball's, kg·m."""
         return self.body_mass * self.com_height
 
-    @cached_property
+    @_Kept
     def pivot_inertia(self) -> float:
         """I + m·l², the body's transverse inertia about the ball's centre, kg·m²."""
         return self.inertia + self.body_mass * self.com_height**2
@@ -240,49 +257,8 @@ def default_params() -> BallbotParams:
     return BallbotParams.from_urdf()
 
 
-class ModelNumbers(NamedTuple):
-    """The parameters that `dynamics` reads, as plain values, tensors or symbols.
-
-    torch.compile cannot trace the cached properties of `BallbotParams`, because they take a lock.
-    """
-
-    total_mass: Any
-    moving_mass: Any
-    first_moment: Any
-    pivot_inertia: Any
-    axial_inertia: Any
-    gravity: Any
-    weight: Any
-    rolls: bool
-    ball_radius: Any
-    friction: Any
-    grips: bool
-    com_height: Any = None
-    ball_inertia: Any = None
-    force_limit: Any = None
-    wheels: Wheels | None = None
-
-    @classmethod
-    def of(cls, params: BallbotParams) -> "ModelNumbers":
-        total_mass = params.ball_mass + params.body_mass
-        rolling = params.ball_inertia / params.ball_radius**2 if params.rolls else None
-        return cls(
-            total_mass=total_mass,
-            moving_mass=total_mass if rolling is None else total_mass + rolling,
-            first_moment=BallbotParams.first_moment.func(params),
-            pivot_inertia=BallbotParams.pivot_inertia.func(params),
-            axial_inertia=params.axial_inertia,
-            gravity=params.gravity,
-            weight=total_mass * params.gravity,
-            rolls=params.rolls,
-            ball_radius=params.ball_radius,
-            friction=params.friction,
-            grips=BallbotParams.grips.func(params),
-            com_height=params.com_height,
-            ball_inertia=params.ball_inertia,
-            force_limit=params.force_limit,
-            wheels=params.wheels,
-        )
+DERIVED = tuple(name for name, part in vars(BallbotParams).items() if isinstance(part, _Kept))
+"""Properties that are computed once."""
 
 
 class _Tree(ElementTree.TreeBuilder):

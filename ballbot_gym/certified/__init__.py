@@ -19,7 +19,7 @@ from ballbot_gym import dynamics, files
 from ballbot_gym.certified import cache
 from ballbot_gym.checks import shown
 from ballbot_gym.env import make_task
-from ballbot_gym.params import BallbotParams, ModelNumbers
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization, track_of
 from ballbot_gym.registry import name_of
 from ballbot_gym.robots import PAPER, checked_robot, file_name, named_robot, robot_name, short_name
@@ -289,9 +289,7 @@ def _holds(
     before, after = (np.concatenate([trajectory.x[part] for trajectory in trajectories]) for part in _ENDS)
     u, c = np.concatenate([trajectory.u for trajectory in trajectories]), constants[number]
     began, ended = (task.at(c, np.concatenate([trajectory.t[part] for trajectory in trajectories])) for part in _ENDS)
-    robot: Any = params
-    if randomization.moves_optima:
-        robot = ModelNumbers.of(randomization.robot(params, tuple(drawn[number].T)))
+    robot = randomization.robot(params, tuple(drawn[number].T)) if randomization.moves_optima else params
     with np.errstate(all="ignore"):  # of damaged files
         moved = np.abs(dynamics.step(robot, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
         found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, began), len(u)), len(known))

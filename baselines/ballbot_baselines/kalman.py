@@ -23,7 +23,7 @@ import numpy as np
 from ballbot_baselines.compiled import LANES, InPlace, in_lanes
 from ballbot_gym import dynamics, sensors
 from ballbot_gym.env import BallbotEnv
-from ballbot_gym.params import BallbotParams, ModelNumbers
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
 from ballbot_gym.rollout import Controller
 from ballbot_gym.tasks import Task
@@ -140,7 +140,7 @@ class TrackFilter:
     def when_free(self) -> np.ndarray:
         """The state (..., 8) in which the next command will begin to act."""
         x, share = self.x, self.factors[..., 2:]
-        robot: Any = self.robot if x.ndim == 1 else ModelNumbers.of(self.robot)
+        robot = self.robot
         for age in range(self._delays[-1], 0, -1):  # of commands that have not begun to act, the earliest first
             if (waits := self.delay >= age).any():
                 forces = share * self._commands[age - 1]

@@ -10,6 +10,7 @@ Solvers see actions, which are forces divided by their limit.
 import math
 from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from functools import lru_cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import casadi
@@ -21,7 +22,7 @@ from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_gym import dynamics
 from ballbot_gym.omni import Wheels
 from ballbot_gym.ops import is_number
-from ballbot_gym.params import BallbotParams, ModelNumbers
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 
 BARRIER = 0.1
@@ -160,7 +161,7 @@ def symbolic_robot(rolls: bool, grips: bool, p: casadi.SX, wheels: bool = False)
     own = Wheels(*(found.pop(field.name) for field in fields(Wheels))) if wheels else None
     weight = found["total_mass"] * found["gravity"]
     numbers = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight} | found
-    return ModelNumbers(**numbers, rolls=rolls, grips=grips, wheels=own), found["force_limit"]
+    return SimpleNamespace(**numbers, rolls=rolls, grips=grips, wheels=own), found["force_limit"]
 
 
 def _after(robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX, substeps: int) -> casadi.SX:

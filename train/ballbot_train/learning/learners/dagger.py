@@ -34,7 +34,7 @@ from ballbot_baselines.tvlqr import tube_gains
 from ballbot_gym import dynamics
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import BatchEpisodes, run_episodes
-from ballbot_gym.params import BallbotParams, ModelNumbers
+from ballbot_gym.params import BallbotParams
 from ballbot_gym.paths import then_stay
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.robots import robot_name
@@ -374,9 +374,7 @@ class Dagger:
     def _ahead(self, batch: BallbotBatch, state: BatchState) -> np.ndarray:
         """(B, 8) where the robots will be when a force of now arrives, after those that are on their way."""
         x, commands = state.x.unbind(0), state.actuator[2:].unflatten(0, (-1, 2)) if len(state.actuator) > 2 else ()
-        robot: Any = self._params
-        if batch.randomization.varies_robot:
-            robot = ModelNumbers.of(batch.randomization.robot(self._params, state.drawn.unbind(0)))
+        robot = batch.model(state.drawn.unbind(0))
         for age in range(len(commands), 0, -1):
             dt = self._task.control_dt
             later = dynamics.step(robot, x, commands[age - 1].unbind(0), dt, dynamics.substeps_for(dt))
