@@ -5,6 +5,7 @@ A policy that respects a symmetry learns one situation where another policy lear
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ballbot_gym import ops
@@ -228,12 +229,6 @@ def _ahead(
     return obstacles[:_OBSTACLES_SEEN], side, features, back
 
 
-def _rest_behind_obstacles(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
-    """`_slalom`'s features at rest at the goal, all obstacles passed. No force is needed there."""
-    none = 0.0 * features[0]
-    return (*[none] * 8, *[none - 0.2, none, none] * _OBSTACLES_SEEN), (none, none)
-
-
 def _fine_slalom(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     """As `_slalom`, and then what tells small errors of rest at the goal apart, for learning from scratch."""
     features, back = _slalom(observation)
@@ -245,16 +240,13 @@ def _rest(observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Back]:
     return (*observation, *_fine_rest(observation)), lambda action: action
 
 
-def _rest_fine(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
-    """`_rest`'s features at rest at the goal."""
+def _still(features: tuple[Any, ...], obstacles: int = 0) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
+    """Features at rest at the goal, with these obstacles passed. No force is needed there."""
     none = 0.0 * features[0]
-    return (none,) * len(features), (none, none)
-
-
-def _rest_behind_obstacles_fine(features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
-    """`_fine_slalom`'s features at rest at the goal, all obstacles passed."""
-    seen, force = _rest_behind_obstacles(features)
-    return (*seen, *_fine_rest(seen)), force
+    seen = [none] * len(features)
+    for i in range(obstacles):
+        seen[8 + 3 * i] = none - 0.2
+    return tuple(seen), (none, none)
 
 
 def _fine_rest(seen: tuple[Any, ...]) -> list[Any]:
@@ -311,12 +303,14 @@ _SWITCHES = tuple(3.4 + 0.1 * i for i in range(13))  # m/s
 _OBSTACLES_SEEN = 4
 _BALL_RADIUS = 0.1  # m, about
 
+_still_behind = partial(_still, obstacles=_OBSTACLES_SEEN)
+
 FRAMES: dict[str, Frame] = {
     "radial": Frame(18, _radial, steady=_steady_orbit),
-    "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, steady=_rest_behind_obstacles),
+    "slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _slalom, steady=_still_behind),
     "routed_slalom": Frame(8 + 3 * _OBSTACLES_SEEN, _routed_slalom, route=Route(5, _slalom_layout, _slalom_sides)),
-    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, steady=_rest_behind_obstacles_fine),
-    "fine_rest": Frame(14, _rest, steady=_rest_fine),
+    "fine_slalom": Frame(14 + 3 * _OBSTACLES_SEEN, _fine_slalom, steady=_still_behind),
+    "fine_rest": Frame(14, _rest, steady=_still),
     "gate": Frame(13 + len(_SWITCHES), _gate),
     "fine_gate": Frame(17 + len(_SWITCHES), _fine_gate),
 }
