@@ -7,11 +7,11 @@ bit-identical wherever an env stands in whatever batch.
 
 import ctypes
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -42,15 +42,6 @@ State = Any
 """A `BatchState` whose fields are NumPy arrays."""
 
 
-class _Code(NamedTuple):
-    """The functions of a library; `codegen` has them."""
-
-    step: Callable[..., None]
-    help: Callable[..., None]
-    start: Callable[..., None]
-    observe: Callable[..., None]
-
-
 @fixed("task", "params", "randomization", "history", "num_envs", "dtype")
 class BallbotNative:
     """B ballbots that do one task, with `state`, `initial_state`, `step` and `robot` as of `BallbotBatch`.
@@ -67,7 +58,7 @@ class BallbotNative:
         dtype: type[np.floating],
         params: BallbotParams,
         threads: int = 1,
-        code: _Code | None = None,
+        code: ctypes.CDLL | None = None,
     ):
         """Makes the envs.
 
@@ -75,7 +66,7 @@ class BallbotNative:
             task, num_envs, params: as of `BallbotBatch`.
             dtype: np.float32 or np.float64.
             threads: among which large batches are divided.
-            code: its functions; default, those of the task and the robot, once they were checked.
+            code: the library of `codegen`'s functions; default, those of the task and the robot, once they were checked.
 
         Raises:
             NativeUnavailableError: CasADi or a C compiler is missing, or the task cannot be traced.
@@ -289,8 +280,8 @@ def _pointer(array: np.ndarray) -> int:
 
 
 @cache
-def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
-    """The functions of a task and a robot, if these compute the same with CasADi's symbols as with numbers.
+def _checked_code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
+    """The library of a task and a robot, if its functions compute the same with CasADi's symbols as with numbers.
 
     A symbol that is made a float, for one, becomes NaN without a word.
 
@@ -316,8 +307,8 @@ def _checked_code(task: Task, params: BallbotParams, double: bool) -> _Code:
 
 
 @cache
-def _code(task: Task, params: BallbotParams, double: bool) -> _Code:
-    """The functions of a task and a robot.
+def _code(task: Task, params: BallbotParams, double: bool) -> ctypes.CDLL:
+    """The library of a task and a robot.
 
     Raises:
         NativeUnavailableError: see `BallbotNative`.
@@ -341,7 +332,7 @@ def _code(task: Task, params: BallbotParams, double: bool) -> _Code:
     for name, signature in signatures.items():
         function = getattr(library, name)
         function.argtypes, function.restype = signature, None
-    return _Code(*(getattr(library, name) for name in _Code._fields))
+    return library
 
 
 @cache
