@@ -177,8 +177,9 @@ class BallbotEnv(gymnasium.Env):
         self._resets = 0
         self._constants: tuple[float, ...] = ()
         self._constants_array = np.zeros(0)
-        # read in every step
+        # read in every step or reset
         self._remembers, self._varies = self.history > 0, self.randomization.varies_episodes
+        self._random, self._varies_robot = self.randomization.active, self.randomization.varies_robot
         self._action_shape = self.action_space.shape
         self._steps, self._survive = self.task.steps, self.task.survival_reward * self.task.control_dt
         self._grips, self._force_limit, self._human = self.params.grips, self.params.force_limit, render_mode == "human"
@@ -200,7 +201,7 @@ class BallbotEnv(gymnasium.Env):
         """
         self._check_open()
         super().reset(seed=seed)
-        draws = ("drawn",) if self.randomization.varies_episodes else ()
+        draws = ("drawn",) if self._varies else ()
         state, constants, *drawn = reset_options(options, "state", "constants", *draws)
         x, c = self._draw(state, constants)
         self._resets += 1
@@ -208,7 +209,7 @@ class BallbotEnv(gymnasium.Env):
         judge, tilt = self._start(x, c)
         self._set_constants(c)
         self._state = x
-        if self.randomization.active:
+        if self._random:
             z = tuple(self.np_random.random(self.randomization.episode_draws).tolist())
             self._drawn, self._actuator = self.randomization.draw(z, self.task.control_dt), self._resting
             for given in drawn:
@@ -424,7 +425,7 @@ class BallbotEnv(gymnasium.Env):
 
     def _restore_simulator(self, memory: tuple[float, ...] = ()) -> None:
         """Puts the simulator into the env's state, and what it remembers besides into its memory."""
-        if self.randomization.varies_robot:
+        if self._varies_robot:
             self._robot = self.randomization.robot(self.params, self._drawn)
             self._simulator.set_params(self._robot)
         self._simulator.reset(self._state, memory)
