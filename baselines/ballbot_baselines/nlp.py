@@ -23,6 +23,8 @@ Constraints g, in the order that fatrop needs:
 | at the end | final_path(s_N, p) |
 """
 
+import itertools
+
 import casadi
 import numpy as np
 
@@ -40,7 +42,7 @@ class Stage:
     | `value` | (z, p) -> out |
     | `jacobian` | (z, p) -> out, nonzeros of ∂out/∂z in the order of `jacobian_at` |
     | `hessian` | (z, p, l) -> gradient of lᵀout, nonzeros of its Hessian in the order of `hessian_at` |
-    | `jacobian_at`, `hessian_at` | row and column of each nonzero |
+    | `jacobian_at`, `hessian_at` | sparsity patterns |
     | `size`, `width`, `params` | lengths of out, of z, and of the p that is taken |
     """
 
@@ -60,8 +62,7 @@ class Stage:
         )
         self.value, self.jacobian, self.hessian = in_lanes(name, functions, flags=flags) if of_stages else functions
         self.size, self.width, self.params = out.shape[0], z.shape[0], p.shape[0]
-        self.jacobian_at = _triplets(jacobian)
-        self.hessian_at = _triplets(hessian)
+        self.jacobian_at, self.hessian_at = jacobian.sparsity(), hessian.sparsity()
 
 
 _AHEAD, _SHARE = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -115,11 +116,14 @@ class RatesStage(Stage):
         )
         self.value, self.jacobian, self.hessian = (function.map(LANES) for function in compiled("dynamics", functions))
         self.size, self.width, self.params = n, width, used
-        self.jacobian_at, self.hessian_at = (_triplets(casadi.SX.ones(rows, width)) for rows in (n, width))
+        self.jacobian_at, self.hessian_at = (casadi.Sparsity.dense(rows, width) for rows in (n, width))
 
 
 class StagedNlp:
-    """The nonlinear program of N intervals as CasADi expressions of z, p and the multipliers lam_f and lam_g."""
+    """The nonlinear program of N intervals as CasADi expressions of z, p and the multipliers lam_f and lam_g.
+
+    `gaps` (N, ns) are the rows of g that say that stages follow each other.
+    """
 
     def __init__(
         self, dynamics: Stage, running: Stage, final: Stage, intervals: int, params: int, initial_matrix: np.ndarray
@@ -134,24 +138,27 @@ class StagedNlp:
             params: length of p.
             initial_matrix: (mo, ns).
         """
-        self._dynamics, self._running, self._final, self._initial = dynamics, running, final, initial_matrix
-        self._n, self._states, self._width = intervals, dynamics.size, dynamics.width
-        self._rows = self._states + running.size - 1  # of the constraints of a stage
-        initials = len(initial_matrix)
-        stages = np.arange(intervals)[:, None]
-        self._first_column = stages * self._width
-        self._first_row = stages * self._rows + initials * (stages > 0)
-        self._final_column, self._final_row = intervals * self._width, intervals * self._rows + initials
-        self._variables, self._constraints = self._final_column + self._states, self._final_row + final.size - 1
+        self._dynamics, self._running, self._final, self._initial = dynamics, running, final, casadi.DM(initial_matrix)
+        self._n, self._states, self._width = n, states, width = intervals, dynamics.size, dynamics.width
+        # Results stand kind by kind: gaps of all stages, [cost, path] of all stages and of the end, and initial rows. Those
+        # at `_order` are g, and the others add up to f.
+        sizes = n * states, n * running.size, final.size, len(initial_matrix)
+        self._parts = np.cumsum([0, *sizes]).tolist()
+        gaps, of_stages, of_end, of_start = np.split(np.arange(sum(sizes)), self._parts[1:-1])
+        first, *others = np.hstack([gaps.reshape(n, states), of_stages.reshape(n, -1)[:, 1:]])
+        order = np.concatenate([first, of_start, *others, of_end[1:]])
+        self._order, self._costs = order.tolist(), [*of_stages[:: running.size].tolist(), int(of_end[0])]
+        self._place = np.full(sum(sizes), len(order))  # of each result in [g, f]
+        self._place[order] = np.arange(len(order))
+        self.gaps = self._place[gaps].reshape(n, states)
 
-        self.z, self.p = casadi.MX.sym("z", self._variables), casadi.MX.sym("p", params)
-        self.lam_f, self.lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", self._constraints)
-        self._stages = casadi.reshape(self.z[: self._final_column], self._width, intervals)
-        self._last = self.z[self._final_column :]
+        self.z, self.p = casadi.MX.sym("z", n * width + states), casadi.MX.sym("p", params)
+        self.lam_f, self.lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", len(order))
+        self._stages, self._last = casadi.reshape(self.z[: n * width], width, n), self.z[n * width :]
         # stage functions take of these what they depend on, which may be the stage's number
-        numbers = casadi.MX(casadi.DM(np.arange(intervals)[None]))
-        self._p_all = casadi.vertcat(casadi.repmat(self.p, 1, intervals), numbers)
-        self._p_last = casadi.vertcat(self.p, intervals)
+        numbers = casadi.MX(casadi.DM(np.arange(n)[None]))
+        self._p_all = casadi.vertcat(casadi.repmat(self.p, 1, n), numbers)
+        self._p_last = casadi.vertcat(self.p, n)
 
     def functions(self) -> tuple[casadi.Function, dict[str, casadi.Function], dict[str, casadi.Function]]:
         """The program and its derivatives under the names that CasADi's solvers look for.
@@ -162,10 +169,9 @@ class StagedNlp:
         """
         z, p, lam_f, lam_g = self.z, self.p, self.lam_f, self.lam_g
         f, g = self.values()
-        gradient, jacobian = casadi.densify(self.gradient()), self.jacobian()
+        gradient, jacobian = self.first_derivatives()
         lagrangian_gradient, hessian = self.lagrangian_derivatives()
         inputs, names = [z, p, lam_f, lam_g], ["x", "p", "lam_f", "lam_g"]
-        full_gradient = lam_f * gradient + casadi.mtimes(jacobian.T, lam_g)
         no_gradient = casadi.MX(p.shape[0], 1)  # with respect to p: the signature has it, but calc_lam_p is off
         cache = {
             "nlp_f": casadi.Function("nlp_f", [z, p], [f], ["x", "p"], ["f"]),
@@ -174,7 +180,7 @@ class StagedNlp:
             "nlp_grad": casadi.Function(
                 "nlp_grad",
                 inputs,
-                [f, g, full_gradient, no_gradient],
+                [f, g, lam_f * gradient + casadi.mtimes(jacobian.T, lam_g), no_gradient],
                 names,
                 ["f", "g", "grad_gamma_x", "grad_gamma_p"],
             ),
@@ -192,100 +198,64 @@ class StagedNlp:
 
     def values(self) -> tuple[casadi.MX, casadi.MX]:
         """The objective f, and the constraints g in the order that this module's table gives."""
-        (running,) = self._over_stages(self._running, self._running.value)
-        final = self._final.value(self._last, self._p_of(self._final))
-        f = casadi.sum2(running[0, :]) + final[0]
-        next_states = casadi.horzcat(self._stages[: self._states, 1:], self._last)
-        (reached,) = self._over_stages(self._dynamics, self._dynamics.value)
-        gaps = next_states - reached
-        stage_g = casadi.vertcat(gaps, running[1:, :])
-        initial_g = casadi.mtimes(casadi.DM(self._initial), self._stages[: self._states, 0])
-        return f, casadi.vertcat(stage_g[:, 0], initial_g, casadi.vec(stage_g[:, 1:]), final[1:, :])
+        (reached,), (running,) = (self._over_stages(each, each.value) for each in (self._dynamics, self._running))
+        gaps = casadi.horzcat(self._stages[: self._states, 1:], self._last) - reached
+        final = self._final.value(self._last, self._p_of_end)
+        initial = casadi.mtimes(self._initial, self._stages[: self._states, 0])
+        results = casadi.vertcat(casadi.vec(gaps), casadi.vec(running), final, initial)
+        return casadi.sum1(results[self._costs]), results[self._order]
 
-    def gradient(self) -> casadi.MX:
-        """∂f/∂z, sparse.
-
-        Nonzeros: row 0 of every stage's Jacobian of [cost, path], then row 0 of the last stage's.
-        """
-        running, final = self._stage_jacobians(self._running), self._final_jacobian()
-        (row, col), (final_row, final_col) = self._running.jacobian_at, self._final.jacobian_at
-        is_cost, is_final_cost = row == 0, final_row == 0
-        variable = self._first_column + col[is_cost]
-        final_variable = self._final_column + final_col[is_final_cost]
-        places = [(variable, np.zeros_like(variable)), (final_variable, np.zeros_like(final_variable))]
-        values = casadi.vertcat(_rows(running, is_cost), _rows(final, is_final_cost))
-        return _scatter(places, values, (self._variables, 1))
-
-    def jacobian(self) -> casadi.MX:
-        """∂g/∂z, sparse.
-
-        Nonzeros, one block after the other: −∂next/∂[s_k, w_k] of every stage, +1 for the s_{k+1} of every stage, the path
-        rows of every stage, the initial matrix, and the final path rows.
-        """
-        running, final = self._stage_jacobians(self._running), self._final_jacobian()
-        next_row, next_col = self._dynamics.jacobian_at
-        row, col = self._running.jacobian_at
-        final_row, final_col = self._final.jacobian_at
-        initial_row, initial_col = np.nonzero(self._initial)
-        is_path, is_final_path = row > 0, final_row > 0
-        component = np.arange(self._states)
-        # Row 0 of [cost, path] is no constraint, so path rows start one row earlier.
-        places = [
-            (self._first_row + next_row, self._first_column + next_col),
-            (self._first_row + component, self._first_column + self._width + component),
-            (self._first_row + self._states - 1 + row[is_path], self._first_column + col[is_path]),
-            (self._rows + initial_row, initial_col),
-            (self._final_row - 1 + final_row[is_final_path], self._final_column + final_col[is_final_path]),
+    def first_derivatives(self) -> tuple[casadi.MX, casadi.MX]:
+        """∂f/∂z, a dense column, and ∂g/∂z, sparse."""
+        n, states, width = self._n, self._states, self._width
+        of_stages = (self._over_stages(each, each.jacobian)[1] for each in (self._dynamics, self._running))
+        slopes, more = map(casadi.vec, of_stages)
+        _, at_end = self._final.jacobian(self._last, self._p_of_end)
+        initial = casadi.sparsify(self._initial)
+        values = casadi.vertcat(-slopes, casadi.MX.ones(n * states), more, at_end, casadi.DM(initial.nonzeros()))
+        # where they stand among the derivatives of all results
+        empty, count = casadi.Sparsity, itertools.count(1)
+        same, last = casadi.Sparsity.diag(states, width), casadi.Sparsity.diag(states, states)
+        numbered = [
+            casadi.DM(pattern, list(itertools.islice(count, pattern.nnz())))
+            for pattern in (
+                casadi.diagcat(*[self._dynamics.jacobian_at] * n, empty(0, states)),
+                casadi.horzcat(empty(n * states, width), casadi.diagcat(*[same] * (n - 1), last)),
+                casadi.diagcat(*[self._running.jacobian_at] * n, self._final.jacobian_at),
+                casadi.horzcat(initial.sparsity(), empty(initial.shape[0], self.z.shape[0] - states)),
+            )
         ]
-        values = casadi.vertcat(
-            -casadi.vec(self._stage_jacobians(self._dynamics)),
-            casadi.MX.ones(self._n * self._states),
-            _rows(running, is_path),
-            casadi.MX(casadi.DM(self._initial[initial_row, initial_col])),
-            _rows(final, is_final_path),
-        )
-        return _scatter(places, values, (self._constraints, self._variables))
+        of_results = casadi.vertcat(numbered[0] + numbered[1], *numbered[2:])
+
+        def gathered(rows: list[int]) -> casadi.MX:
+            found = of_results[rows, :]
+            return casadi.MX(found.sparsity(), values[[int(number) - 1 for number in found.nonzeros()]])
+
+        return casadi.densify(casadi.sum1(gathered(self._costs)).T), gathered(self._order)
 
     def lagrangian_derivatives(self) -> tuple[casadi.MX, casadi.MX]:
-        """Gradient (dense) and Hessian (sparse) of lam_f·f + lam_gᵀg with respect to z.
-
-        Nonzeros of the Hessian: that of the dynamics of every stage, that of [cost, path] of every stage, and that of
-        [final_cost, final_path]. The first two share places, and add up there.
-        """
-        lam_initial, lam_stages, lam_final = self._divided_multipliers()
-        lam_next, lam_path = lam_stages[: self._states, :], lam_stages[self._states :, :]
+        """Gradient (dense) and Hessian (sparse) of lam_f·f + lam_gᵀg with respect to z."""
+        n, states = self._n, self._states
+        multipliers = casadi.vertcat(self.lam_g, self.lam_f)[self._place.tolist()]
+        lam_next, lam_running, lam_final, lam_initial = casadi.vertsplit(multipliers, self._parts)
+        lam_next = casadi.reshape(lam_next, states, n)
         gradient_next, hessian_next = self._over_stages(self._dynamics, self._dynamics.hessian, -lam_next)
-        lam_running = casadi.vertcat(casadi.repmat(self.lam_f, 1, self._n), lam_path)
-        gradient, hessian = self._over_stages(self._running, self._running.hessian, lam_running)
-        final_gradient, final_hessian = self._final.hessian(
-            self._last, self._p_of(self._final), casadi.vertcat(self.lam_f, lam_final)
+        gradient, hessian = self._over_stages(
+            self._running, self._running.hessian, casadi.reshape(lam_running, self._running.size, n)
         )
+        final_gradient, final_hessian = self._final.hessian(self._last, self._p_of_end, lam_final)
         # s_k is also the next state of stage k − 1, and s_0 is in the initial rows.
-        of_states = casadi.horzcat(casadi.mtimes(casadi.DM(self._initial.T), lam_initial), lam_next[:, :-1])
-        of_inputs = casadi.MX.zeros(self._width - self._states, self._n)
+        of_states = casadi.horzcat(casadi.mtimes(self._initial.T, lam_initial), lam_next[:, :-1])
+        of_inputs = casadi.MX.zeros(self._width - states, n)
         stage_gradients = gradient_next + gradient + casadi.vertcat(of_states, of_inputs)
-        full_gradient = casadi.vertcat(casadi.vec(stage_gradients), final_gradient + lam_next[:, -1])
-        places = [
-            tuple(self._first_column + at for at in self._dynamics.hessian_at),
-            tuple(self._first_column + at for at in self._running.hessian_at),
-            tuple(self._final_column + at for at in self._final.hessian_at),
-        ]
-        values = casadi.vertcat(casadi.vec(hessian_next), casadi.vec(hessian), final_hessian)
-        return full_gradient, _scatter(places, values, (self._variables, self._variables))
-
-    def _divided_multipliers(self) -> tuple[casadi.MX, casadi.MX, casadi.MX]:
-        """lam_g of the initial rows (mo,), of the stages' rows (rows, N), and of the final rows."""
-        rows, after_initial = self._rows, self._rows + len(self._initial)
-        of_stages = casadi.vertcat(self.lam_g[:rows], self.lam_g[after_initial : self._final_row])
-        return self.lam_g[rows:after_initial], casadi.reshape(of_stages, rows, self._n), self.lam_g[self._final_row :]
-
-    def _stage_jacobians(self, stage: Stage) -> casadi.MX:
-        """(nonzeros, N)"""
-        return self._over_stages(stage, stage.jacobian)[1]
-
-    def _final_jacobian(self) -> casadi.MX:
-        """(nonzeros,)"""
-        return self._final.jacobian(self._last, self._p_of(self._final))[1]
+        of_stages = (
+            casadi.MX(casadi.diagcat(*[each.hessian_at] * n), casadi.vec(nonzeros))
+            for each, nonzeros in ((self._dynamics, hessian_next), (self._running, hessian))
+        )
+        return (
+            casadi.vertcat(casadi.vec(stage_gradients), final_gradient + lam_next[:, -1]),
+            casadi.diagcat(sum(of_stages), casadi.MX(self._final.hessian_at, final_hessian)),
+        )
 
     def _over_stages(self, stage: Stage, function: casadi.Function, *multipliers: casadi.MX) -> list[casadi.MX]:
         """Results of all stages, a column each. The last block of stages is filled up with the last stage."""
@@ -296,36 +266,11 @@ class StagedNlp:
         results = function.map(blocks).call([part[:, columns] if last else part for part in given])
         return [part[:, : self._n] if last else part for part in results]
 
-    def _p_of(self, stage: Stage) -> casadi.MX:
-        return self._p_last[: stage.params]
-
-
-def _scatter(places: list[tuple[np.ndarray, ...]], values: casadi.MX, shape: tuple[int, int]) -> casadi.MX:
-    """A sparse matrix from the rows and columns of its values. Values with the same place (at most two) add up."""
-    row, col = (np.concatenate([np.ravel(part[i]) for part in places]) for i in (0, 1))
-    order = np.lexsort((row, col))
-    place = col[order] * shape[0] + row[order]
-    first = np.flatnonzero(np.diff(place, prepend=-1))
-    pattern = casadi.Sparsity.triplet(*shape, row[order[first]].tolist(), col[order[first]].tolist())
-    if len(first) == len(place):
-        entries = values[order.tolist()]
-    else:
-        target = np.searchsorted(place[first], col * shape[0] + row)
-        add_up = casadi.Sparsity.triplet(len(first), len(place), target.tolist(), list(range(len(place))))
-        entries = casadi.mtimes(casadi.MX(casadi.DM(add_up, 1.0)), values)
-    return casadi.MX(pattern, entries)
-
-
-def _rows(nonzeros: casadi.MX, keep: np.ndarray) -> casadi.MX:
-    """The nonzeros to keep, stage after stage, as one column."""
-    return casadi.vec(nonzeros[np.flatnonzero(keep).tolist(), :]) if keep.any() else casadi.MX(0, 1)
+    @property
+    def _p_of_end(self) -> casadi.MX:
+        return self._p_last[: self._final.params]
 
 
 def _nonzeros(matrix: casadi.SX) -> casadi.SX:
     # CasADi's type stubs do not know that vertcat takes scalar expressions.
     return casadi.vertcat(*matrix.nonzeros()) if matrix.nnz() else casadi.SX(0, 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
-
-
-def _triplets(matrix: casadi.SX) -> tuple[np.ndarray, np.ndarray]:
-    rows, cols = matrix.sparsity().get_triplet()
-    return np.array(rows, int), np.array(cols, int)

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import casadi
 import numpy as np
-import scipy.linalg
 
 from ballbot_baselines.compiled import LONG, SIMD
 from ballbot_baselines.nlp import RatesStage, Stage, StagedNlp
@@ -198,13 +197,13 @@ class OcpSolver:
         paths, finals = stages.running.size - 1, stages.final.size - 1
         initial_matrix = np.zeros((0, ocp.states)) if ocp.initial_matrix is None else ocp.initial_matrix
         initials = len(initial_matrix)
-        self._rows, self._initials = ocp.states + paths, initials
         of_stage = _equality(ocp.states + stages.equalities, ocp.states + paths)
         of_end = _equality(stages.final_equalities, finals)
         equality = of_stage + [True] * initials + of_stage * (intervals - 1) + of_end
         self._g_lower, self._g_upper = np.zeros(len(equality)), np.where(equality, 0.0, np.inf)
         nlp = StagedNlp(stages.dynamics, stages.running, stages.final, intervals, ocp.params, initial_matrix)
         oracle, derivatives, for_ipopt = nlp.functions()
+        self._gaps = nlp.gaps
         options: dict = {"print_time": False, "error_on_fail": False, "calc_lam_p": False, "cache": derivatives}
         own = {"print_level": 0, "tol": tolerance, "max_iter": max_iterations, "mu_init": barrier}
         if solver == "fatrop":
@@ -270,7 +269,8 @@ class OcpSolver:
             iterations=int(stats["iter_count"]),
             seconds=seconds,
             solver=self.solver,
-            costates=self._costates(np.array(result["lam_g"]).ravel()),
+            # Gaps are s_{k+1} − next_k, and the cost's slope with respect to their right-hand side is minus the multiplier.
+            costates=-np.array(result["lam_g"]).ravel()[self._gaps],
         )
 
     def toward_consistency(
@@ -293,10 +293,12 @@ class OcpSolver:
         lower = _interleave(bounds.state_lower, bounds.input_lower)
         upper = _interleave(bounds.state_upper, bounds.input_upper)
         z = np.clip(_interleave(states, inputs), lower, upper)
-        free, equal = lower < upper, self._g_upper == 0
+        equal, among_free = np.flatnonzero(self._g_upper == 0).tolist(), casadi.diag(casadi.DM(lower < upper))
         for _ in range(2):
             g, jacobian = self._jac_g(z, np.asarray(p, np.float64))
-            step = self._newton.solve(np.array(jacobian.nonzeros()), free, -np.array(g).ravel()[equal])
+            slopes = jacobian[equal, :] @ among_free
+            products = slopes @ slopes.T + _DAMPING * casadi.DM.eye(len(equal))
+            step = np.array(slopes.T @ casadi.solve(products, -g[equal], "ldl")).ravel()
             if not np.isfinite(step).all():
                 break
             z = np.clip(z + step, lower, upper)
@@ -304,60 +306,15 @@ class OcpSolver:
                 break
         return self._divide(z)
 
-    @functools.cached_property
-    def _newton(self) -> "_LeastNorm":
-        return _LeastNorm(self._jac_g.sparsity_out(1), self._g_upper == 0)
-
     def _divide(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ns, width = self.ocp.states, self.ocp.states + self.ocp.inputs
         stages = z[: self.intervals * width].reshape(self.intervals, width)
         return np.vstack([stages[:, :ns], z[self.intervals * width :]]), stages[:, ns:].copy()
 
-    def _costates(self, multipliers: np.ndarray) -> np.ndarray:
-        # Constraints are s_{k+1} − next_k = 0. The cost's slope with respect to the right-hand side is minus the multiplier.
-        first = self._rows + self._initials + self._rows * np.arange(-1, self.intervals - 1)
-        first[0] = 0
-        return -multipliers[first[:, None] + np.arange(self.ocp.states)]
-
 
 def _equality(equalities: int, constraints: int) -> list[bool]:
     """Whether each constraint is an equality; equalities come first."""
     return [True] * equalities + [False] * (constraints - equalities)
-
-
-class _LeastNorm:
-    """The shortest v (size,) with M v = right, up to `_DAMPING`, for matrices M whose nonzeros stand at the same places.
-
-    What depends on these places alone is found once.
-    """
-
-    def __init__(self, sparsity: casadi.Sparsity, of_rows: np.ndarray):
-        """Makes it for the rows of a matrix that a mask has; they stand stage by stage, so M·Mᵀ is banded."""
-        rows, columns = map(np.array, sparsity.get_triplet())
-        count, self._size = int(of_rows.sum()), sparsity.size2()
-        self._kept = of_rows[rows]
-        self._rows, self._columns = (np.cumsum(of_rows) - 1)[rows[self._kept]], columns[self._kept]
-        firsts = [np.empty(0, np.int64)]
-        seconds = firsts.copy()
-        for ahead in range(len(self._rows)):  # M·Mᵀ sums the products of two nonzeros of one column
-            first = np.flatnonzero(self._columns[ahead:] == self._columns[: len(self._columns) - ahead])
-            if not first.size:
-                break
-            firsts.append(first)
-            seconds.append(first + ahead)
-        self._first, self._second = np.concatenate(firsts), np.concatenate(seconds)
-        below = self._rows[self._second] - self._rows[self._first]
-        self._places = below * count + self._rows[self._first]
-        self._shape = int(below.max(initial=0)) + 1, count
-
-    def solve(self, values: np.ndarray, free: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """v, given all nonzeros, column by column and downwards; which components of v may differ from 0; and right."""
-        values = values[self._kept] * free[self._columns]
-        products = values[self._second] * values[self._first]
-        band = np.bincount(self._places, products, self._shape[0] * self._shape[1]).reshape(self._shape)
-        band[0] += _DAMPING
-        solved = scipy.linalg.solveh_banded(band, right, overwrite_ab=True, lower=True)
-        return np.bincount(self._columns, values * solved[self._rows], self._size)
 
 
 def _interleave(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
