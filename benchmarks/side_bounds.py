@@ -60,9 +60,9 @@ def lines_of(index: int, seed: int) -> list[dict[str, float | str]]:
     solved = {choice: cost_of(x0, c, every, choice) for choice in choices}
     solving = time.process_time() - began - bounding
     best = min(solved, key=lambda choice: solved[choice][0])
-    prediction = sides.predict(TASK, PARAMS, x0, c, solved[best][1], obstacles)
+    prediction = sides.predict(TASK, PARAMS, x0[None], c[1:2], solved[best][1][None, :, 0], obstacles[None])
     predicted: dict[Choice, float] = {
-        tuple(side): cost for side, cost in zip(prediction.sides.tolist(), prediction.costs, strict=True)
+        tuple(side): cost for side, cost in zip(prediction.sides.tolist(), prediction.costs[0], strict=True)
     }
 
     def bound(choice: Choice, size: int) -> float:

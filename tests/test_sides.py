@@ -18,36 +18,43 @@ def slaloms():
     return [(known.states[i], known.constants[i], known.trajectories[i].x[:, :2]) for i in range(20)]
 
 
+def predicted(task, params, x0, c, path):
+    """What is predicted of one slalom."""
+    return sides.predict(task, params, x0[None], c[1:2], path[None, :, 0], task.passed_obstacles(c)[None])
+
+
 def test_predicted_motions_clear_every_obstacle_on_their_side(slaloms, params):
     task = Weave()
     for x0, c, path in slaloms[:5]:
         _, obstacles = split_constants(c)
-        found = sides.predict(task, params, x0, c, path, task.passed_obstacles(c))
+        found = predicted(task, params, x0, c, path)
         assert len(found.sides) == 2 ** len(obstacles)
         passed = [int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]]
-        clearance = found.sides * (found.y[:, passed] - obstacles[:, 1]) - obstacles[:, 2] - task.ball_radius
+        y = found.y(0)
+        clearance = found.sides * (y[:, passed] - obstacles[:, 1]) - obstacles[:, 2] - task.ball_radius
         assert clearance.min() > -1e-6
+        assert found.passed[0].tolist() == passed
         assert (found.costs >= 0).all()
-        np.testing.assert_allclose(found.y[:, 0], x0[1], atol=1e-9)
-        np.testing.assert_allclose(found.y[:, -1], 0.0, atol=1e-2)
+        np.testing.assert_allclose(y[:, 0], x0[1], atol=1e-9)
+        np.testing.assert_allclose(y[:, -1], 0.0, atol=1e-2)
 
 
 def test_obstacles_far_from_the_way_cost_nothing_on_one_side(slaloms, params):
     x0, c, path = slaloms[0]
     c = c.copy()
     c[3::3] = 8.0  # all on the left
-    found = sides.predict(Weave(), params, x0, c, path, Weave().passed_obstacles(c))
+    found = predicted(Weave(), params, x0, c, path)
     right = (found.sides == -1).all(1)
-    assert found.costs[right] == 0.0
-    assert found.costs[~right].min() > 1.0
+    assert found.costs[0, right] == 0.0
+    assert found.costs[0, ~right].min() > 1.0
 
 
 def test_the_optimal_choice_is_predicted_among_the_best(slaloms, params):
     task, excess = Weave(), []
     for x0, c, path in slaloms:
-        found = sides.predict(task, params, x0, c, path, task.passed_obstacles(c))
+        found = predicted(task, params, x0, c, path)
         optimal = (found.sides == sides_passed(path, c)).all(1)
-        excess.append(float(found.costs[optimal][0] - found.costs.min()))
+        excess.append(float(found.costs[0, optimal][0] - found.costs.min()))
     assert max(excess) < 1.0
     assert np.median(excess) < 0.1
 
@@ -59,9 +66,9 @@ def test_the_slalom_without_obstacles_predicts_the_optimal_choice(params):
         x0, c = known.states[i], known.constants[i]
         free = find_optimum(task, params, x0, task.without_obstacles(c), guesses=1)
         assert free.cost < known.costs[i]
-        found = sides.predict(task, params, x0, c, free.trajectory.x[:, :2], task.passed_obstacles(c))
+        found = predicted(task, params, x0, c, free.trajectory.x)
         optimal = (found.sides == sides_passed(known.trajectories[i].x[:, :2], c)).all(1)
-        doubt.append((found.costs[optimal][0] - found.costs.min()) / known.costs[i])
+        doubt.append((found.costs[0, optimal][0] - found.costs.min()) / known.costs[i])
     assert max(doubt) < 0.01
 
 

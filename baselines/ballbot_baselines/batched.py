@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ballbot_baselines import guess, righting, search
+from ballbot_baselines import guess, righting, search, sides
 from ballbot_baselines.ilqr import MARGIN, Options, Solutions, ilqr
 from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
 from ballbot_gym import machine_code
@@ -167,16 +167,6 @@ class _Guesses:
     def some(self, chosen: np.ndarray) -> "_Guesses":
         return _Guesses(self.of[chosen], self.x[chosen], self.a[chosen], self.steps[chosen])
 
-    @classmethod
-    def joined(cls, of: Sequence[int], motions: Sequence[tuple[np.ndarray, np.ndarray]]) -> "_Guesses":
-        """Of states (n+1, 8) and actions (n, 2), whose n may differ."""
-        steps = np.array([len(a) for _, a in motions])
-        most = steps.max(initial=0)
-        x, a = np.zeros((len(steps), most + 1, motions[0][0].shape[1])), np.zeros((len(steps), most, 2))
-        for i, (states, actions) in enumerate(motions):
-            x[i, : len(states)], a[i, : len(actions)] = states, actions
-        return cls(np.asarray(of), x, a, steps)
-
 
 class _Batch:
     """The search of some episodes, which fills in their `BatchOptima`."""
@@ -193,6 +183,11 @@ class _Batch:
         """(B, 8) where each episode comes to rest, of a task that ends there."""
         episodes = zip(self._x0, self._c, strict=True)
         return np.array([self._task.reference(x, c, self._params).x[-1] for x, c in episodes])
+
+    @cached_property
+    def _obstacles(self) -> list[np.ndarray]:
+        """(n, 3) of each slalom, as `Task.passed_obstacles` gives them."""
+        return [np.asarray(self._task.passed_obstacles(c)) for c in self._c]
 
     def search(self, forces: np.ndarray | None) -> None:
         task = self._task
@@ -268,10 +263,9 @@ class _Batch:
 
     def _sides(self, of: Sequence[int] | np.ndarray, paths: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """(J, most obstacles) on which sides ground paths (n, at least 2) pass; 0 where there is no obstacle."""
-        obstacles = [np.asarray(self._task.passed_obstacles(c)) for c in self._c]
-        found = np.zeros((len(of), max(map(len, obstacles))), int)
+        found = np.zeros((len(of), max(map(len, self._obstacles))), int)
         for row, (i, path) in enumerate(zip(of, paths, strict=True)):
-            found[row, : len(obstacles[i])] = search.side_choice(path, obstacles[i])
+            found[row, : len(self._obstacles[i])] = search.side_choice(path, self._obstacles[i])
         return found
 
     def _keep(
@@ -374,9 +368,10 @@ class _Batch:
         return _Guesses(np.arange(count), x, a, np.full(count, n)).some(np.isfinite(best))
 
     def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> _Guesses:
-        """Guesses along ground paths (steps+1, 2)."""
-        motions = [self._motion(path, self._task.control_dt, self._x0[i]) for i, path in zip(of, paths, strict=True)]
-        return _Guesses.joined(of, [(x[::coarseness], a[::coarseness]) for x, a in motions])
+        """Guesses along ground paths (steps+1, 2) of the same number of steps."""
+        x, a = self._motion(np.array(paths), self._task.control_dt, self._x0[of])
+        a = a[:, ::coarseness]
+        return _Guesses(np.asarray(of), x[:, ::coarseness], a, np.full(len(a), a.shape[1]))
 
     def _motion(self, path: np.ndarray, length: float | np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, u = guess.along_path(self._params, path, length, start=x0)
@@ -441,24 +436,30 @@ class _Batch:
         """Slaloms: likely choices of sides are compared with forces held longer, over the time until LQR is right about the
         rest.
         """
-        task, coarse, every = self._task, search.COARSE, np.arange(len(self._x0))
-        straight = [search.straight_path(task, self._params, x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
+        task, params, coarse, every = self._task, self._params, search.COARSE, np.arange(len(self._x0))
+        straight = [search.straight_path(task, params, x0, c) for x0, c in zip(self._x0, self._c, strict=True)]
         away = np.array([task.without_obstacles(c) for c in self._c])
         free = self._solve(self._along(every.tolist(), straight, coarse), _ROUGH_PATH, coarse, c=away)
-        solved = np.flatnonzero(free.solved)
-        if not len(solved):
-            return
-        likely = search.likely_sides(
-            task, self._params, self._x0[solved], self._c[solved], free.x[solved], free.costs[solved]
-        )
-        steps = np.full(len(solved), task.steps)
-        if self._solver.rest is not None:  # rounded up, so that many episodes share a horizon
-            shared = coarse * max(1, round(_SHARED_SECONDS / task.control_dt / coarse))
-            after = likely.passed + _AFTER_SECONDS / task.control_dt
-            steps = np.minimum(steps, np.ceil(after / shared).astype(int) * shared)
-        for some in np.unique(steps).tolist():
-            chosen = {int(solved[k]): likely.sides[k] for k in np.flatnonzero(steps == some)}
-            self._pass_obstacles(chosen, some)
+        along = guess.resampled(free.x[..., :1], task.steps)[..., 0]
+        goal_y = np.array([straight_one[-1, 1] for straight_one in straight])
+        doubt = search.GRIPPING_DOUBT if params.grips else search.SIDE_DOUBT
+        likely: dict[int, dict[int, np.ndarray]] = {}  # choices by the steps that are optimized, and by episode
+        counts = np.where(free.solved, [len(each) for each in self._obstacles], 0)
+        for count in np.unique(counts[counts > 0]):
+            rows = np.flatnonzero(counts == count)
+            own = np.array([self._obstacles[i] for i in rows])
+            found = sides.predict(task, params, self._x0[rows], goal_y[rows], along[rows], own)
+            predicted, steps = free.costs[rows, None] + found.costs, np.full(len(rows), task.steps)
+            if self._solver.rest is not None:  # rounded up, so that many episodes share a horizon
+                shared = coarse * max(1, round(_SHARED_SECONDS / task.control_dt / coarse))
+                after = found.passed.max(1) + _AFTER_SECONDS / task.control_dt
+                steps = np.minimum(steps, np.ceil(after / shared).astype(int) * shared)
+            for i, prices, last in zip(rows.tolist(), predicted, steps.tolist(), strict=True):
+                order = np.argsort(prices, kind="stable")
+                chosen = order[prices[order] <= prices.min() * (1 + doubt)]
+                likely.setdefault(last, {})[i] = found.sides[chosen]
+        for steps, choices in likely.items():
+            self._pass_obstacles(choices, steps)
 
     def _pass_obstacles(self, likely: Mapping[int, np.ndarray], steps: int) -> None:
         """The best of likely choices of sides (k, obstacles) of episodes, whose first control steps are optimized."""
@@ -469,15 +470,15 @@ class _Batch:
             for i, choices in likely.items()
             for chosen in choices
         ]
-        along, sides = self._along(of, paths, coarse), self._sides(of, paths)
-        rough = self._solve(along, _SIDES, coarse, chosen_sides=sides)
+        along, wanted = self._along(of, paths, coarse), self._sides(of, paths)
+        rough = self._solve(along, _SIDES, coarse, chosen_sides=wanted)
         chosen = _contenders(along.of, rough, _SIDES_DOUBT)
         if not len(chosen):
             return
         x = np.array([guess.resampled(states, steps) for states in rough.x[chosen]])
         a = np.repeat(rough.a[chosen], coarse, axis=1)
         near = _Guesses(along.of[chosen], x, a, np.full(len(chosen), steps))
-        found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=sides[chosen])
+        found = self._solve(near, _ROUGH_SOLUTION, chosen_sides=wanted[chosen])
         self._pass_later(near, found)
         left = chosen[np.isinf(self._kept(near, found))]
         if len(left):

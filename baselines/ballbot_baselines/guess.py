@@ -51,8 +51,9 @@ def resampled(values: np.ndarray, intervals: int) -> np.ndarray:
 
 
 def _smoothed(values: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
-    """Means (..., n, k) over `_SMOOTHING` seconds of values every dt s, (...,)."""
-    widths, means = np.maximum(1, np.rint(_SMOOTHING / np.asarray(dt)).astype(int)), np.empty_like(values)
+    """Means (..., n, k) over `_SMOOTHING` seconds of values every dt s, one or (...,)."""
+    widths = np.maximum(1, np.rint(_SMOOTHING / np.broadcast_to(dt, values.shape[:-2])).astype(int))
+    means = np.empty_like(values)
     for width in np.unique(widths).tolist():
         some = values[widths == width]
         padded = np.pad(some, ((0, 0), (width // 2, width - 1 - width // 2), (0, 0)), mode="edge")

@@ -6,7 +6,7 @@ leads to a solution, the search starts from simulated recoveries (`righting.py`)
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,13 +32,11 @@ _COARSEST = 4  # the same when choices of sides are compared first
 _ROUGH = 1e-4  # tolerance there: costs are then right to 1e-5 of their value, in four iterations less
 BASIN_DOUBT = 0.01
 """Paths whose coarse costs differ by less than this share may be ordered differently on the env's grid."""
-_SIDE_DOUBT = 0.01  # choices of sides whose predicted cost exceeds the best by more than this share are not solved
+SIDE_DOUBT = 0.01  # choices of sides whose predicted cost exceeds the best by more than this share are not solved
 _COARSEST_DOUBT = 0.005  # relative: how differently the coarsest grid may order choices of sides; 0.0035 was measured
 _GRID_DOUBT = 0.002  # the same of the coarse grid; 0.0007 was measured
 _GRIPPING_ITERATIONS = 300  # of the coarse searches of a robot that has to grip: 130 to 270 are common
-_GRIPPING_DOUBT = (
-    0.02  # for such robots in place of `_SIDE_DOUBT` and `_GRID_DOUBT`, because predictions ignore friction
-)
+GRIPPING_DOUBT = 0.02  # for such robots in place of `SIDE_DOUBT` and `_GRID_DOUBT`, because predictions ignore friction
 _STRAIGHT_SECONDS = 3.0  # how long the guessed motion without obstacles takes
 
 Found = tuple[int, OcpSolution]
@@ -202,10 +200,10 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
     there is no motion without obstacles, nothing is solved.
     """
     task, params, x0, c = episode.task, episode.params, episode.x0, episode.c
-    iterations, side_doubt, grid_doubt = _QUICK_ITERATIONS, _SIDE_DOUBT, _GRID_DOUBT
+    iterations, side_doubt, grid_doubt = _QUICK_ITERATIONS, SIDE_DOUBT, _GRID_DOUBT
     coarsest, tolerance = (_COARSEST if task.steps % _COARSEST == 0 else COARSE), _ROUGH
     if params.grips:
-        iterations, side_doubt, grid_doubt = _GRIPPING_ITERATIONS, _GRIPPING_DOUBT, _GRIPPING_DOUBT
+        iterations, side_doubt, grid_doubt = _GRIPPING_ITERATIONS, GRIPPING_DOUBT, GRIPPING_DOUBT
         coarsest, tolerance = COARSE, None
 
     def solved_from(path: np.ndarray, barrier: float, episode: Shooting = episode) -> OcpSolution:
@@ -216,12 +214,17 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
     free = solved_from(straight_path(task, params, x0, c), NEAR_BARRIER, replace(episode, c=task.without_obstacles(c)))
     if not free.success:
         return []
-    predicted, motions = _predicted_sides(task, params, x0, c, paths, free.states, free.cost)
+    motion = guess.resampled(free.states[:, :2], task.steps)
+    goal_y = task.reference(x0, c, params).x[-1, 1:2]
+    prediction = sides.predict(task, params, x0[None], goal_y, motion[None, :, 0], obstacles[None])
+    rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
+    row_of = [rows[side_choice(path, obstacles)] for path in paths]
+    predicted, across = free.cost + prediction.costs[0, row_of], prediction.y(0)[row_of]
     solved: list[Found] = []
     for i in np.argsort(predicted, kind="stable")[:most].tolist():
         if solved and predicted[i] > predicted[solved[0][0]] * (1 + side_doubt):
             break
-        motion = motions[i]
+        motion = np.column_stack([motion[:, 0], across[i]])
         for start, barrier in ((motion, NEAR_BARRIER), (motion, BARRIER), (paths[i], BARRIER)):
             solution = solved_from(start, barrier)
             if solution.success:
@@ -231,62 +234,6 @@ def _from_likely_sides(episode: Shooting, paths: list[np.ndarray], most: int, ob
     if coarsest > COARSE and len(_distinct(solved, _COARSEST_DOUBT)) > 1:
         solved = _on_coarse_grid(episode, _distinct(solved, _COARSEST_DOUBT)) or solved
     return _refined(episode, solved, grid_doubt, paths[:most])
-
-
-def _predicted_sides(
-    task: Task,
-    params: BallbotParams,
-    x0: np.ndarray,
-    c: np.ndarray,
-    paths: list[np.ndarray],
-    free: np.ndarray,
-    cost: float,
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """What each guessed path's choice of sides is predicted to cost, and its predicted motion (steps+1, 2).
-
-    From the states (n+1, 8) and the cost of the motion without obstacles.
-    """
-    obstacles = task.passed_obstacles(c)
-    assert obstacles is not None
-    along = guess.resampled(free[:, :2], task.steps)
-    prediction = sides.predict(task, params, x0, c, along, obstacles)
-    rows = {tuple(side): row for row, side in enumerate(prediction.sides.tolist())}
-    row_of = [rows[side_choice(path, obstacles)] for path in paths]
-    return cost + prediction.costs[row_of], [np.column_stack([along[:, 0], prediction.y[row]]) for row in row_of]
-
-
-@dataclass(frozen=True)
-class LikelySides:
-    """Of B slaloms: every choice of sides that may be the best, the likeliest first, −1 or 1, (k, obstacles) of each; and the
-    control steps (B,) at which the last obstacle is passed.
-    """
-
-    sides: list[np.ndarray]
-    passed: np.ndarray
-
-
-def likely_sides(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, free: np.ndarray, costs: np.ndarray
-) -> LikelySides:
-    """From the states (B, n+1, 8) and costs (B,) of the motions without obstacles of slaloms x0 (B, 8), c (B, nc)."""
-    doubt = _GRIPPING_DOUBT if params.grips else _SIDE_DOUBT
-    found: list[np.ndarray] = [np.zeros((0, 0), int)] * len(c)
-    last = np.zeros(len(c), int)
-    obstacles = [np.asarray(task.passed_obstacles(each)) for each in c]
-    goal_y = np.array([task.reference(*episode, params).x[-1, 1] for episode in zip(x0, c, strict=True)])
-    along = np.array([guess.resampled(states[:, :1], task.steps)[:, 0] for states in free])
-    counts = np.array([len(each) for each in obstacles])
-    for count in np.unique(counts):
-        rows = np.flatnonzero(counts == count)
-        own = np.array([obstacles[i] for i in rows])
-        more, passed = sides.predict_costs(task, params, x0[rows], goal_y[rows], along[rows], own)
-        predicted = costs[rows, None] + more
-        choices = sides.choices(count)
-        for i, prices in zip(rows.tolist(), predicted, strict=True):
-            order = np.argsort(prices, kind="stable")
-            found[i] = choices[order[prices[order] <= prices.min() * (1 + doubt)]]
-        last[rows] = passed.max(1)
-    return LikelySides(found, last)
 
 
 def _on_coarse_grid(episode: Shooting, solved: list[Found]) -> list[Found]:

@@ -30,49 +30,34 @@ _REGULARIZATION = 1e-9  # of the kernel, m²: obstacles passed in the same contr
 
 @dataclass(frozen=True)
 class Prediction:
-    """Choices of sides and what follows from each.
+    """What follows from every choice of sides, in B slaloms of n obstacles.
 
     | field | shape | meaning |
     |---|---|---|
-    | sides | (n, obstacles) | −1 or 1, as in `Weave.side_path` |
-    | costs | (n,) | what the choice costs more than the motion without obstacles |
-    | y | (n, steps+1) | the ground position across the way, m |
+    | sides | (2^n, n) | −1 or 1, as in `Weave.side_path` |
+    | costs | (B, 2^n) | what the choice costs more than the motion without obstacles |
+    | passed | (B, n) | control steps at which obstacles are passed |
+    | free | (B, steps+1) | the ground position across the way without obstacles, m |
+    | pushes | (B, 2^n, n) | multipliers of the obstacles, positive to the left |
+    | responses | (steps+1, steps) | the position's response to forces, divided by √s |
     """
 
     sides: np.ndarray
     costs: np.ndarray
-    y: np.ndarray
+    passed: np.ndarray
+    free: np.ndarray
+    pushes: np.ndarray
+    responses: np.ndarray
+
+    def y(self, slalom: int) -> np.ndarray:
+        """(2^n, steps+1) the ground position across the way in one slalom, m."""
+        return self.free[slalom] + self.pushes[slalom] @ self.responses[self.passed[slalom]] @ self.responses.T
 
 
 def predict(
-    task: Task, params: BallbotParams, x0: np.ndarray, c: np.ndarray, path: np.ndarray, obstacles: np.ndarray
-) -> Prediction:
-    """Predicts every choice of sides.
-
-    Args:
-        task, params: the slalom and the robot.
-        x0, c: (8,) initial state and (nc,) constants.
-        path: (steps+1, 2) ground positions of one solution, m.
-        obstacles: (n, 3) as `Task.passed_obstacles` gives.
-    """
-    goal_y = task.reference(x0, c, params).x[-1, 1]
-    model = _model(task, params)
-    passed = np.array([int(np.argmin(np.abs(path[:, 0] - x))) for x in obstacles[:, 0]])
-    free = goal_y + model.free @ (np.asarray(x0)[_ACROSS] - [goal_y, 0, 0, 0])
-    (prices,), (costs,) = _priced(model, passed[None], obstacles[None, :, 1:], free[passed][None])
-    sides = choices(len(passed))
-    return Prediction(sides, costs, free + (sides * prices) @ model.responses[passed] @ model.responses.T)
-
-
-def choices(obstacles: int) -> np.ndarray:
-    """(2^n, n) every choice of sides of n obstacles, −1 or 1, in the order of `Prediction`."""
-    return np.array(list(itertools.product((-1, 1), repeat=obstacles)))
-
-
-def predict_costs(
     task: Task, params: BallbotParams, x0: np.ndarray, goal_y: np.ndarray, along: np.ndarray, obstacles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """What every choice of sides costs more than the motion without obstacles, of many slaloms at once.
+) -> Prediction:
+    """Predicts every choice of sides, in B slaloms at once.
 
     Args:
         task, params: the slalom and the robot.
@@ -80,30 +65,26 @@ def predict_costs(
         goal_y: (B,) m.
         along: (B, steps+1) x of one solution of each, m.
         obstacles: (B, n, 3) as `Task.passed_obstacles` gives.
-
-    Returns:
-        (B, 2^n), in the order of `choices`; and the control steps (B, n) at which obstacles are passed.
     """
-    model = _model(task, params)
-    passed = np.abs(along[:, :, None] - obstacles[:, None, :, 0]).argmin(1)
+    motions, responses = _model(task, params)
+    n, passed = obstacles.shape[1], np.abs(along[:, :, None] - obstacles[:, None, :, 0]).argmin(1)
     across = x0[:, _ACROSS] - np.pad(goal_y[:, None], ((0, 0), (0, 3)))
-    relative = obstacles[..., 1:] - np.stack([goal_y, np.zeros(len(goal_y))], axis=-1)[:, None]
-    return _priced(model, passed, relative, np.einsum("bnk,bk->bn", model.free[passed], across))[1], passed
-
-
-@dataclass(frozen=True)
-class _Model:
-    """Motion across the way: `free` (steps+1, 4) are the positions without obstacles by initial state.
-
-    `responses` (steps+1, steps) are the impulse responses divided by √s.
-    """
-
-    free: np.ndarray
-    responses: np.ndarray
+    free = goal_y[:, None] + np.einsum("nk,bk->bn", motions, across)
+    sides, at = np.array(list(itertools.product((-1, 1), repeat=n))), responses[passed]
+    kernels = at @ at.transpose(0, 2, 1) + _REGULARIZATION * np.eye(n)
+    beyond = obstacles[..., 1] - np.take_along_axis(free, passed, 1)
+    least = sides * (beyond[:, None] + sides * obstacles[:, None, :, 2])
+    matrices = kernels[:, None] * sides[:, :, None] * sides[:, None, :]
+    prices = _prices(matrices.reshape(-1, n, n), least.reshape(-1, n)).reshape(least.shape)
+    costs = np.einsum("bsi,bsij,bsj->bs", prices, matrices, prices)
+    return Prediction(sides, costs, passed, free, sides * prices, responses)
 
 
 @lru_cache(maxsize=8)
-def _model(task: Task, params: BallbotParams) -> _Model:
+def _model(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
+    """Of the motion across the way: (steps+1, 4) positions without obstacles by initial state, and (steps+1, steps) impulse
+    responses divided by √s.
+    """
     params = replace(params, wheels=None)  # with wheels it moves nearly as without
     dt, rest = task.control_dt, np.zeros((1, 8))
     a, b = (matrix[0] for matrix in discretize(params, rest, np.zeros((1, 2)), dt))
@@ -118,27 +99,7 @@ def _model(task: Task, params: BallbotParams) -> _Model:
         powers.append(closed @ powers[-1])
     impulse = np.array([0.0, *((power @ b)[0, 0] for power in powers[:-1])])
     responses = scipy.linalg.toeplitz(impulse, np.zeros(task.steps))
-    return _Model(np.array([power[0] for power in powers]), responses / np.sqrt(price[0, 0]))
-
-
-def _priced(
-    model: _Model, passed: np.ndarray, obstacles: np.ndarray, free: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The multipliers (B, 2^n, n) and the costs (B, 2^n) of every choice of sides, of many slaloms.
-
-    Args:
-        model: of the motion across the way.
-        passed: (B, n) control steps at which obstacles are passed.
-        obstacles: (B, n, 2) y, and how near the ball's centre may come, m.
-        free: (B, n) y without obstacles at these steps, m.
-    """
-    n = passed.shape[1]
-    sides, responses = choices(n), model.responses[passed]
-    kernels = responses @ responses.transpose(0, 2, 1) + _REGULARIZATION * np.eye(n)
-    least = sides * (obstacles[:, None, :, 0] + sides * obstacles[:, None, :, 1] - free[:, None])
-    matrices = kernels[:, None] * sides[:, :, None] * sides[:, None, :]
-    prices = _prices(matrices.reshape(-1, n, n), least.reshape(-1, n)).reshape(least.shape)
-    return prices, np.einsum("bsi,bsij,bsj->bs", prices, matrices, prices)
+    return np.array([power[0] for power in powers]), responses / np.sqrt(price[0, 0])
 
 
 def _prices(matrices: np.ndarray, least: np.ndarray) -> np.ndarray:

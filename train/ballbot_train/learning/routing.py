@@ -82,13 +82,13 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
     counts = np.array([len(each) for each in obstacles])
     for count in np.unique(counts):
         columns = np.flatnonzero((farther[:, count:] == farther[:, count - 1 : count]).all(1))
-        row_of = {tuple(side): row for row, side in enumerate(sides.choices(count).tolist())}
         of_count = np.flatnonzero(counts == count)
         for rows in np.array_split(of_count, math.ceil(len(of_count) / _BATCH)):
             own = np.array([obstacles[i] for i in rows])
             stretch = distances[rows] / distances[known][nearest[rows]]
             along = stretch[:, None] * np.array([motions[k].trajectory.x[:, 0] for k in nearest[rows]])
-            costs, _ = sides.predict_costs(task, params, x[rows], goals[rows, 1], along, own)
+            predicted = sides.predict(task, params, x[rows], goals[rows, 1], along, own)
+            costs, row_of = predicted.costs, {tuple(side): row for row, side in enumerate(predicted.sides.tolist())}
             base = stretch**2 * np.array([motions[k].cost for k in nearest[rows]])
             relative = (costs - costs.min(1, keepdims=True)) / (base + costs.min(1))[:, None]
             nearer = np.where(
