@@ -19,6 +19,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -196,7 +197,7 @@ class _Batch:
         elif task.passed_obstacles(self._c[0]) is not None and task.steps % search.COARSE == 0:
             self._weave()
         elif len(task.reference(self._x0[0], self._c[0], self._params).x) == 1:
-            self._recover(forces)
+            self._keep(self._recoveries(forces), _MOTION)  # over the first seconds where LQR is right about the rest
             self._follow_paths(np.flatnonzero(np.isnan(self._optima.costs)))
         else:
             self._follow_paths(np.arange(len(self._x0)))
@@ -307,22 +308,14 @@ class _Batch:
             ):
                 kept[row, :steps], kept[row, steps:] = unit * values[i, :steps], 0
 
-    def _recover(self, forces: np.ndarray | None) -> None:
-        """From the recoveries, over the first seconds where LQR is right about the rest."""
-        self._keep(self._recoveries(forces), _MOTION)
-
     def _to_the_end(self, guesses: _Guesses, found: Solutions) -> tuple[_Guesses, Solutions]:
         """Whole episodes, of solutions of their first seconds and LQR then: solved where LQR's cost-to-go was right."""
-        rest, ends, dt, limit = (
-            self._solver.rest,
-            self._ends[guesses.of],
-            self._task.control_dt,
-            self._params.force_limit,
-        )
+        rest, ends, limit = self._solver.rest, self._ends[guesses.of], self._params.force_limit
         assert rest is not None
         left = self._task.steps - guesses.a.shape[1]
         last = found.x[:, -1]
-        x, a, costs = self._solver.stay(last, dt, self._given(guesses.of, self._task.steps), left, ends)
+        given, none = self._given(guesses.of, self._task.steps), np.zeros((len(last), left, 2))
+        x, a, costs = self._solver.simulate(last, self._task.control_dt, given, none, ends=ends)
         expected = rest.costs(last - ends)
         whole = replace(
             found,
@@ -343,7 +336,8 @@ class _Batch:
         best = np.full(count, np.inf)
         x, a = np.zeros((count, n + 1, 8)), np.zeros((count, n, 2))
 
-        def improve(rows: np.ndarray, simulated: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+        def improve(rows: np.ndarray, given_actions: np.ndarray, *followed: Any) -> None:
+            simulated = self._solver.simulate(x0[rows], task.control_dt, given[rows], given_actions[rows], *followed)
             states, actions, costs = simulated
             if rest is not None and n < task.steps:
                 costs = costs + rest.costs(states[:, -1] - self._ends[rows])
@@ -358,13 +352,9 @@ class _Batch:
             rows = np.flatnonzero(np.isinf(best))
             for bandwidth, seconds, lean, fade in family if len(rows) else ():
                 path[..., 6:] = lean * np.exp(-times / fade)[None, :, None] * side[:, None]
-                followed = self._solver.follow(x0[rows], task.control_dt, given[rows], path[rows], (bandwidth, seconds))
-                improve(rows, followed)
+                improve(rows, np.zeros_like(a), path[rows], (bandwidth, seconds))
         if forces is not None:
-            improve(
-                np.arange(count),
-                self._solver.simulate(x0, task.control_dt, given, forces[:, :n] / self._params.force_limit),
-            )
+            improve(np.arange(count), forces[:, :n] / self._params.force_limit)
         return _Guesses(np.arange(count), x, a, np.full(count, n)).some(np.isfinite(best))
 
     def _along(self, of: Sequence[int], paths: Sequence[np.ndarray], coarseness: int = 1) -> _Guesses:

@@ -202,65 +202,47 @@ class Ilqr:
             self._solve(len(rows), longest, n, *(array.ctypes.data for array in (rows, *arrays)))
         return Solutions(x, a, gains, slopes, costs, status == OPTIMAL, m, e)
 
-    def follow(
-        self, x0: np.ndarray, length: float, given: np.ndarray, paths: np.ndarray, settings: tuple[float, float]
+    def simulate(
+        self,
+        x0: np.ndarray,
+        length: float,
+        given: np.ndarray,
+        a: np.ndarray,
+        paths: np.ndarray | None = None,
+        settings: tuple[float, float] = (0.0, 0.0),
+        ends: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Simulates J episodes in which `righting.steering` follows a path.
+        """Simulates J episodes under given actions, in which `righting.steering` follows a path, or under LQR at the end.
 
         Args:
             x0: (J, 8) initial states.
             length: of a step, s.
             given: as of `solve`.
+            a: (J, n, 2) actions; 0 with `paths` or `ends`.
             paths: (J, n, 8) positions, velocities, accelerations, and leans that are added; SI units.
-            settings: of the feedback, its bandwidth, rad/s, and its time constant, s.
+            settings: of the feedback along paths, its bandwidth, rad/s, and its time constant, s.
+            ends: (J, 8) states about which LQR acts.
 
         Returns:
             States (J, n+1, 8), actions (J, n, 2), and costs (J,), which are infinite where a margin is violated.
         """
-        return self._simulated(
-            x0, np.zeros((*paths.shape[:2], 2)), length, given, np.ascontiguousarray(paths), settings
-        )
-
-    def simulate(
-        self, x0: np.ndarray, length: float, given: np.ndarray, a: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same under actions a (J, n, 2)."""
-        return self._simulated(x0, np.array(a, np.float64, order="C"), length, given, None, (0.0, 0.0))
+        jobs, n = a.shape[:2]
+        a, x = np.array(a, np.float64, order="C"), np.zeros((jobs, n + 1, self.states))
+        costs, missed, feedback = np.zeros(jobs), np.zeros(jobs), None
+        x[:, 0] = x0
+        if ends is not None:
+            assert self.rest is not None
+            feedback = np.column_stack([np.tile(self.rest.gain.ravel() / self._limit, (jobs, 1)), ends])
+        paths = None if paths is None else np.ascontiguousarray(paths)
+        arrays = *self._given(jobs, length, given), paths, np.tile(settings, (jobs, 1)), feedback, x, a, costs, missed
+        self._follow(jobs, n, *(None if array is None else array.ctypes.data for array in arrays))
+        return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
 
     def ends(self, ends: np.ndarray, share: float) -> np.ndarray:
         """(J, 45) parameters: that a share of LQR's cost-to-go about the states `ends` (J, 8) counts, 0 or 1."""
         assert self.rest is not None
         same = np.tile([*self.rest.p[np.triu_indices(8)], share], (len(ends), 1))
         return np.column_stack([ends, same])
-
-    def stay(
-        self, x0: np.ndarray, length: float, given: np.ndarray, n: int, ends: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same for n steps under LQR about the states `ends` (J, 8)."""
-        assert self.rest is not None
-        gains = np.tile(self.rest.gain.ravel() / self._limit, (len(ends), 1))
-        feedback = np.column_stack([gains, ends])
-        return self._simulated(x0, np.zeros((len(x0), n, 2)), length, given, None, (0.0, 0.0), feedback)
-
-    def _simulated(
-        self,
-        x0: np.ndarray,
-        a: np.ndarray,
-        length: float,
-        given: np.ndarray,
-        paths: np.ndarray | None,
-        settings: tuple[float, float],
-        lqr: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        jobs, n = a.shape[:2]
-        x, costs, missed = np.zeros((jobs, n + 1, self.states)), np.zeros(jobs), np.zeros(jobs)
-        x[:, 0] = x0
-        followed, held = (None if array is None else array.ctypes.data for array in (paths, lqr))
-        before = *self._given(jobs, length, given), np.tile(np.array(settings, np.float64), (jobs, 1))
-        of_steps, of_problems, of_feedback = (array.ctypes.data for array in before)
-        after = (array.ctypes.data for array in (x, a, costs, missed))
-        self._follow(jobs, n, of_steps, of_problems, followed, of_feedback, held, *after)
-        return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
 
     def _given(self, jobs: int, lengths: Any, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         shapes = ((lengths, (jobs,)), (given, (jobs, self._sizes["PARAMS"])))
