@@ -13,7 +13,7 @@ import numpy as np
 
 from ballbot_baselines.compiled import LANES, LONG, SIMD, InPlace, in_lanes
 from ballbot_baselines.disturbance import DisturbanceEstimator
-from ballbot_baselines.shooting import robot_names, robot_numbers, symbolic_robot
+from ballbot_baselines.shooting import RobotKind, robot_numbers
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -113,20 +113,20 @@ class HorizonQp:
     | `curvature` | (N,) | of the friction cone in the inputs, by the multipliers of the last program; 0 before the first |
     """
 
-    def __init__(self, task: Task, rolls: bool, grips: bool, wheels: bool, nodes: int):
+    def __init__(self, task: Task, kind: RobotKind, nodes: int):
         """Differentiates the stage and builds the solver; compiles on first use on a machine. `set_robot` must follow."""
-        self._states, self._inputs = (11, 3) if wheels else (8, 2)
+        self._states, self._inputs = kind.states, kind.inputs
         self._at = _Places.of(self._states, self._inputs)
         count = len(task.margins((0.0,) * self._states, (1.0,) * (len(task.constant_names) + task.clock)))
         self.distinct = np.arange(count)
         self.disturbance: DisturbanceEstimator | None = None
         self.curvature = np.zeros(nodes)
         self._margins = min(count, _MARGINS)
-        self._make_stage(task, rolls, 2 * grips, wheels, nodes, count)
-        self._make_program(nodes, self._margins, 2 * grips)
+        self._make_stage(task, kind, nodes, count)
+        self._make_program(nodes, self._margins, 2 * kind.grips)
 
-    def _make_stage(self, task: Task, rolls: bool, grips: int, wheels: bool, n: int, m: int) -> None:
-        states, forces = self._states, self._inputs
+    def _make_stage(self, task: Task, kind: RobotKind, n: int, m: int) -> None:
+        states, forces, grips = self._states, self._inputs, 2 * kind.grips
         variables = states + forces
         blocks = -(-n // LANES)  # of intervals; the last one is filled up with zeros
         computed = slice(0, blocks * LANES)
@@ -134,13 +134,13 @@ class HorizonQp:
         def rows(*shape: int) -> np.ndarray:
             return np.zeros((max(n + 1, computed.stop), *shape))
 
-        numbers = rows(1 + len(robot_names(rolls, grips > 0, wheels)))  # an interval's length, and the robot
+        numbers = rows(1 + len(kind.names))  # an interval's length, and the robot
         c = rows(len(task.constant_names) + task.clock)
         inputs = [rows(states), rows(forces), numbers, c, *([rows()] if grips else [])]
         outputs = [rows(states), rows(variables, states), rows(variables), rows(m), rows(states, m)]
         outputs += [rows(grips), rows(variables, grips)] if grips else []
         self._stage = InPlace(
-            _stage_function(task, rolls, grips > 0, wheels).map(blocks),
+            _stage_function(task, kind).map(blocks),
             [array[computed] for array in inputs],
             [array[computed] for array in outputs],
         )
@@ -271,23 +271,23 @@ class HorizonQp:
 
 
 @lru_cache(maxsize=16)
-def horizon_qp(task: Task, rolls: bool, grips: bool, wheels: bool, nodes: int) -> HorizonQp:
+def horizon_qp(task: Task, kind: RobotKind, nodes: int) -> HorizonQp:
     """The program of a task, kind of robot and number of intervals, made once and shared by all controllers."""
-    return HorizonQp(task, rolls, grips, wheels, nodes)
+    return HorizonQp(task, kind, nodes)
 
 
 @lru_cache(maxsize=16)
-def _stage_function(task: Task, rolls: bool, grips: bool, wheels: bool) -> casadi.Function:
+def _stage_function(task: Task, kind: RobotKind) -> casadi.Function:
     """(x, a, p, c) -> next state, its Jacobian (8, 10), gradient of the interval's cost (10), margins, their Jacobian.
 
     It computes `LANES` intervals at once, and matrices are columns. p is the interval's length and the robot's numbers.
 
     Where friction is limited, it also takes the reserve of grip, and gives the limits of grip and their Jacobian.
     """
-    x, a = (casadi.SX.sym(name, size) for name, size in zip("xa", (11, 3) if wheels else (8, 2), strict=True))
-    p = casadi.SX.sym("p", 1 + len(robot_names(rolls, grips, wheels)))
+    x, a = casadi.SX.sym("x", kind.states), casadi.SX.sym("a", kind.inputs)
+    p = casadi.SX.sym("p", 1 + len(kind.names))
     c = casadi.SX.sym("c", len(task.constant_names) + task.clock)
-    robot, limit = symbolic_robot(rolls, grips, p, wheels)
+    robot, limit = kind.symbolic(p)
     z, u, h = casadi.vertcat(x, a), limit * a, p[0]
     after = dynamics.step(robot, x, u, h, 2)  # two RK4 steps, as the env takes per control step
     margins = casadi.vertcat(*task.margins(x, c))
@@ -299,7 +299,7 @@ def _stage_function(task: Task, rolls: bool, grips: bool, wheels: bool) -> casad
         casadi.vec(casadi.densify(casadi.jacobian(margins, x))),
     ]
     inputs = [x, a, p, c]
-    if grips:
+    if kind.grips:
         reserve = casadi.SX.sym("reserve")
         inputs.append(reserve)
         begins, ends = (
@@ -310,7 +310,7 @@ def _stage_function(task: Task, rolls: bool, grips: bool, wheels: bool) -> casad
         grip = casadi.if_else(ends[1] < begins[1], ends, begins) / _GRIP_UNIT
         outputs += [grip, casadi.vec(casadi.densify(casadi.jacobian(grip, z)))]
     function = casadi.Function("stage", inputs, outputs, {"cse": True})
-    return in_lanes(f"{task.id}-nmpc", (function,), flags=LONG if wheels else SIMD)[0]
+    return in_lanes(f"{task.id}-nmpc", (function,), flags=LONG if kind.wheels else SIMD)[0]
 
 
 def _solver(n: int, m: int, grips: int, states: int, inputs: int) -> casadi.Function:

@@ -25,7 +25,7 @@ import numpy as np
 from ballbot_baselines import righting
 from ballbot_baselines.compiled import LANES, SIMD
 from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
-from ballbot_baselines.shooting import kind_of, shooting_ocp, symbolic_robot
+from ballbot_baselines.shooting import RobotKind, kind_of, shooting_ocp
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -272,7 +272,7 @@ class _Stage:
         self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + _REST * rests)
         self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
         self._limit: Any
-        self._robot, self._limit = symbolic_robot(params.rolls, params.grips, self._all)
+        self._robot, self._limit = RobotKind.of(params).symbolic(self._all)
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
         path, end = self._path(self._a), self._ocp.final_inequalities(self._x[:8], self._all)

@@ -30,7 +30,7 @@ from ballbot_baselines.horizon import Grid, horizon_qp
 from ballbot_baselines.linearize import quadratic_cost
 from ballbot_baselines.lqr import final_weight
 from ballbot_baselines.optimum import Optimum, plan_to_track
-from ballbot_baselines.shooting import Backoff
+from ballbot_baselines.shooting import Backoff, RobotKind
 from ballbot_baselines.tvlqr import TvlqrController
 from ballbot_gym import dynamics
 from ballbot_gym.params import BallbotParams
@@ -155,7 +155,7 @@ class NmpcController:
             raise ValueError(f"horizon must be a whole number of control steps of {task.control_dt} s, not {horizon} s")
         self._grid = Grid.make(steps, min(nodes or (steps if params.grips else _NODES), steps))
         self._shift_states, self._shift_inputs = self._grid.shift_states(), self._grid.shift_inputs()
-        self._qp = horizon_qp(task, params.rolls, params.grips, params.wheels is not None, len(self._grid.lengths))
+        self._qp = horizon_qp(task, RobotKind.of(params), len(self._grid.lengths))
         self.plan: Optimum | None = None
         self.predicted: np.ndarray | None = None
         self.disturbance: DisturbanceEstimator | None = None

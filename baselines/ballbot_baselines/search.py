@@ -160,7 +160,7 @@ def _from_righting(episode: Shooting) -> list[Found]:
             break
         for x, u in righting.guesses(task, params, member, c):
             if task.first_exit:
-                relaxed = episode.relaxed(x, u / limit)
+                relaxed = episode.relaxed(x, u / limit, task.control_dt)
                 solved = episode.in_whole_steps(relaxed) if relaxed.is_optimal else [relaxed]
             else:
                 solved = [episode.solve(shooting_solver(task, params, len(u), "fatrop", barrier=BARRIER), x, u / limit)]

@@ -8,10 +8,10 @@ Solvers see actions, which are forces divided by their limit.
 """
 
 import math
-from dataclasses import asdict, astuple, dataclass, field, fields, replace
-from functools import lru_cache, partial
+from dataclasses import asdict, astuple, dataclass, field, fields
+from functools import lru_cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
@@ -34,7 +34,7 @@ FREE_TIME_INTERVALS = 60
 """Of a first-exit task whose time is free."""
 
 _MOST_ITERATIONS = 200
-_checked: set[tuple[Task, bool, bool, bool]] = set()
+_checked: set[tuple[Task, "RobotKind"]] = set()
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,47 @@ class Backoff:
         return Backoff(**{name: min(value, max(share * value, least[name])) for name, value in asdict(self).items()})
 
 
+class RobotKind(NamedTuple):
+    """What differs between the formulas of robots. All else that differs are numbers, which are parameters of solvers."""
+
+    rolls: bool
+    grips: bool
+    wheels: bool
+
+    @classmethod
+    def of(cls, params: BallbotParams) -> "RobotKind":
+        return cls(params.rolls, params.grips, params.wheels is not None)
+
+    @property
+    def names(self) -> list[str]:
+        """Fields of such a robot, and of its wheels, that `robot_numbers` gives."""
+        names = ["total_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "force_limit"]
+        names += ["moving_mass", "ball_radius"] * self.rolls + ["friction"] * self.grips
+        return names + ["ball_inertia", *(field.name for field in fields(Wheels))] * self.wheels
+
+    @property
+    def states(self) -> int:
+        return 11 if self.wheels else 8
+
+    @property
+    def inputs(self) -> int:
+        return 3 if self.wheels else 2
+
+    def symbolic(self, p: casadi.SX) -> tuple[Any, casadi.SX]:
+        """A robot of this kind, whose numbers stand in p after the length of a step, and its force limit."""
+        found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(self.names)}
+        own = Wheels(*(found.pop(field.name) for field in fields(Wheels))) if self.wheels else None
+        weight = found["total_mass"] * found["gravity"]
+        default = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight}
+        return SimpleNamespace(**(default | found), rolls=self.rolls, grips=self.grips, wheels=own), found["force_limit"]
+
+
+def robot_numbers(params: BallbotParams) -> list[float]:
+    """What problems need to know of a robot, besides its kind."""
+    wheels = [] if params.wheels is None else [params.ball_inertia, *astuple(params.wheels)]
+    return [getattr(params, name) for name in RobotKind(params.rolls, params.grips, False).names] + wheels
+
+
 def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
     """A task on its env's discretization, or with forces held longer than its control steps.
 
@@ -83,9 +124,9 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
     return _ocp(*kind_of(task, params))
 
 
-def kind_of(task: Task, params: BallbotParams) -> tuple[Task, bool, bool, bool]:
-    """What solvers are made for: a task whose formulas they can use, whether the ball rolls, has to grip, and has wheels."""
-    kind = task, params.rolls, params.grips, params.wheels is not None
+def kind_of(task: Task, params: BallbotParams) -> tuple[Task, RobotKind]:
+    """What solvers are made for: a task whose formulas they can use, and a kind of robot."""
+    kind = task, RobotKind.of(params)
     if kind not in _checked:
         check_formulas(task, params)
         _checked.add(kind)
@@ -93,37 +134,57 @@ def kind_of(task: Task, params: BallbotParams) -> tuple[Task, bool, bool, bool]:
 
 
 @lru_cache(maxsize=64)
-def _ocp(task: Task, rolls: bool, grips: bool, wheels: bool) -> Ocp:
-    nr = len(robot_names(rolls, grips, wheels))
-    nc = len(task.constant_names)
-    robot = partial(symbolic_robot, rolls, grips, wheels=wheels)
+def _ocp(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
+    """With `free_time` the length of all intervals is one more state, the last, and the first of p is not used for it."""
+    n, nc, first = kind.states, len(task.constant_names), 1 + len(kind.names)
+    margin, goal, reserve = range(first + nc, first + nc + 3)  # back-offs in p
 
-    def margins(x: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(*task.margins(x, _constants(task, nr, p, p[0]))) - p[1 + nr + nc]
+    def of_stage(s: casadi.SX, p: casadi.SX) -> tuple[casadi.SX, casadi.SX, casadi.SX]:
+        """State, length of the interval, and constants, with the stage's time if the task has a clock."""
+        c, length = p[first : first + nc], s[n] if free_time else p[0]
+        return s[:n], length, task.at(c, p[-2] + p[-1] * length) if task.clock else c
 
-    def path(x: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
-        numbers, limit = robot(p)
-        return casadi.vertcat(margins(x, p), *dynamics.limits(numbers, x, limit * a, p[3 + nr + nc], p[0]))
+    def margins(s: casadi.SX, p: casadi.SX) -> casadi.SX:
+        x, _, c = of_stage(s, p)
+        return casadi.vertcat(*task.margins(x, c)) - p[margin]
 
-    def final(x: casadi.SX, p: casadi.SX) -> casadi.SX:
+    def path(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+        if not kind.grips:
+            return margins(s, p)
+        robot, limit = kind.symbolic(p)
+        return casadi.vertcat(margins(s, p), *dynamics.limits(robot, s[:n], limit * a, p[reserve], p[0]))
+
+    def final(s: casadi.SX, p: casadi.SX) -> casadi.SX:
         if not task.first_exit:
-            return margins(x, p)
+            return margins(s, p)
+        x, _, c = of_stage(s, p)
         # Goal functions are normalized, q/tolerance² − 1: keeping a fraction b of the tolerance asks (1−b)² − 1 − g ≥ 0.
-        room = (1 - p[2 + nr + nc]) ** 2 - 1 - casadi.vertcat(*task.goal(x, _constants(task, nr, p, p[0])))
-        return casadi.vertcat(margins(x, p), room)
+        return casadi.vertcat(margins(s, p), (1 - p[goal]) ** 2 - 1 - casadi.vertcat(*task.goal(x, c)))
 
-    substeps = dynamics.substeps_for(task.control_dt)
+    def after(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+        (x, length, _), (robot, limit) = of_stage(s, p), kind.symbolic(p)
+        return casadi.vertcat(dynamics.step(robot, x, limit * a, length, substeps), s[n:])
+
+    def rates(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+        (x, length, _), (robot, limit) = of_stage(s, p), kind.symbolic(p)
+        return casadi.vertcat(length * dynamics.derivative(robot, x, limit * a), casadi.SX.zeros(int(free_time)))
+
+    def cost(s: casadi.SX, a: casadi.SX, p: casadi.SX) -> casadi.SX:
+        (x, length, c), (_, limit) = of_stage(s, p), kind.symbolic(p)
+        return task.cost(x, limit * a, c) * length
+
+    substeps = 2 if free_time else dynamics.substeps_for(task.control_dt)
     return Ocp(
-        name=task.id,
-        states=11 if wheels else 8,
-        inputs=3 if wheels else 2,
-        params=1 + nr + nc + 2 + grips + task.clock,
+        name=f"{task.id}-free-time" if free_time else task.id,
+        states=n + free_time,
+        inputs=kind.inputs,
+        params=first + nc + 2 + kind.grips + task.clock,
         counts_stages=task.clock,
-        next=lambda x, a, p: _after(robot(p), x, a, p[0], substeps),
-        cost=lambda x, a, p: task.cost(x, robot(p)[1] * a, _constants(task, nr, p, p[0])) * p[0],
-        inequalities=path if grips else lambda x, a, p: margins(x, p),
+        next=after,
+        cost=cost,
+        inequalities=path,
         final_inequalities=final,
-        rates=(lambda x, a, p: _rates(robot(p), x, a, p[0])) if wheels else None,
+        rates=rates if kind.wheels else None,
         rk4_steps=substeps,
     )
 
@@ -139,47 +200,6 @@ def shooting_parameters(
     return [task.control_dt * coarseness, *numbers, *c, backoff.margin, backoff.goal, *reserve, *clock]
 
 
-def robot_numbers(params: BallbotParams) -> list[float]:
-    """What problems need to know of a robot, besides whether its ball rolls, whether it has to grip, and has wheels."""
-    wheels = params.wheels
-    names = robot_names(params.rolls, params.grips)
-    return [getattr(params, name) for name in names] + (
-        [] if wheels is None else [params.ball_inertia, *astuple(wheels)]
-    )
-
-
-def robot_names(rolls: bool, grips: bool, wheels: bool = False) -> list[str]:
-    """Fields of a robot of this kind, and of its wheels, that `robot_numbers` gives."""
-    names = ["total_mass", "first_moment", "pivot_inertia", "axial_inertia", "gravity", "force_limit"]
-    names += ["moving_mass", "ball_radius"] * rolls + ["friction"] * grips
-    return names + ["ball_inertia", *(field.name for field in fields(Wheels))] * wheels
-
-
-def symbolic_robot(rolls: bool, grips: bool, p: casadi.SX, wheels: bool = False) -> tuple[Any, casadi.SX]:
-    """A robot of this kind, whose numbers stand in p after the length of a step, and its force limit."""
-    found: dict[str, Any] = {name: p[1 + i] for i, name in enumerate(robot_names(rolls, grips, wheels))}
-    own = Wheels(*(found.pop(field.name) for field in fields(Wheels))) if wheels else None
-    weight = found["total_mass"] * found["gravity"]
-    numbers = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight} | found
-    return SimpleNamespace(**numbers, rolls=rolls, grips=grips, wheels=own), found["force_limit"]
-
-
-def _after(robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX, substeps: int) -> casadi.SX:
-    numbers, limit = robot
-    return dynamics.step(numbers, x, limit * a, length, substeps)
-
-
-def _rates(robot: tuple[Any, casadi.SX], x: casadi.SX, a: casadi.SX, length: casadi.SX) -> casadi.SX:
-    numbers, limit = robot
-    return length * dynamics.derivative(numbers, x, limit * a)
-
-
-def _constants(task: Task, nr: int, p: casadi.SX, h: casadi.SX) -> casadi.SX:
-    """c of a stage of length h, with its time if the task has a clock; it stands in p after nr numbers of the robot."""
-    c = p[1 + nr : 1 + nr + len(task.constant_names)]
-    return task.at(c, p[-2] + p[-1] * h) if task.clock else c
-
-
 def shooting_solver(
     task: Task,
     params: BallbotParams,
@@ -188,6 +208,7 @@ def shooting_solver(
     iterations: int = _MOST_ITERATIONS,
     barrier: float = BARRIER,
     tolerance: float | None = None,
+    free_time: bool = False,
 ) -> OcpSolver:
     """A solver of `shooting_ocp`, made once for all robots of a kind.
 
@@ -197,49 +218,16 @@ def shooting_solver(
         iterations: after which it gives up.
         barrier: of the first iterate.
         tolerance: of the solver; default, the finest that it reaches.
+        free_time: whether the intervals have one free length, the last state. It tells roughly when to arrive.
     """
-    options = solver, tolerance or _tolerance(params.grips), iterations, barrier
-    return _solver(*kind_of(task, params), steps, *options)
+    # On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits.
+    tolerance = tolerance or (1e-6 if params.grips else 1e-8)
+    return _solver(*kind_of(task, params), free_time, steps, solver, tolerance, iterations, barrier)
 
 
 @lru_cache(maxsize=256)
-def _solver(task: Task, rolls: bool, grips: bool, wheels: bool, steps: int, *options: Any) -> OcpSolver:
-    return OcpSolver(_ocp(task, rolls, grips, wheels), steps, *options)
-
-
-def free_time_solver(task: Task, params: BallbotParams, solver: str) -> OcpSolver:
-    """A solver of a first-exit task over intervals of one free length h, the last state. It tells roughly when to arrive.
-
-    Made once for all robots of a kind.
-    """
-    return _free_time_solver(*kind_of(task, params), solver)
-
-
-@lru_cache(maxsize=8)
-def _free_time_solver(task: Task, rolls: bool, grips: bool, wheels: bool, solver: str) -> OcpSolver:
-    fixed, nr = _ocp(task, rolls, grips, wheels), len(robot_names(rolls, grips, wheels))
-    robot, n = partial(symbolic_robot, rolls, grips, wheels=wheels), fixed.states
-
-    def with_length(s: casadi.SX, p: casadi.SX) -> casadi.SX:
-        return casadi.vertcat(s[n], p[1:]) if task.clock else p  # the length is also what the stage's time is found by
-
-    ocp = replace(
-        fixed,
-        name=f"{task.id}-free-time",
-        states=n + 1,
-        next=lambda s, a, p: casadi.vertcat(_after(robot(p), s[:n], a, s[n], 2), s[n]),
-        cost=lambda s, a, p: task.cost(s[:n], robot(p)[1] * a, _constants(task, nr, p, s[n])) * s[n],
-        inequalities=lambda s, a, p: fixed.inequalities(s[:n], a, with_length(s, p)),
-        final_inequalities=lambda s, p: fixed.final_inequalities(s[:n], with_length(s, p)),
-        rates=(lambda s, a, p: casadi.vertcat(_rates(robot(p), s[:n], a, s[n]), 0)) if wheels else None,
-        rk4_steps=2,
-    )
-    return OcpSolver(ocp, FREE_TIME_INTERVALS, solver, _tolerance(grips))
-
-
-def _tolerance(grips: bool) -> float:
-    """Of the solvers. On the friction cone fatrop stalls between 1e-7 and 1e-8, at the same cost to 7 digits."""
-    return 1e-6 if grips else 1e-8
+def _solver(task: Task, kind: RobotKind, free_time: bool, *options: Any) -> OcpSolver:
+    return OcpSolver(_ocp(task, kind, free_time), *options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,12 +275,20 @@ class Shooting:
         """The solution with a free interval length from a ground path (n+1, 2), m, one point for each control step."""
         h = (len(path) - 1) * self.task.control_dt / FREE_TIME_INTERVALS
         x, u = guess.along_path(self.params, guess.resampled(path, FREE_TIME_INTERVALS), h, start=self.x0)
-        return self._in_free_time(x, u / self.params.force_limit, h)
+        return self.relaxed(x, u / self.params.force_limit, h)
 
-    def relaxed(self, x: np.ndarray, a: np.ndarray) -> OcpSolution:
-        """The solution with a free interval length from a guess."""
-        h = len(a) * self.task.control_dt / FREE_TIME_INTERVALS
-        return self._in_free_time(*_resampled(x, a, FREE_TIME_INTERVALS), h)
+    def relaxed(self, x: np.ndarray, a: np.ndarray, h: float) -> OcpSolution:
+        """The solution with a free interval length from a guess with intervals of h s."""
+        n, longest = FREE_TIME_INTERVALS, self.task.duration / FREE_TIME_INTERVALS
+        x, a, h = *_resampled(x, a, n), h * len(a) / n
+        for name in ("fatrop", "ipopt"):
+            solver = shooting_solver(self.task, self.params, n, name, free_time=True)
+            bounds = self._bounds(solver, x[0], n)
+            bounds.state_lower[:, -1], bounds.state_upper[:, -1] = min(self.task.control_dt / 4, longest), longest
+            solution = solver.solve(np.column_stack([x, np.full(n + 1, h)]), a, bounds, self._parameters())
+            if solution.is_optimal:
+                break
+        return solution
 
     def in_whole_steps(self, relaxed: OcpSolution) -> list[OcpSolution]:
         """Solutions that arrive after whole numbers of control steps.
@@ -316,18 +312,6 @@ class Shooting:
                     break
                 nearby += direction
         return [solution for group in groups.values() for solution in group]
-
-    def _in_free_time(self, x: np.ndarray, a: np.ndarray, h: float) -> OcpSolution:
-        n = len(a)
-        for name in ("fatrop", "ipopt"):
-            solver = free_time_solver(self.task, self.params, name)
-            bounds = self._bounds(solver, x[0], n)
-            longest = self.task.duration / n
-            bounds.state_lower[:, -1], bounds.state_upper[:, -1] = min(self.task.control_dt / 4, longest), longest
-            solution = solver.solve(np.column_stack([x, np.full(n + 1, h)]), a, bounds, self._parameters())
-            if solution.is_optimal:
-                break
-        return solution
 
     def _bounds(self, solver: OcpSolver, x0: np.ndarray, n: int) -> Bounds:
         bounds, force = Bounds.free(solver.ocp, n), self.backoff.force
