@@ -15,7 +15,7 @@ variables q are states that do not change.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import casadi
 import numpy as np
@@ -89,39 +89,24 @@ class Plan:
     seconds: float
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where things stand in the staged state s = [x, u/limit, h, q, x_start]; inputs are the next [x, u/limit] from
-    the leans on.
-    """
+# Where things stand in the staged state s = [x, u/limit, h, q, x_start]. Only periodic problems have an x_start. Inputs are
+# the next [x, u/limit] from the leans on.
+_X, _A, _INPUTS, _H = slice(0, 8), slice(8, 10), slice(2, 10), 10
 
-    free: int
-    periodic: bool
-    x: ClassVar[slice] = slice(0, 8)
-    a: ClassVar[slice] = slice(8, 10)
-    inputs: ClassVar[slice] = slice(2, 10)
-    h: ClassVar[int] = 10
 
-    @property
-    def q(self) -> slice:
-        return slice(11, 11 + self.free)
-
-    @property
-    def start(self) -> slice:
-        return slice(11 + self.free, 11 + self.free + 8 * self.periodic)
-
-    @property
-    def size(self) -> int:
-        return self.start.stop
+def _free(problem: Problem) -> slice:
+    """Where the free variables q stand."""
+    return slice(_H + 1, _H + 1 + len(problem.free))
 
 
 def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
     """The staged problem whose dynamics and equality constraints are Hermite–Simpson's."""
-    at, limit = _Layout(len(problem.free), problem.periodic), params.force_limit
+    q, limit = _free(problem), params.force_limit
+    start = slice(q.stop, q.stop + 8 * problem.periodic)
 
     def interval(s: casadi.SX, w: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
         """The next [x, u/limit], and the defects of its components from the leans on."""
-        x0, u0, h, x1, u1 = s[at.x], limit * s[at.a], s[at.h], casadi.vertcat(0, 0, w[:6]), limit * w[6:]
+        x0, u0, h, x1, u1 = s[_X], limit * s[_A], s[_H], casadi.vertcat(0, 0, w[:6]), limit * w[6:]
         f0, f1 = dynamics.derivative(params, x0, u0), dynamics.derivative(params, x1, u1)
         middle = 0.5 * (x0 + x1) + h / 8 * (f0 - f1)
         f_middle = dynamics.derivative(params, middle, 0.5 * (u0 + u1))
@@ -129,26 +114,26 @@ def hermite_simpson(problem: Problem, params: BallbotParams) -> Ocp:
         return casadi.vertcat(reached[:2], w), w[:6] - reached[2:]
 
     def path(function: Callable | None, s: casadi.SX) -> casadi.SX:
-        return casadi.SX(0, 1) if function is None else casadi.vertcat(*function(s[at.x], limit * s[at.a], s[at.q]))
+        return casadi.SX(0, 1) if function is None else casadi.vertcat(*function(s[_X], limit * s[_A], s[q]))
 
     def inequalities(s: casadi.SX) -> casadi.SX:
         asked = path(problem.inequalities, s)
-        return casadi.vertcat(asked, *dynamics.limits(params, s[at.x], limit * s[at.a])) if params.grips else asked
+        return casadi.vertcat(asked, *dynamics.limits(params, s[_X], limit * s[_A])) if params.grips else asked
 
     initial = None
     if problem.periodic:  # x_start is x_0
-        initial = np.zeros((8, at.size))
-        initial[:, at.x], initial[:, at.start] = np.eye(8), -np.eye(8)
+        initial = np.zeros((8, start.stop))
+        initial[:, _X], initial[:, start] = np.eye(8), -np.eye(8)
     return Ocp(
         name="hermite-simpson",
-        states=at.size,
+        states=start.stop,
         inputs=8,
         params=0,
-        next=lambda s, w, p: casadi.vertcat(interval(s, w)[0], s[at.h :]),
-        cost=lambda s, w, p: problem.cost(s[at.x], limit * s[at.a], s[at.h], s[at.q]),
+        next=lambda s, w, p: casadi.vertcat(interval(s, w)[0], s[_H:]),
+        cost=lambda s, w, p: problem.cost(s[_X], limit * s[_A], s[_H], s[q]),
         equalities=lambda s, w, p: casadi.vertcat(interval(s, w)[1], path(problem.equalities, s)),
         inequalities=lambda s, w, p: inequalities(s),
-        final_equalities=(lambda s, p: s[at.x] - s[at.start]) if problem.periodic else no_path,
+        final_equalities=(lambda s, p: s[_X] - s[start]) if problem.periodic else no_path,
         final_inequalities=lambda s, p: inequalities(s),
         initial_matrix=initial,
     )
@@ -166,17 +151,16 @@ def solve(
     Raises:
         PlanError: the solver did not converge to a feasible plan; the message says how it ended and how infeasible it is.
     """
-    n, at = problem.intervals, _Layout(len(problem.free), problem.periodic)
-    ocp = hermite_simpson(problem, params)
-    bounds = _bounds(problem, ocp, at)
+    n, ocp = problem.intervals, hermite_simpson(problem, params)
+    bounds = _bounds(problem, ocp)
     knots = np.column_stack([guess.x, guess.u / params.force_limit])
     start = guess.x[0] if problem.periodic else ()
     constant = np.tile([guess.h, *guess.q, *start], (n + 1, 1))
-    states, inputs = np.hstack([knots, constant]), knots[1:, at.inputs]
+    states, inputs = np.hstack([knots, constant]), knots[1:, _INPUTS]
     optimizer = OcpSolver(ocp, n, solver, max_iterations=max_iterations)
     started = time.perf_counter()
     if not _is_motion(guess):
-        states, inputs = optimizer.toward_consistency(states, inputs, _with_given_times(bounds, states, at))
+        states, inputs = optimizer.toward_consistency(states, inputs, _with_given_times(problem, bounds, states))
     result = optimizer.solve(states, inputs, bounds)
     seconds = time.perf_counter() - started
     converged = result.success or result.status == ACCEPTABLE
@@ -185,7 +169,7 @@ def solve(
             f"{problem.name}: {solver} found no plan: {result.status} after {result.iterations} iterations, constraints "
             f"violated by {result.violation:.1e}. Try another guess or more time."
         )
-    return _plan(params, result, at, seconds)
+    return _plan(problem, params, result, seconds)
 
 
 def _is_motion(guess: Guess) -> bool:
@@ -195,26 +179,26 @@ def _is_motion(guess: Guess) -> bool:
     return bool(np.abs(changes - expected).sum() <= _UNLIKE * (np.abs(changes) + np.abs(expected)).sum())
 
 
-def _with_given_times(bounds: Bounds, states: np.ndarray, at: _Layout) -> Bounds:
+def _with_given_times(problem: Problem, bounds: Bounds, states: np.ndarray) -> Bounds:
     """Bounds that also fix the step and the free variables at the guess's values."""
     lower, upper = bounds.state_lower.copy(), bounds.state_upper.copy()
-    held = slice(at.h, at.start.start)
+    held = slice(_H, _free(problem).stop)
     lower[:, held] = upper[:, held] = np.clip(states[:, held], lower[0, held], upper[0, held])
     return replace(bounds, state_lower=lower, state_upper=upper)
 
 
-def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:
+def _bounds(problem: Problem, ocp: Ocp) -> Bounds:
     bounds = Bounds.free(ocp, problem.intervals)
     lower, upper = bounds.state_lower, bounds.state_upper
     lower[:, 2:4], upper[:, 2:4] = -problem.lean_limit, problem.lean_limit
-    lower[:, at.a], upper[:, at.a] = -1, 1
+    lower[:, _A], upper[:, _A] = -1, 1
     for knot, (low, high) in ((0, problem.initial), (-1, problem.final)):
-        lower[knot, at.x] = np.maximum(lower[knot, at.x], low)
-        upper[knot, at.x] = np.minimum(upper[knot, at.x], high)
+        lower[knot, _X] = np.maximum(lower[knot, _X], low)
+        upper[knot, _X] = np.minimum(upper[knot, _X], high)
     # h and q do not change, so bounds at the first knot suffice.
-    lower[0, at.h], upper[0, at.h] = problem.step
+    lower[0, _H], upper[0, _H] = problem.step
     for i, (low, high) in enumerate(problem.free):
-        lower[0, at.q.start + i], upper[0, at.q.start + i] = low, high
+        lower[0, _H + 1 + i], upper[0, _H + 1 + i] = low, high
     for knot, i in np.argwhere(lower > upper)[:1]:
         name, low, high = dynamics.STATE[i][0] if i < 8 else "a decision variable", lower[knot, i], upper[knot, i]
         raise PlanError(
@@ -223,14 +207,14 @@ def _bounds(problem: Problem, ocp: Ocp, at: _Layout) -> Bounds:
     return bounds
 
 
-def _plan(params: BallbotParams, result: OcpSolution, at: _Layout, seconds: float) -> Plan:
-    x, u = result.states[:, at.x], params.force_limit * result.states[:, at.a]
-    t = result.states[0, at.h] * np.arange(len(x))
+def _plan(problem: Problem, params: BallbotParams, result: OcpSolution, seconds: float) -> Plan:
+    x, u = result.states[:, _X], params.force_limit * result.states[:, _A]
+    t = result.states[0, _H] * np.arange(len(x))
     trajectory = Trajectory(t, x, u, xdot=dynamics.derivative(params, x, u))
     return Plan(
         cost=result.cost,
         trajectory=trajectory,
-        q=result.states[0, at.q],
+        q=result.states[0, _free(problem)],
         status=result.status,
         violation=result.violation,
         collocation_error=collocation_error(params, trajectory),

@@ -62,54 +62,6 @@ class Counts:
     replans: int = 0
 
 
-@dataclass(frozen=True)
-class PreparedPlan:
-    """A plan with the gains and weights along it that the controller needs. Making it takes longer than a control step.
-
-    | field | shape | meaning |
-    |---|---|---|
-    | `tracker` | | TVLQR along the plan |
-    | `q`, `r` | (n, 8, 8), (n, 2, 2) | Hessians of the cost rate in states and actions |
-    | `p`, `slopes` | (n+1, 8, 8), (n+1, 8) | of the cost-to-go from each state |
-    | `sums` | (n+1, 2) | sums of the actions before each step |
-    | `distinct` | (m,) | indices of the margins that do not repeat others |
-    """
-
-    plan: Optimum
-    tracker: TvlqrController
-    q: np.ndarray
-    r: np.ndarray
-    p: np.ndarray
-    slopes: np.ndarray
-    sums: np.ndarray
-    distinct: np.ndarray
-
-
-def prepared_plan(
-    task: Task, params: BallbotParams, x: np.ndarray, c: np.ndarray, backoff: Backoff, start: float = 0.0
-) -> PreparedPlan:
-    """Plans from state x (8,) at the episode's time `start`, s, with constants c (nc,), and prepares the plan.
-
-    Raises:
-        PlanError: there is no plan.
-    """
-    plan = plan_to_track(task, params, x, c, backoff, start)
-    trajectory = plan.trajectory
-    tracker = TvlqrController.for_task(task, params, trajectory, c)
-    q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c, trajectory.t[:-1])
-    margins = np.array([task.margins(x, task.at(c, t)) for t, x in zip(trajectory.t, trajectory.x, strict=True)])
-    return PreparedPlan(
-        plan=plan,
-        tracker=tracker,
-        q=2 * q,
-        r=2 * r * params.force_limit**2,
-        p=np.concatenate([tracker.gains.p, final_weight(task, params, trajectory.x[-1], c, trajectory.t[-1])[None]]),
-        slopes=np.concatenate([np.zeros((1, params.state_size)), plan.costates]),
-        sums=np.concatenate([np.zeros((1, params.action_size)), np.cumsum(trajectory.u, axis=0)]) / params.force_limit,
-        distinct=np.unique(margins, axis=1, return_index=True)[1],  # unused obstacles repeat others
-    )
-
-
 class NmpcController:
     """Model predictive control about the episode's plan. One iteration per control step by default (real-time iteration).
 
@@ -163,24 +115,40 @@ class NmpcController:
 
     def reset(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
         c = np.asarray(c, np.float64)
-        prepared = prepared_plan(self._task, self._params, x, c, self.backoff, t)
+        self._follow(t, x, c)
         self._c, self._lost = c, False
         self.disturbance = DisturbanceEstimator(self._params.force_limit) if self._offset_free else None
         self._before: tuple[np.ndarray, np.ndarray] | None = None
-        self._follow(t, prepared)
 
     def adapt(self, params: BallbotParams) -> None:
         """Goes on with the model of another robot of the same kind. The plan stays."""
         self._params = params
 
-    def _follow(self, t: float, prepared: PreparedPlan) -> None:
-        """Starts the horizon on a plan of the episode at time t."""
-        self._start, self._prepared, self.plan, self.predicted = t, prepared, prepared.plan, None
-        self._trajectory = prepared.plan.trajectory
-        prepared.tracker.reset(t, self._trajectory.x[0], self._c)
-        self._length, self._step = len(self._trajectory.u), 0
+    def _follow(self, t: float, x: np.ndarray, c: np.ndarray) -> None:
+        """Plans from state x at the episode's time t, and starts on the plan. It takes longer than a control step.
+
+        Raises:
+            PlanError: there is no plan.
+        """
+        task, robot = self._task, self._params
+        plan = plan_to_track(task, robot, x, c, self.backoff, t)
+        self._start, self.plan, self.predicted = t, plan, None
+        self._trajectory = trajectory = plan.trajectory
+        self._tracker = TvlqrController.for_task(task, robot, trajectory, c)
+        self._tracker.reset(t, trajectory.x[0], c)
+        self._length, self._step = len(trajectory.u), 0
+        q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c, trajectory.t[:-1])
+        self._q, self._r = 2 * q, 2 * r * robot.force_limit**2  # Hessians of the cost rate in states and actions
+        # of the cost-to-go from each state
+        p_final = final_weight(task, robot, trajectory.x[-1], c, trajectory.t[-1])
+        self._p = np.concatenate([self._tracker.gains.p, p_final[None]])
+        self._slopes = np.concatenate([np.zeros((1, robot.state_size)), plan.costates])
+        # sums of the actions before each step
+        sums = np.cumsum(trajectory.u, axis=0) / robot.force_limit
+        self._sums = np.concatenate([np.zeros((1, robot.action_size)), sums])
+        margins = np.array([task.margins(x, task.at(c, t)) for t, x in zip(trajectory.t, trajectory.x, strict=True)])
+        self._distinct = np.unique(margins, axis=1, return_index=True)[1]  # unused obstacles repeat others
         nodes = len(self._grid.lengths)
-        robot = self._params
         self._dx, self._da = np.zeros((nodes + 1, robot.state_size)), np.zeros((nodes, robot.action_size))
         self._curvature = np.zeros(nodes)
         self._reserve = self._reserve_of_grip()
@@ -192,7 +160,7 @@ class NmpcController:
         if elapsed >= self._length and self._found_new_plan(t, x):
             elapsed = 0
         if elapsed >= self._length:
-            u = self._prepared.tracker.act(t, x)  # the plan's end is held
+            u = self._tracker.act(t, x)  # the plan's end is held
             self.predicted = None
         else:
             self._advance(elapsed)
@@ -225,7 +193,7 @@ class NmpcController:
             return False
         self.counts.replans += 1
         try:
-            self._follow(t, prepared_plan(self._task, self._params, x, self._c, self.backoff, t))
+            self._follow(t, x, self._c)
         except PlanError:
             self._lost = True
         return not self._lost
@@ -239,7 +207,7 @@ class NmpcController:
         self._step = elapsed
         self._nodes = at = np.minimum(elapsed + self._grid.offsets, self._length)
         self._lengths = np.diff(at)  # near the plan's end intervals shrink to nothing
-        sums = self._prepared.sums
+        sums = self._sums
         self._x_plan = self._trajectory.x[at]
         self._a_plan = (sums[at[1:]] - sums[at[:-1]]) / np.maximum(self._lengths, 1)[:, None]
 
@@ -261,22 +229,20 @@ class NmpcController:
         return True
 
     def _load(self, x: np.ndarray) -> None:
-        qp, prepared, dt, end = self._qp, self._prepared, self._task.control_dt, self._nodes[-1]
+        qp, dt, end = self._qp, self._task.control_dt, self._nodes[-1]
         self._guess_x, self._guess_a = self._x_plan + self._dx, self._a_plan + self._da
         qp.x[:], qp.a[:-1] = self._guess_x, self._guess_a
         qp.x[0] = x
         qp.set_robot(self._params)
-        qp.distinct, qp.disturbance, qp.curvature = prepared.distinct, self.disturbance, self._curvature
+        qp.distinct, qp.disturbance, qp.curvature = self._distinct, self.disturbance, self._curvature
         times = self._trajectory.t[0] + dt * self._nodes
         qp.h[:-1], qp.c[:], qp.reserve[:] = dt * self._lengths, self._task.at(self._c, times), self._reserve
         at, weight = np.minimum(self._nodes[:-1], self._length - 1), (dt * self._lengths)[:, None, None]
-        qp.set_weights(
-            prepared.q[at] * weight, prepared.r[at] * weight, prepared.p[end], prepared.slopes[end], self._x_plan[-1]
-        )
+        qp.set_weights(self._q[at] * weight, self._r[at] * weight, self._p[end], self._slopes[end], self._x_plan[-1])
 
     def _fall_back(self, x: np.ndarray) -> np.ndarray:
         """The last plan under TVLQR: the last solution, shifted, with the episode plan's gains."""
-        gain = self._prepared.tracker.gains.k[self._step]
+        gain = self._tracker.gains.k[self._step]
         return self._params.force_limit * self._guess_a[0] - gain @ (x - self._guess_x[0])
 
 

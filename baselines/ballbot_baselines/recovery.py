@@ -18,7 +18,7 @@ from dataclasses import replace
 import casadi
 import numpy as np
 
-from ballbot_baselines import guess, righting
+from ballbot_baselines import righting
 from ballbot_baselines.ocp import Bounds, Ocp, OcpSolution, OcpSolver
 from ballbot_baselines.shooting import Backoff, shooting_ocp, shooting_parameters
 from ballbot_gym.params import BallbotParams
@@ -50,7 +50,8 @@ def largest_leans(task: Task, params: BallbotParams, component: int, values: np.
     solver = OcpSolver(_largest_lean_ocp(task, params), task.steps, "fatrop", _TOLERANCE, _ITERATIONS)
     leans = np.full(len(values), np.nan)
     middle = int(np.argmin(np.abs(values)))
-    standing, sideways = _standing(task, params), _sideways(task, params)
+    standing = np.zeros((task.steps + 1, 9)), np.zeros((task.steps, 2))
+    sideways = _sideways(task, params) or standing
     for order in (range(middle, len(values)), range(middle, -1, -1)):
         start, failures = standing, 0
         for i in order:
@@ -78,20 +79,14 @@ def _solve(
     return solver.solve(x, a, bounds, p)
 
 
-def _standing(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
-    path = np.zeros((task.steps + 1, 2))
-    x, u = guess.along_path(params, path, task.control_dt)
-    return np.column_stack([x, np.zeros(len(x))]), u
-
-
-def _sideways(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray]:
-    """A simulated recovery from a large lean that first leans to one side; standing, if there is none."""
+def _sideways(task: Task, params: BallbotParams) -> tuple[np.ndarray, np.ndarray] | None:
+    """A simulated recovery from a large lean that first leans to one side, if there is one."""
     x0 = np.zeros(8)
     x0[_LEAN] = _STEEP
     for member in righting.righted(task, params, x0, np.zeros(0), params.force_limit):
         if member.side and len(member.u) == task.steps:
             return np.column_stack([member.x, np.full(len(member.x), _STEEP)]), member.u / params.force_limit
-    return _standing(task, params)
+    return None
 
 
 def _largest_lean_ocp(task: Task, params: BallbotParams) -> Ocp:
