@@ -73,7 +73,7 @@ def interpreted(monkeypatch):
     """
     compiled, shooting = (pytest.importorskip(f"ballbot_baselines.{name}") for name in ("compiled", "shooting"))
     monkeypatch.setattr(compiled, "loaded", lambda *_: None)
-    for name in ("_ocp", "_solver"):
+    for name in ("ocp_of", "_solver"):
         monkeypatch.setattr(shooting, name, functools.cache(getattr(shooting, name).__wrapped__))
 
 

@@ -17,14 +17,14 @@ What remains unsolved is left to `find_optimum`. `benchmarks/batched_optima.py` 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ballbot_baselines import guess, righting, search, sides
-from ballbot_baselines.ilqr import MARGIN, Options, Solutions, ilqr
+from ballbot_baselines.ilqr import MARGIN, Options, Rows, Solutions, ilqr
 from ballbot_baselines.shooting import FREE_TIME_INTERVALS, Backoff, robot_numbers, shooting_parameters
 from ballbot_gym import machine_code
 from ballbot_gym.params import BallbotParams
@@ -63,7 +63,7 @@ _GUESSES = 5  # as of `find_optimum`
 
 
 @dataclass(frozen=True)
-class BatchOptima:
+class BatchOptima(Rows):
     """Optima of B episodes of at most n control steps.
 
     | field | shape | meaning |
@@ -84,10 +84,6 @@ class BatchOptima:
     forces: np.ndarray
     gains: np.ndarray
     slopes: np.ndarray
-
-    def some(self, rows: slice) -> "BatchOptima":
-        """Some of them; no copies."""
-        return BatchOptima(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def solves(task: Task, params: BallbotParams) -> bool:
@@ -157,16 +153,13 @@ def find_optima(
 
 
 @dataclass(frozen=True)
-class _Guesses:
+class _Guesses(Rows):
     """J guesses: of which episodes, states (J, n+1, 8 or 9), actions (J, n, 2), and numbers of steps (J,)."""
 
     of: np.ndarray
     x: np.ndarray
     a: np.ndarray
     steps: np.ndarray
-
-    def some(self, chosen: np.ndarray) -> "_Guesses":
-        return _Guesses(self.of[chosen], self.x[chosen], self.a[chosen], self.steps[chosen])
 
 
 class _Batch:
@@ -297,10 +290,7 @@ class _Batch:
             if not found.solved[i] or found.costs[i] >= optima.costs[row]:
                 continue
             optima.costs[row], optima.steps[row] = found.costs[i], steps
-            optima.states[row, : steps + 1], optima.states[row, steps + 1 :] = (
-                found.x[i, : steps + 1],
-                found.x[i, steps],
-            )
+            optima.states[row] = found.x[i, np.minimum(np.arange(self._task.steps + 1), steps)]
             for kept, values, unit in (
                 (optima.forces, found.a, limit),
                 (optima.gains, found.gains, limit),

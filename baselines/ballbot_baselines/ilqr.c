@@ -12,8 +12,13 @@
 #define EACH_LANE for (int k = 0; k < LANES; ++k)
 
 typedef struct {
-    double width, least_width, shrink, factor, tolerance, violation, iterations, bends, multiplier;
+    double width, tolerance, violation, bends, multiplier;
 } options;
+
+#define LEAST_WIDTH 2e-4 /* where widths end */
+#define SHRINK 0.5       /* of widths, whenever the multipliers change */
+#define FACTOR 10.0      /* by which a multiplier changes at most */
+#define ITERATIONS 60    /* after which an episode is given up */
 
 enum { OPTIMAL = 0, STUCK = 1, EXHAUSTED = 2, FELL = 3 };
 
@@ -28,11 +33,11 @@ static real price(int count, const real *g, const real *multiplier, real width, 
     return sum;
 }
 
-static void update(int count, const real *g, real *multiplier, real width, real factor, int k) {
+static void update(int count, const real *g, real *multiplier, real width, int k) {
     for (int i = 0; i < count; ++i) {
         const real t = g[i * LANES + k] / width, below = t < -0.5 ? t + 0.5 : 0;
         real by = 1 / (1 + (t - below)) - 4 * below;
-        by = by > factor ? factor : by < 1 / factor ? 1 / factor : by;
+        by = by > FACTOR ? FACTOR : by < 1 / FACTOR ? 1 / FACTOR : by;
         multiplier[i * LANES + k] *= by;
     }
 }
@@ -53,8 +58,8 @@ typedef struct {
     const int64_t *steps;
     const options *each;
     const double *lengths, *given;
-    double *x_all, *a_all, *path_prices, *end_prices, *gains_all, *slopes_all, *costs, *missed_all;
-    int64_t *status, *iterations;
+    double *x_all, *a_all, *path_prices, *end_prices, *gains_all, *slopes_all, *costs;
+    int64_t *status;
 } problems;
 
 /* LANES episodes: row t of the arrays is step t. */
@@ -96,7 +101,6 @@ static void off(const block *b, int k, real *gap, real *missed) {
 
 static void unload(block *b, const problems *q, int k, int over) {
     const int64_t j = b->job[k], empty = b->n - q->steps[j];
-    real gap = 0, missed = 0;
     for (int64_t t = empty; t <= b->n; ++t) {
         const int64_t s = t - empty;
         for (int i = 0; i < STATES; ++i) q->x_all[(j * (q->most + 1) + s) * STATES + i] = b->x[t][i][k];
@@ -107,8 +111,7 @@ static void unload(block *b, const problems *q, int k, int over) {
         for (int i = 0; i < PATH; ++i) q->path_prices[(j * q->most + s) * PATH + i] = b->m[t][i][k];
     }
     for (int i = 0; i < END; ++i) q->end_prices[j * END + i] = b->e[i][k];
-    off(b, k, &gap, &missed);
-    q->costs[j] = b->cost[k], q->missed_all[j] = missed, q->status[j] = over, q->iterations[j] = b->tick[k];
+    q->costs[j] = b->cost[k], q->status[j] = over;
     b->job[k] = -1, --b->active;
 }
 
@@ -175,11 +178,10 @@ static void accept(block *b, int k) {
 
 /* New multipliers, and a narrower price. */
 static void reprice(block *b, int k) {
-    const options *o = &b->o[k];
     for (int64_t t = 0; t < b->n; ++t)
-        if (b->dt[t][0][k] > 0) update(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], o->factor, k);
-    update(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], o->factor, k);
-    b->width[0][k] = fmax(b->width[0][k] * o->shrink, o->least_width);
+        if (b->dt[t][0][k] > 0) update(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], k);
+    update(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], k);
+    b->width[0][k] = fmax(b->width[0][k] * SHRINK, LEAST_WIDTH);
     b->merit[k] = b->cost[k] + price(END, &b->ge[0][0], &b->e[0][0], b->width[0][k], k), b->share[0][k] = 1;
     for (int64_t t = 0; t < b->n; ++t)
         if (b->dt[t][0][k] > 0) b->merit[k] += price(PATH, &b->g[t][0][0], &b->m[t][0][0], b->width[0][k], k);
@@ -207,19 +209,19 @@ static int decide(block *b, int k) {
         off(b, k, &gap, &missed);
         if ((settled || stuck) && missed <= o->violation && gap <= 10 * o->tolerance * scale)
             over = settled ? OPTIMAL : STUCK;
-        else if (stuck && b->width[0][k] <= o->least_width)
+        else if (stuck && b->width[0][k] <= LEAST_WIDTH)
             over = STUCK;
         else
             reprice(b, k);
     }
-    return ++b->tick[k] >= o->iterations && over < 0 ? EXHAUSTED : over;
+    return ++b->tick[k] >= ITERATIONS && over < 0 ? EXHAUSTED : over;
 }
 
 /* Solves `jobs` of the episodes, of at most n steps, each with its options. */
 void solve(int64_t jobs, int64_t n, int64_t most, const int64_t *rows, const options *each, const int64_t *steps,
            const double *lengths, const double *given, double *x, double *a, double *path_prices, double *end_prices,
-           double *gains, double *slopes, double *costs, double *missed, int64_t *status, int64_t *iterations) {
-    const problems q = {most, rows, steps, each, lengths, given, x, a, path_prices, end_prices, gains, slopes, costs, missed, status, iterations};
+           double *gains, double *slopes, double *costs, int64_t *status) {
+    const problems q = {most, rows, steps, each, lengths, given, x, a, path_prices, end_prices, gains, slopes, costs, status};
     block *b = calloc(1, sizeof *b);
     b->n = n;
 #define MAKE(name) b->name = calloc((size_t)n + 1, sizeof *b->name)

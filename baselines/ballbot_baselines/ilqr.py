@@ -17,7 +17,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import casadi
 import numpy as np
@@ -25,7 +25,7 @@ import numpy as np
 from ballbot_baselines import righting
 from ballbot_baselines.compiled import LANES, SIMD
 from ballbot_baselines.lqr import discrete_lqr, is_equilibrium
-from ballbot_baselines.shooting import RobotKind, kind_of, shooting_ocp
+from ballbot_baselines.shooting import RobotKind, kind_of, ocp_of
 from ballbot_gym import codegen, dynamics, machine_code, ops
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
@@ -45,30 +45,33 @@ _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limit
 
 @dataclass(frozen=True)
 class Options:
-    """Of the solver, in ilqr.c's order, the multiplier last. Widths are in the unit of the constraints."""
+    """Of the solver, in ilqr.c's order, the multiplier last."""
 
     width: float = 0.2
-    """Of the constraints' prices, at first."""
-    least_width: float = 2e-4
-    """Where it ends."""
-    shrink: float = 0.5
-    """How it shrinks whenever the multipliers change."""
-    factor: float = 10.0
-    """By which a multiplier changes at most."""
+    """Of the constraints' prices, at first, in the unit of the constraints."""
     tolerance: float = 1e-5
     """Relative: the last iteration promises to lower the cost by less."""
     violation: float = MARGIN
     """By which a constraint is missed at most, besides what the caller keeps of it."""
-    iterations: float = 60
-    """After which it gives up."""
     bends: float = 3
     """Newton steps on the dynamics, for guesses that are no motions; 0 for those that are."""
     multiplier: float = 0.1
     """Of every constraint, at first."""
 
 
+Some = TypeVar("Some", bound="Rows")
+
+
+class Rows:
+    """Arrays of many problems, a row for each."""
+
+    def some(self: Some, rows: np.ndarray | slice) -> Some:
+        """Those of some problems: copies, or views for a slice."""
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(cast(Any, self))))
+
+
 @dataclass(frozen=True)
-class Solutions:
+class Solutions(Rows):
     """Of J problems of at most n steps; those with fewer have no meaning at the end.
 
     | field | shape | meaning |
@@ -91,10 +94,6 @@ class Solutions:
     solved: np.ndarray
     multipliers: np.ndarray
     end_multipliers: np.ndarray
-
-    def some(self, rows: np.ndarray) -> "Solutions":
-        """Copies of some of them."""
-        return Solutions(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def put(self, rows: np.ndarray, others: "Solutions", which: np.ndarray) -> None:
         """Puts the others' solutions `which` in place of the rows at the same indices."""
@@ -132,9 +131,6 @@ def rest(task: Task, params: BallbotParams) -> Rest | None:
     return found[0] if np.allclose(found[0].p, found[-1].p, rtol=1e-9) else None
 
 
-_COMPILED: dict[tuple[Any, ...], tuple[ctypes.CDLL, int, dict[str, int]]] = {}
-
-
 class Ilqr:
     """The solver of a task and a robot. `rest` says where the task ends at rest.
 
@@ -146,16 +142,13 @@ class Ilqr:
     """
 
     def __init__(self, task: Task, params: BallbotParams, free_time: bool = False):
-        kind: tuple[Any, ...] = (free_time, *kind_of(task, params))  # which refuses formulas that cannot be optimized
+        kind = kind_of(task, params)  # which refuses formulas that cannot be optimized
         self._limit, self.rest = params.force_limit, None if free_time else rest(task, params)
-        if kind not in _COMPILED:
-            stage = _Stage(task, params, free_time, self.rest is not None)
-            name = f"{task.id}-ilqr{'-free' if free_time else ''}"
-            _COMPILED[kind] = ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD))), stage.ns, stage.sizes
-        library, self.states, self._sizes = _COMPILED[kind]
+        library, self._sizes = _compiled(*kind, free_time, self.rest is not None)
+        self.states = self._sizes["STATES"]
         self._solve, self._follow = library.solve, library.follow
         count, pointer = ctypes.c_int64, ctypes.c_void_p
-        self._solve.argtypes, self._solve.restype = [count, count, count, *[pointer] * 15], None
+        self._solve.argtypes, self._solve.restype = [count, count, count, *[pointer] * 13], None
         self._follow.argtypes, self._follow.restype = [count, count, *[pointer] * 9], None
 
     def solve(
@@ -193,8 +186,8 @@ class Ilqr:
         m[:] = settings[:, -1:, None] if multipliers is None else multipliers
         e[:] = settings[:, -1:] if end_multipliers is None else end_multipliers
         gains, slopes = np.zeros((jobs, n, 2, self.states)), np.zeros((jobs, n, self.states))
-        costs, missed, (status, iterations) = np.zeros(jobs), np.zeros(jobs), np.zeros((2, jobs), np.int64)
-        arrays = (settings, steps, lengths, given, x, a, m, e, gains, slopes, costs, missed, status, iterations)
+        costs, status = np.zeros(jobs), np.zeros(jobs, np.int64)
+        arrays = (settings, steps, lengths, given, x, a, m, e, gains, slopes, costs, status)
         alike = -(-steps // _ALIKE)
         for group in np.unique(alike):
             rows = np.flatnonzero(alike == group)
@@ -260,11 +253,18 @@ def ilqr(task: Task, params: BallbotParams, free_time: bool = False) -> Ilqr:
     return Ilqr(task, params, free_time)
 
 
+@functools.cache
+def _compiled(task: Task, kind: RobotKind, free_time: bool, rests: bool) -> tuple[ctypes.CDLL, dict[str, int]]:
+    """The functions of ilqr.c for a task and a kind of robot, and the sizes that they were made for."""
+    stage, name = _Stage(task, kind, free_time, rests), f"{task.id}-ilqr{'-free' if free_time else ''}"
+    return ctypes.CDLL(str(machine_code.library(name, stage.source(), SIMD))), stage.sizes
+
+
 class _Stage:
     """The functions of ilqr.c: what a control step of one episode computes, as C that computes it for `LANES`."""
 
-    def __init__(self, task: Task, params: BallbotParams, free_time: bool, rests: bool):
-        self._ocp = shooting_ocp(task, params)
+    def __init__(self, task: Task, kind: RobotKind, free_time: bool, rests: bool):
+        self._ocp = ocp_of(task, kind)
         self._substeps = dynamics.substeps_for(task.control_dt)
         self._free, self.ns, self._rests = free_time, 9 if free_time else 8, rests
         symbol = casadi.SX.sym
@@ -272,7 +272,7 @@ class _Stage:
         self._p = symbol("p", self._ocp.params - 1 + 2 * free_time + _REST * rests)
         self._all = casadi.vertcat(self._length(self._x), self._p[: self._ocp.params - 1])
         self._limit: Any
-        self._robot, self._limit = RobotKind.of(params).symbolic(self._all)
+        self._robot, self._limit = kind.symbolic(self._all)
         self._width, self._share, self._gain = symbol("width"), symbol("share"), symbol("gain", 2 * self.ns)
         self._following, self._step = symbol("following", self.ns), symbol("step", 2)
         path, end = self._path(self._a), self._ocp.final_inequalities(self._x[:8], self._all)

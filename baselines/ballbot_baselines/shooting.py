@@ -121,7 +121,7 @@ def shooting_ocp(task: Task, params: BallbotParams) -> Ocp:
     Raises:
         ValueError: no optimizer can use the task's formulas; see `check_formulas`.
     """
-    return _ocp(*kind_of(task, params))
+    return ocp_of(*kind_of(task, params))
 
 
 def kind_of(task: Task, params: BallbotParams) -> tuple[Task, RobotKind]:
@@ -134,8 +134,8 @@ def kind_of(task: Task, params: BallbotParams) -> tuple[Task, RobotKind]:
 
 
 @lru_cache(maxsize=64)
-def _ocp(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
-    """With `free_time` the length of all intervals is one more state, the last, and the first of p is not used for it."""
+def ocp_of(task: Task, kind: RobotKind, free_time: bool = False) -> Ocp:
+    """`shooting_ocp` of a kind of robot. With `free_time` one length of all intervals, s, is the last state."""
     n, nc, first = kind.states, len(task.constant_names), 1 + len(kind.names)
     margin, goal, reserve = range(first + nc, first + nc + 3)  # back-offs in p
 
@@ -227,7 +227,7 @@ def shooting_solver(
 
 @lru_cache(maxsize=256)
 def _solver(task: Task, kind: RobotKind, free_time: bool, *options: Any) -> OcpSolver:
-    return OcpSolver(_ocp(task, kind, free_time), *options)
+    return OcpSolver(ocp_of(task, kind, free_time), *options)
 
 
 @dataclass(frozen=True, eq=False)
