@@ -207,7 +207,8 @@ class _Batch:
         rows[:, first : first + c.shape[1]] = c
         if free_time or self._solver.rest is None:
             return rows
-        return np.column_stack([rows, self._solver.ends(self._ends[of], float(steps < self._task.steps))])
+        of_rest = [*self._solver.rest.p[np.triu_indices(8)], float(steps < self._task.steps)]
+        return np.column_stack([rows, self._ends[of], np.tile(of_rest, (len(c), 1))])
 
     def _solve(
         self,

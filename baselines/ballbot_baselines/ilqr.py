@@ -39,7 +39,7 @@ _SUBSTEPS = 1  # of RK4 where a control step is linearized; it is then wrong by 
 _LEAST_CURVATURE = 1e-9  # of the cost along an action, so that steps of no length have a best one
 _LARGEST_ACTION = 1 - 1e-7  # as in `shooting.Backoff`
 _ALIKE = 20  # problems whose numbers of steps share a multiple of these are solved together
-_REST = 8 + 36 + 1  # parameters of `Ilqr.ends`
+_REST = 8 + 36 + 1  # parameters of LQR's cost-to-go: a state, the upper triangle of P, and its share
 _OVER = 3.0  # curvature that keeps the actions of a bent guess near their limits
 
 
@@ -170,7 +170,7 @@ class Ilqr:
             steps: (J,) or one number of steps, n at most.
             lengths: (J,) or one length of a step, s; 1 where it is free.
             given: (J, np) parameters: p of `shooting_ocp` but the first, and the bounds of a free length, s, or else, for
-                tasks with a `rest`, what `ends` gives.
+                tasks with a `rest`, a state (8,), P's upper triangle (36,), and the share of LQR's cost-to-go that counts.
             options: of the solver, or of each problem.
             multipliers, end_multipliers: (J, n, path constraints) and (J, constraints of the end) at first, of a solution of
                 nearly the same problem; default, the option.
@@ -230,12 +230,6 @@ class Ilqr:
         arrays = *self._given(jobs, length, given), paths, np.tile(settings, (jobs, 1)), feedback, x, a, costs, missed
         self._follow(jobs, n, *(None if array is None else array.ctypes.data for array in arrays))
         return x, a, np.where((missed <= 0) & np.isfinite(costs), costs, np.inf)
-
-    def ends(self, ends: np.ndarray, share: float) -> np.ndarray:
-        """(J, 45) parameters: that a share of LQR's cost-to-go about the states `ends` (J, 8) counts, 0 or 1."""
-        assert self.rest is not None
-        same = np.tile([*self.rest.p[np.triu_indices(8)], share], (len(ends), 1))
-        return np.column_stack([ends, same])
 
     def _given(self, jobs: int, lengths: Any, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         shapes = ((lengths, (jobs,)), (given, (jobs, self._sizes["PARAMS"])))

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.linalg
 
 from ballbot_baselines.linearize import discretize, quadratic_cost
-from ballbot_baselines.lqr import discrete_lqr, final_weight, is_equilibrium, riccati
+from ballbot_baselines.lqr import discrete_lqr, final_weight, is_equilibrium, riccati, tracking_gains
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
@@ -93,17 +93,18 @@ def tube_gains(task: Task, params: BallbotParams, trajectory: Trajectory, c: np.
     The gains are TVLQR's. If the task ends in its goal, only those goal functions that limit the optimum are weighted at its
     end. Weighting the whole goal would ask for forces that the optimum from a neighbouring state does not need.
     """
-    if not task.first_exit:
-        return TvlqrController.for_task(task, params, trajectory, c).gains.k
-    q, r = quadratic_cost(task, trajectory.x[:-1], trajectory.u, c)
+    x, u = _sampled(trajectory, task.control_dt)
     end, h = trajectory.x[-1], 1e-5
-    goal = np.array(task.goal(end, c), np.float64)
-    slopes = np.array(
-        [np.subtract(task.goal(end + d, c), task.goal(end - d, c)) / (2 * h) for d in h * np.eye(len(end))]
-    )
-    active = slopes[:, goal > goal.max() - _ACTIVE]
-    dt = task.control_dt
-    return TvlqrController(params, trajectory, dt, q * dt, r * dt, active @ active.T + 1e-3 * np.eye(len(end))).gains.k
+    if task.first_exit:
+        goal = np.array(task.goal(end, c), np.float64)
+        slopes = np.array(
+            [np.subtract(task.goal(end + d, c), task.goal(end - d, c)) / (2 * h) for d in h * np.eye(len(end))]
+        )
+        active = slopes[:, goal > goal.max() - _ACTIVE]
+        p_final = active @ active.T + 1e-3 * np.eye(len(end))
+    else:
+        p_final = final_weight(task, params, end, c, trajectory.t[-1])
+    return tracking_gains(task, params, x, u, c, p_final, trajectory.t[0]).k
 
 
 def _sampled(trajectory: Trajectory, dt: float) -> tuple[np.ndarray, np.ndarray]:
