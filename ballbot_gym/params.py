@@ -79,6 +79,8 @@ class _Kept(Generic[_Value]):
         self._name = name
 
     def __get__(self, instance: Any, owner: type | None = None) -> _Value:
+        if instance is None:
+            return self  # pyright: ignore[reportReturnType]  # asked of the class, as documentation does
         value = instance.__dict__[self._name] = self._compute(instance)
         return value
 

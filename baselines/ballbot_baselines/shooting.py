@@ -102,7 +102,9 @@ class RobotKind(NamedTuple):
         own = Wheels(*(found.pop(field.name) for field in fields(Wheels))) if self.wheels else None
         weight = found["total_mass"] * found["gravity"]
         default = {"moving_mass": found["total_mass"], "ball_radius": 0.0, "friction": math.inf, "weight": weight}
-        return SimpleNamespace(**(default | found), rolls=self.rolls, grips=self.grips, wheels=own), found["force_limit"]
+        return SimpleNamespace(**(default | found), rolls=self.rolls, grips=self.grips, wheels=own), found[
+            "force_limit"
+        ]
 
 
 def robot_numbers(params: BallbotParams) -> list[float]:

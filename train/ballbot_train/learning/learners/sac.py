@@ -330,7 +330,6 @@ class Sac(ModelFree):
         )
         if not warm:
             model.critic.register_forward_hook(self._weigh)
-        critics = (*model.critic.q_networks, *model.critic_target.q_networks)
         self._set_model(
             model,
             actor.mean
@@ -338,7 +337,7 @@ class Sac(ModelFree):
             else torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
             (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
             self._replay,
-            [last_bias(critic) for critic in critics],
+            [last_bias(critic) for critic in (*model.critic.q_networks, *model.critic_target.q_networks)],
         )
         if start is not None:
             check_start(start.spec, self._spec)
