@@ -232,6 +232,7 @@ class BallbotBatch:
         mask: torch.Tensor | None = None,
         x: torch.Tensor | None = None,
         c: torch.Tensor | None = None,
+        drawn: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Starts episodes.
 
@@ -241,15 +242,16 @@ class BallbotBatch:
             mask: (B,) bool, the envs to reset; default, all. The first time all are reset.
             x: (8, B) initial states; default, drawn.
             c: (nc, B) constants; default, drawn.
+            drawn: (6 or 14, B) what the randomization draws for the episodes; default, by their seeds.
 
         Returns:
             (B, no) observations of all envs.
 
         Raises:
-            ValueError: seeds, mask, states or constants of the wrong shape, not finite or out of their range; or a given
-                state that violates a limit of the task.
+            ValueError: seeds, mask, states, constants or draws of the wrong shape, not finite or out of their range; or a
+                given state that violates a limit of the task.
         """
-        self.state = self.initial_state(seed, mask, x, c)
+        self.state = self.initial_state(seed, mask, x, c, drawn)
         return self.observe(self.state)
 
     def initial_state(
@@ -258,10 +260,12 @@ class BallbotBatch:
         mask: torch.Tensor | None = None,
         x: torch.Tensor | None = None,
         c: torch.Tensor | None = None,
+        drawn: torch.Tensor | None = None,
     ) -> BatchState:
         """The state in which `reset` with these arguments would start; changes nothing."""
         self._check_mask(mask)
         self._check_given(x, self.params.state_size, "x")
+        self._check_given(drawn, self.randomization.episode_draws * self.randomization.varies_episodes, "drawn")
         if c is not None:
             self._check_given(c, len(self.task.constant_names), "c")
             for distinct in np.unique(c.detach().cpu().double().numpy(), axis=1).T:
@@ -277,7 +281,7 @@ class BallbotBatch:
         if seed is not None:
             given = torch.tensor([-1 if s is None else s for s in seeds_of(seed, self.num_envs)], device=self.device)
             seeds, episode = torch.where(given < 0, seeds, given), torch.where(given < 0, episode, 0)
-        new = self._start(seeds, episode, x, c)
+        new = self._start(seeds, episode, x, c, drawn)
         if x is not None:
             begin = self.task.at(new.c, torch.zeros_like(new.x[0]))
             violated = first_violated(self.task.limits(new.x, begin))
@@ -462,9 +466,14 @@ class BallbotBatch:
         return self.randomization.robot(self.params, drawn) if self.randomization.varies_robot else self.params
 
     def _start(
-        self, seed: torch.Tensor, episode: torch.Tensor, x: torch.Tensor | None = None, c: torch.Tensor | None = None
+        self,
+        seed: torch.Tensor,
+        episode: torch.Tensor,
+        x: torch.Tensor | None = None,
+        c: torch.Tensor | None = None,
+        drawn: torch.Tensor | None = None,
     ) -> _Rows:
-        """The starts of episodes; x and c are drawn where they are not given."""
+        """The starts of episodes; x, c and what the randomization draws are drawn where they are not given."""
         task, noise = self.task, self.randomization
         key = counter_rng.key(seed, episode, 0 * episode)
         varied = noise.varies_episodes
@@ -475,12 +484,13 @@ class BallbotBatch:
         constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
         state = task.start(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
         zero = torch.zeros_like(episode)
-        drawn = noise.draw(z[task.state_draws :][: noise.episode_draws], task.control_dt) if varied else ()
+        rows = noise.draw(z[task.state_draws :][: noise.episode_draws], task.control_dt) if varied else ()
+        rows = rows if drawn is None else drawn.unbind(0)
         still = torch.zeros_like(seed, dtype=self.dtype)
         forces = self.params.action_size
         actuator = noise.resting((still,) * forces, task.control_dt)
-        read = sensors.first(self.model(drawn), state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
-        begun = _Rows(state, constants, zero, episode, seed, drawn, actuator, (), read)
+        read = sensors.first(self.model(rows), state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
+        begun = _Rows(state, constants, zero, episode, seed, rows, actuator, (), read)
         return begun._replace(past=self.history * (*self._seen(begun), *(still,) * forces)) if self.history else begun
 
     def _observe(self, now: _Rows) -> torch.Tensor:

@@ -12,7 +12,6 @@ try:
 except ModuleNotFoundError as error:
     raise missing(__name__, error.name) from error
 
-from ballbot_gym import sensors
 from ballbot_gym.batch import BallbotBatch
 
 
@@ -56,16 +55,11 @@ def run_episodes(
         record: whether to keep the states of all control steps.
         drawn: (B, 6 or 14) what the batch's randomization draws for the episodes; default, by its seed.
     """
-    start = (torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device) for part in (x, c))
-    observation = batch.reset(0, None, *start)
-    if drawn is not None and batch.state is not None:
-        rows = torch.as_tensor(drawn.T, dtype=batch.dtype, device=batch.device).contiguous()
-        batch.state = batch.state._replace(drawn=rows)
-        if batch.history:  # the past before the episode has the drawn errors of sensors too
-            seen = batch.observe(batch.state).T[: sensors.observation_size(batch.task, batch.params, batch.observation)]
-            begun = torch.cat([seen, torch.zeros_like(seen[: batch.params.action_size])])
-            batch.state = batch.state._replace(past=begun.repeat(batch.history, 1))
-        observation = batch.observe(batch.state)
+    given = (
+        None if part is None else torch.as_tensor(part.T, dtype=batch.dtype, device=batch.device)
+        for part in (x, c, drawn)
+    )
+    observation = batch.reset(0, None, *given)
     running = torch.ones(batch.num_envs, dtype=torch.bool, device=batch.device)
     success, failure, terminated = torch.zeros((3, batch.num_envs), dtype=torch.bool, device=batch.device)
     cost = torch.zeros(batch.num_envs, dtype=torch.float64, device=batch.device)

@@ -219,6 +219,21 @@ def test_the_past_of_an_episode_with_given_draws_begins_with_their_sensors(rng):
     assert torch.equal(first[:, 16:18], torch.zeros(3, 2))
 
 
+def test_the_first_reading_of_sensors_is_of_the_robot_that_was_given():
+    import torch
+
+    varied = Randomization(body_mass=(0.7, 1.4))
+    batch = BallbotBatch(
+        "stabilize", 3, robot="omni", observation="sensors", randomization=varied, compile=False, dtype=torch.float64
+    )
+    by_seed = batch.reset(seed=5)
+    drawn = batch.state.drawn
+    assert torch.equal(batch.reset(seed=5, drawn=drawn), by_seed)
+    assert (batch.reset(seed=5, drawn=drawn.flip(1))[[0, 2], :6] != by_seed[[0, 2], :6]).any()
+    with pytest.raises(ValueError, match="drawn"):
+        batch.reset(seed=5, drawn=drawn[:2])
+
+
 def test_an_informed_policy_acts_as_its_start_at_first_and_runs_behind_a_filter(tmp_path):
     import torch
 

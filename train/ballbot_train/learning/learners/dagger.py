@@ -311,10 +311,8 @@ class Dagger:
         batch = BallbotBatch(
             task, len(x), compile=False, params=self._params, randomization=randomization, history=self._history
         )
-        start = batch.initial_state(
-            int(rng.integers(2**31)), None, *(torch.as_tensor(part.T, dtype=batch.dtype) for part in (x, c))
-        )
-        start = start._replace(drawn=torch.as_tensor(drawn.T, dtype=batch.dtype))
+        given = (torch.as_tensor(part.T, dtype=batch.dtype) for part in (x, c, drawn))
+        start = batch.initial_state(int(rng.integers(2**31)), None, *given)
         robots = [randomization.robot(self._params, tuple(row)) for row in drawn.tolist()]
         states, lasted, costs = self._labelled_run(batch, start, robots, rng)
         at = rng.integers(lasted).tolist()
