@@ -21,7 +21,7 @@ from ballbot_gym.rollout import ActionController, rollout
 from ballbot_gym.tasks import TASKS
 from ballbot_train.evaluation.controllers import make_controller
 from ballbot_train.policy import PolicyNetwork, load_network, save_policy
-from ballbot_train.policy_files import BEST, PolicySpec, shipped_policies
+from ballbot_train.policy_files import BEST, SHIPPED, PolicyError, PolicySpec, shipped_policies
 from ballbot_train.report import playground
 from ballbot_train.report.playground import SCENARIOS, engine_script, write_playground
 from ballbot_train.report.printed import javascript_function
@@ -156,6 +156,11 @@ def test_policies_with_frames_mirrors_and_oddness_act_as_in_python(tmp_path, rng
             script += f"found.push({acts});\n"
     found = run_in_node(engine_script(paths) + script + "answer(found);", tmp_path)
     np.testing.assert_allclose(found, expected, atol=1e-4)  # N; a float32 action has steps of 2e-5 N
+
+
+def test_a_policy_that_sees_more_than_the_present_is_refused():
+    with pytest.raises(PolicyError, match="more than the present observation"):
+        engine_script([str(SHIPPED / "turn-shac-informed-unknown.json")])
 
 
 def test_a_function_with_an_unknown_operation_is_refused():

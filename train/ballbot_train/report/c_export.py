@@ -21,12 +21,11 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.rollout import rollout
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import FRAMES, REACH
 from ballbot_train.console import printable
 from ballbot_train.onnx_export import metadata
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network
 from ballbot_train.policy_files import PolicyError, PolicySpec
-from ballbot_train.report.printed import Functions, c_function, c_number, frame_functions
+from ballbot_train.report.printed import c_function, c_number, layers_of, policy_function
 from ballbot_train.weights import own_defaults
 
 LQR = "lqr"
@@ -78,49 +77,30 @@ def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
 
 
 def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str, filtered: bool) -> str:
-    spec, params = network.spec, named_robot(robot)
-    networks = {
-        "mlp": _layers(network.mlp),
-        "linear": _layers([network.linear]),
-        "routes": [] if network.routes is None else _layers(network.routes.mlp),
-    }
-    inputs = networks["mlp"][0][0].shape[1]
-    seen = spec.seen
-    if network.routes is not None:
-        seen += network.routes.route.obstacles
-    signs = [[*signs, *(spec.history * (*signs, *action)), *action] for signs, action in spec.mirrors]
+    spec, params, networks = network.spec, named_robot(robot), layers_of(network)
     templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "assets"),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    needed = "needed" if spec.squash == "tanh" else f"needed / {c_number(REACH)}"
     return templates.get_template("controller.c.j2").render(
         about=_comment(about),
-        observations=spec.observations,
-        constants=task.constant_names,
-        force_limit=c_number(params.force_limit),
-        dt=c_number(task.control_dt),
-        seen=seen,
-        inputs=inputs,
+        spec=spec,
+        params=params,
+        task=task,
         widest=max(weight.shape[0] for layers in networks.values() for weight, _ in layers),
         networks=networks,
-        functions=_functions(network, task, params.state_size, seen, inputs),
-        states=params.state_size,
-        actions=params.action_size,
-        activation=spec.activation,
-        history=spec.history,
-        frame=spec.frame,
-        centred=spec.centred,
-        squash=spec.squash,
-        unsquashed=f"atanhf(fmaxf(fminf({needed}, 0.999f), -0.999f))",
-        reach=c_number(REACH),
-        mirrors=_numbers(np.array(signs)),
-        mirror_count=len(signs),
+        observed=c_function(
+            "observed",
+            lambda x, c, t: task.seen(tuple(casadi.vertsplit(x)), task.at(tuple(casadi.vertsplit(c)), t)),
+            {"x": params.state_size, "c": len(task.constant_names), "t": 1},
+        ),
+        acted=c_function("acted", policy_function(network), {"o": spec.seen}),
         filter=_filter(task, params) if filtered else None,
         test=_filtered_test(network, task, robot) if filtered else _test(network, task, robot),
         largest_error=c_number(LARGEST_ERROR),
+        number=c_number,
         numbers=_numbers,
         exact=lambda values: textwrap.fill(", ".join(map(repr, values.tolist())), 120),
     )
@@ -147,32 +127,6 @@ def _filter(task: Task, params: BallbotParams) -> dict[str, Any]:
         "reading_variance": kalman.readings_variance(task.control_dt),
         "model": c_function("robot", robot, {"x": params.state_size, "u": params.action_size}, "double"),
     }
-
-
-def _functions(network: PolicyNetwork, task: Task, states: int, seen: int, inputs: int) -> list[str]:
-    """The printed functions that the template calls."""
-    split = casadi.vertsplit
-    functions: Functions = {
-        "observed": (
-            lambda x, c, t: task.seen(tuple(split(x)), task.at(tuple(split(c)), t)),
-            {"x": states, "c": len(task.constant_names), "t": 1},
-        )
-    }
-    if network.spec.frame is not None:
-        frame = FRAMES[network.spec.frame]
-        functions |= frame_functions(frame, network.features, network.spec.observations, seen)
-    if network.spec.centred:
-        functions["kept"] = (lambda f: sum(network.kept(tuple(split(f))), ()), {"f": inputs})
-    return [c_function(name, *function) for name, function in functions.items()]
-
-
-def _layers(modules: Any) -> list[tuple[np.ndarray, np.ndarray | None]]:
-    """Weights and biases of the linear layers among modules."""
-    return [
-        (layer.weight.detach().numpy(), None if layer.bias is None else layer.bias.detach().numpy())
-        for layer in modules
-        if isinstance(layer, torch.nn.Linear)
-    ]
 
 
 def _filtered_test(network: PolicyNetwork, task: Task, robot: str) -> dict[str, np.ndarray]:

@@ -9,12 +9,12 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import casadi
 import numpy as np
-import safetensors.numpy
 from markupsafe import Markup
 
 from ballbot_baselines.lqr import LqrController
@@ -23,12 +23,13 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams, default_params
 from ballbot_gym.randomization import TRACKS, Randomization
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import FRAMES, REACH
+from ballbot_gym.tasks.transition import outcome
 from ballbot_train.evaluation.controllers import policy_path, task_name
-from ballbot_train.policy_files import BEST, PolicySpec, paths_of, read_description, shipped_policies
+from ballbot_train.policy import PolicyNetwork, load_network
+from ballbot_train.policy_files import BEST, PolicyError, read_description, shipped_policies
 from ballbot_train.report import labels
 from ballbot_train.report.page import asset, render, scene_data
-from ballbot_train.report.printed import Functions, frame_functions, javascript_function
+from ballbot_train.report.printed import javascript_function, layers_of, policy_function
 
 _UNKNOWN = (
     "body_mass",
@@ -107,7 +108,7 @@ def playground_page(policies: Sequence[str] = ()) -> str:
         policies: files of policies, each shown in place of the shipped one of its task.
 
     Raises:
-        PolicyError: a file is no policy.
+        PolicyError: a file is no policy, or that of one that sees more than the present observation.
         ValueError: a policy is of no registered task, two are of one task, or the page would be larger than `LARGEST`.
     """
     page = render(
@@ -123,25 +124,24 @@ def playground_page(policies: Sequence[str] = ()) -> str:
 
 def engine_script(policies: Sequence[str] = ()) -> str:
     """All of the page that computes, as JavaScript without a page: what the tests run in node."""
-    params = default_params()
+    params, paths = default_params(), _policies(policies)
+    networks = {task: load_network(path, make_task(task)) for task, path in paths.items()}
     data = {
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
         "unknown": {name: getattr(TRACKS["unknown"], name) for name in _UNKNOWN},
-        "reach": REACH,
         **scene_data(params),
         "push_scale": drawing.PUSH_SCALE,
         "ghost_opacity": drawing.GHOST_OPACITY,
         "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr", 0)},
-        "policies": _policies(policies),
+        "policies": {task: _policy_data(paths[task], network) for task, network in networks.items()},
         "you": {"label": "you", "color": labels.YOU},
         "best": {"label": "optimum", "color": labels.OPTIMUM},
         "scenarios": [_scenario_data(episode, params) for scenario in SCENARIOS for episode in _episodes(scenario)],
     }
     # Within a script, "<" could end it.
-    text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    specs = {name: policy["frame"] for name, policy in data["policies"].items()}
-    return "\n".join([_model_script(params, specs), f"const DATA = {text};", asset("engine.js")])
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False, default=_packed).replace("<", "\\u003c")
+    return "\n".join([_model_script(params, networks), f"const DATA = {text};", asset("engine.js")])
 
 
 def _episodes(scenario: Scenario) -> list[Scenario]:
@@ -150,53 +150,27 @@ def _episodes(scenario: Scenario) -> list[Scenario]:
     return [scenario, *(replace(scenario, text=text, episode=episode, others=()) for episode in scenario.others)]
 
 
-def _policies(given: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The policy of each task."""
+def _policies(given: Sequence[str]) -> dict[str, Path]:
+    """The file of each task's policy."""
     paths: dict[str, Path] = {}
     for policy in given:
         task = task_name(str(policy), None)
         if task in paths:
             raise ValueError(f"{paths[task]} and {policy} are both policies for {task}; give one")
         paths[task] = policy_path(str(policy), make_task(task))
-        _check_policy(paths[task], make_task(task))
-    shipped = {task: shipped_policies(make_task(task))[learner] for task, learner in BEST.items()}
-    return {task: _policy_data(paths.get(task, path), make_task(task)) for task, path in shipped.items()}
+    return {task: paths.get(task, shipped_policies(make_task(task))[learner]) for task, learner in BEST.items()}
 
 
-def _check_policy(path: Path, task: Task) -> None:
-    """Raises a PolicyError where a file is no policy of the task."""
-    from ballbot_train.policy import load_network  # it imports torch
-
-    load_network(path, task)
-
-
-def _policy_data(path: Path, task: Task) -> dict[str, Any]:
-    """What a policy computes with, the numbers packed. torch is not imported: the files hold all."""
-    described = read_description(path)
-    spec = PolicySpec.read(described["spec"])
-    name = str(described.get("training", {}).get("learner", path.stem))
-    weights = safetensors.numpy.load(files.read(paths_of(path)[0]))
-    # activations lie between the layers, which are numbered with them
-    layers = [f"mlp.{2 * i}" for i in range(len(spec.hidden) + 1)]
+def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
+    """What a policy computes with, beside what is printed."""
+    if network.spec.seen != network.spec.observations:
+        raise PolicyError(f"{path} sees more than the present observation, and the page computes that alone")
+    name = str(read_description(path).get("training", {}).get("learner", path.stem))
     return {
         "label": labels.label(name),
         "color": labels.color(name, 0),
-        "layers": [_layer(weights, layer) for layer in layers],
-        "linear": _layer(weights, "linear") if spec.linear else None,
-        "activation": spec.activation,
-        "squash": spec.squash,
-        "mirrors": spec.mirrors,
-        "frame": spec.frame,
-        "centred": spec.centred,
-        "routes": [_layer(weights, f"routes.mlp.{2 * i}") for i in range(len(spec.routes) + 1)] if spec.routes else [],
-    }
-
-
-def _layer(weights: Mapping[str, np.ndarray], name: str) -> dict[str, str | None]:
-    bias = weights.get(f"{name}.bias")
-    return {
-        "weight": _packed(weights[f"{name}.weight"], np.float32),
-        "bias": None if bias is None else _packed(bias, np.float32),
+        "activation": network.spec.activation,
+        **layers_of(network),
     }
 
 
@@ -208,7 +182,7 @@ def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
         state, constants = episodes.states[scenario.episode], episodes.constants[scenario.episode]
         optimum = float(episodes.costs[scenario.episode])
         trajectory = episodes.trajectories[scenario.episode]
-        best = {"x": _packed(trajectory.x, np.float32), "u": _packed(trajectory.u, np.float32)}
+        best = {"x": np.float32(trajectory.x), "u": np.float32(trajectory.u)}
     lqr = LqrController(task, params)
     lqr.reset(0.0, state, constants)
     return {
@@ -225,14 +199,14 @@ def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
         "markers": [asdict(marker) for marker in task.markers(constants)],
         "lqr": {
             "closed": lqr.reference.closed,
-            "x": _packed(lqr.reference.x, np.float64),
-            "u": _packed(lqr.reference.u, np.float64),
-            "k": _packed(lqr.gains.k, np.float64),
+            "x": lqr.reference.x,
+            "u": lqr.reference.u,
+            "k": lqr.gains.k,
         },
     }
 
 
-def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> str:
+def _model_script(params: BallbotParams, networks: Mapping[str, PolicyNetwork]) -> str:
     """The functions `step` and `push`, of a robot with the factors `_UNKNOWN`, and `MODELS`: those of every shipped task."""
     dt = make_task("stabilize").control_dt
     substeps = dynamics.substeps_for(dt)
@@ -250,35 +224,26 @@ def _model_script(params: BallbotParams, frames: Mapping[str, str | None]) -> st
         ),
     ]
     models = []
-    for name in BEST:
-        source, entry = _task_script(name, make_task(name), frames.get(name))
-        parts.append(source)
-        models.append(entry)
-    return "\n".join([*parts, "const MODELS = {\n" + "\n".join(models) + "\n};"])
+    for name, network in networks.items():
+        task = make_task(name)
+        functions = {
+            "observe": (task.observe, {"x": 8, "c": len(task.constant_names)}),
+            "outcome": (partial(_outcome, task), {"x": 8, "u": 2, "end": 8, "c": len(task.constant_names)}),
+            "action": (policy_function(network), {"o": network.spec.seen}),
+        }
+        parts += [javascript_function(f"{name}_{key}", *function) for key, function in functions.items()]
+        entries = ", ".join(f"{key}: {name}_{key}" for key in functions)
+        models.append(f"  {name}: {{ {entries}, limit_names: {json.dumps(task.limit_names)} }},")
+    return "\n".join([*parts, "const MODELS = {", *models, "};"])
 
 
-def _task_script(name: str, task: Task, frame: str | None) -> tuple[str, str]:
-    """The source of a task's functions, and its line of `MODELS`."""
-    constants = len(task.constant_names)
-    of_state = {"x": 8, "c": constants}
-    functions: Functions = {
-        "observe": (task.observe, of_state),
-        "cost": (task.cost, {"x": 8, "u": 2, "c": constants}),
-        "limits": (task.limits, of_state),
-        "goal": (task.goal, of_state),
-    }
-    if frame is not None:
-        own, observations = FRAMES[frame], len(task.observation_scale)
-        seen = observations + (0 if own.route is None else own.route.obstacles)
-        functions |= frame_functions(own, own.features, observations, seen)
-        if (steady := own.steady) is not None:  # the features of the steady motion, and then the action
-            functions["steady"] = (lambda f: sum(steady(tuple(casadi.vertsplit(f))), ()), {"f": own.size})
-    sources = [javascript_function(f"{name}_{key}", *function) for key, function in functions.items()]
-    entries = ", ".join(f"{key}: {name}_{key}" for key in functions)
-    facts = f"limit_names: {json.dumps(task.limit_names)}, first_exit: {json.dumps(task.first_exit)}"
-    return "\n".join(sources), f"  {name}: {{ {entries}, {facts} }},"
+def _outcome(task: Task, x: casadi.SX, u: casadi.SX, end: casadi.SX, c: casadi.SX) -> tuple[Any, ...]:
+    """Cost of a control step, the index of the limit that it violates, or −1, and whether the episode ends at its goal."""
+    did = outcome(task, x, u, end, c, 1)
+    return did.running, did.violated, did.success
 
 
-def _packed(numbers: np.ndarray, kind: type) -> str:
-    """Numbers in base64, little-endian, as every browser's machine reads them."""
-    return base64.b64encode(np.ascontiguousarray(numbers, np.dtype(kind).newbyteorder("<")).tobytes()).decode()
+def _packed(numbers: np.ndarray) -> dict[str, str]:
+    """Numbers by their kind, in base64, little-endian, as every browser's machine reads them."""
+    content = np.ascontiguousarray(numbers, numbers.dtype.newbyteorder("<")).tobytes()
+    return {numbers.dtype.name: base64.b64encode(content).decode()}

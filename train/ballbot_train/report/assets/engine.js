@@ -3,85 +3,43 @@
 "use strict";
 
 /** Numbers that Python packed, as an array. */
-function unpacked(base64, Kind) {
-  const text = atob(base64);
-  const bytes = Uint8Array.from(text, (letter) => letter.charCodeAt(0));
-  return new Kind(bytes.buffer);
+function unpacked({ float32, float64 }) {
+  const bytes = Uint8Array.from(atob(float32 ?? float64), (letter) => letter.charCodeAt(0));
+  return float32 === undefined ? new Float64Array(bytes.buffer) : new Float32Array(bytes.buffer);
 }
 
 const ACTIVATIONS = { tanh: Math.tanh, relu: (a) => Math.max(a, 0), silu: (a) => a / (1 + Math.exp(-a)) };
 
-/** A learned policy: force = limit · squash(W o + MLP(o)), averaged over mirror images or seen in a frame, as in policy.py. */
+/** A learned policy. What it computes around its networks is printed: `action` of `MODELS`. */
 class Policy {
   constructor(data, model) {
-    this.data = data;
     this.model = model;
-    const layer = ({ weight, bias }) => ({
-      weight: unpacked(weight, Float32Array),
-      bias: bias === null ? null : unpacked(bias, Float32Array),
-    });
-    this.layers = data.layers.map(layer);
-    this.linear = data.linear === null ? null : layer(data.linear);
-    this.routes = data.routes.map(layer);
+    const [mlp, linear, routes] = [data.mlp, data.linear, data.routes].map((layers) =>
+      layers.map(([weight, bias]) => ({ weight: unpacked(weight), bias: bias && unpacked(bias) })),
+    );
+    const sum = (inputs) => {
+      const values = network(mlp, ACTIVATIONS[data.activation], inputs);
+      return linear.length ? affine(linear[0], inputs).map((value, i) => value + values[i]) : values;
+    };
+    this.networks = [sum, (layout) => farther(network(routes, Math.tanh, layout))];
   }
-
-  reset() {}
 
   act(k, x, c) {
-    const observation = Array.from(Float32Array.from(this.model.observe(x, c)));
-    const squash = this.data.squash === "tanh" ? Math.tanh : (a) => Math.min(Math.max(a, -1), 1);
-    return this.raw(observation).map((a) => DATA.force_limit * Math.fround(squash(a)));
+    const action = this.model.action(Float32Array.from(this.model.observe(x, c)), this.networks);
+    return action.map((a) => DATA.force_limit * Math.fround(a));
   }
+}
 
-  raw(observation) {
-    if (this.model.features) {
-      const seen = this.routes.length ? [...observation, ...this.sides(observation)] : observation;
-      return this.model.back(seen, this.inFrame(this.model.features(seen)));
-    }
-    const total = this.sum(observation);
-    for (const [signs, action] of this.data.mirrors) {
-      const mirrored = this.sum(observation.map((value, i) => signs[i] * value));
-      total.forEach((_, i) => (total[i] += action[i] * mirrored[i]));
-    }
-    return total.map((value) => value / (1 + this.data.mirrors.length));
-  }
-
-  /** The action in the frame; of a centred policy it is exact in the frame's steady motion. */
-  inFrame(features) {
-    let output = this.sum(features);
-    if (this.data.centred) {
-      const steady = this.model.steady(features);
-      const kept = this.sum(steady.slice(0, features.length));
-      const needed = steady.slice(features.length).map((action) => unsquashed(action, this.data.squash));
-      output = output.map((value, i) => value - kept[i] + needed[i]);
-    }
-    return this.data.squash === "tanh_in_frame" ? output.map((value) => DATA.reach * Math.tanh(value)) : output;
-  }
-
-  /** On which side each obstacle is passed. The outputs belong to the choices of farther sides, the first to none. */
-  sides(observation) {
-    const outputs = network(this.routes, Math.tanh, this.model.layout(observation));
-    const best = outputs.indexOf(Math.max(...outputs));
-    const obstacles = Math.log2(outputs.length);
-    const farther = Array.from({ length: obstacles }, (_, i) => ((best >> (obstacles - 1 - i)) & 1 ? -1 : 1));
-    return this.model.chosen_sides(observation, farther);
-  }
-
-  sum(inputs) {
-    const values = network(this.layers, ACTIVATIONS[this.data.activation], inputs);
-    return this.linear === null ? values : affine(this.linear, inputs).map((value, i) => value + values[i]);
-  }
+/** For every obstacle, whether it is passed on its nearer side, 1, or on its farther, −1, of outputs that belong to the choices. */
+function farther(outputs) {
+  const best = outputs.indexOf(Math.max(...outputs));
+  const obstacles = Math.log2(outputs.length);
+  return Array.from({ length: obstacles }, (_, i) => ((best >> (obstacles - 1 - i)) & 1 ? -1 : 1));
 }
 
 /** Layers with an activation between them. */
 function network(layers, activate, inputs) {
   return layers.reduce((values, layer, i) => affine(layer, i === 0 ? values : values.map(activate)), inputs);
-}
-
-/** What a network has to give for an action, before it is squashed. */
-function unsquashed(action, squash) {
-  if (squash === "clip") return action;
-  return Math.atanh(Math.min(Math.max(action / (squash === "tanh_in_frame" ? DATA.reach : 1), -0.999), 0.999));
 }
 
 /** W v + b, with W in rows. */
@@ -99,7 +57,7 @@ function affine({ weight, bias }, values) {
 class Lqr {
   constructor(data) {
     this.closed = data.closed;
-    [this.x, this.u, this.k] = [data.x, data.u, data.k].map((part) => unpacked(part, Float64Array));
+    [this.x, this.u, this.k] = [data.x, data.u, data.k].map(unpacked);
     this.points = this.u.length / 2;
   }
 
@@ -164,19 +122,22 @@ class Robot {
       return;
     }
     const held = force.map((f) => this.robot[2] * Math.min(Math.max(f, -limit), limit));
-    this.move(held, step(this.x, held, this.robot));
-    this.judge();
+    const [violated, arrived] = this.move(held, step(this.x, held, this.robot));
+    if (violated >= 0) this.ended = this.model.limit_names[violated];
+    else if (arrived) this.ended = "goal";
   }
 
-  /** Counts a control step under a force, to the next state. */
+  /** Counts a control step under a force, to the next state. Tells the violated limit, or −1, and whether it is the goal. */
   move(force, next) {
     const { optimum, duration, constants } = this.scenario;
     const counts = optimum === null || this.steps * DATA.dt < duration - 1e-9; // an episode's cost ends with it
-    if (counts) this.cost += this.model.cost(this.x, force, constants)[0] * DATA.dt;
+    const [cost, ...end] = this.model.outcome(this.x, force, next, constants);
+    if (counts) this.cost += cost;
     [this.x, this.force] = [next, force];
     this.steps += 1;
     this.peak = Math.max(this.peak, this.tilt);
     this.path.push([this.x[0], this.x[1]]);
+    return end;
   }
 
   /** A horizontal impulse on the body's centre of mass, N·s. */
@@ -184,20 +145,13 @@ class Robot {
     if (this.ended || !impulse.every(Number.isFinite)) return;
     this.x = push(this.x, impulse, this.robot);
   }
-
-  judge() {
-    const c = this.scenario.constants;
-    const violated = this.model.limits(this.x, c).findIndex((limit) => !(limit >= 0));
-    if (violated >= 0) this.ended = this.model.limit_names[violated];
-    else if (this.model.first_exit && this.model.goal(this.x, c).every((excess) => excess <= 0)) this.ended = "goal";
-  }
 }
 
 /** The optimum of a certified episode, which drives along its trajectory. */
 class Optimum extends Robot {
   constructor(scenario) {
     super(null, scenario);
-    [this.states, this.forces] = [scenario.best.x, scenario.best.u].map((part) => unpacked(part, Float32Array));
+    [this.states, this.forces] = [scenario.best.x, scenario.best.u].map(unpacked);
   }
 
   advance() {
