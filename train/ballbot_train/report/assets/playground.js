@@ -13,7 +13,7 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowD
 class Playground {
   constructor() {
     try {
-      this.scene = new Scene(find(".view"), DATA.robot, DATA);
+      this.scene = new Scene(find(".view"), DATA);
     } catch (error) {
       find(".trouble").hidden = false;
       find(".trouble").textContent = `The robots cannot be drawn: ${error.message}. The numbers below are computed all the same.`;
@@ -334,9 +334,7 @@ class Playground {
         this.steer(held[0], -held[1]);
       } else if (this.drag.robot) this.drag.pull = this.pullTo([x, y]);
       else {
-        const camera = this.scene.camera;
-        camera.yaw -= (x - this.drag.at[0]) * 0.008;
-        camera.pitch = Math.min(Math.max(camera.pitch + (y - this.drag.at[1]) * 0.006, 0.05), 1.45);
+        this.scene.turn(...Vector.minus([x, y], this.drag.at));
         this.drag.at = [x, y];
       }
     };

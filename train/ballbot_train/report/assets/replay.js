@@ -62,7 +62,7 @@ class Replay {
       stage.innerHTML = '<div class="caption"><b></b><span class="tilt"></span></div><div class="note"></div><canvas class="view" role="img"></canvas>';
       const canvas = stage.querySelector("canvas");
       try {
-        this.stages[n] = { stage, scene: new Scene(canvas, this.data.robot, this.data) };
+        this.stages[n] = { stage, scene: new Scene(canvas, this.data) };
         this.listen(canvas);
       } catch (error) {
         this.stages[n] = { stage, scene: null };
@@ -87,10 +87,7 @@ class Replay {
     };
     canvas.onpointermove = (event) => {
       if (!last) return;
-      for (const { camera } of this.stages.map(({ scene }) => scene).filter(Boolean)) {
-        camera.yaw -= (event.clientX - last.clientX) * 0.008;
-        camera.pitch = Math.min(Math.max(camera.pitch + (event.clientY - last.clientY) * 0.006, 0.05), 1.45);
-      }
+      for (const { scene } of this.stages) scene?.turn(event.clientX - last.clientX, event.clientY - last.clientY);
       last = event;
       this.draw();
     };

@@ -3,6 +3,8 @@
 "use strict";
 
 const FIELD_OF_VIEW = 0.7; // rad, vertical
+const [NEAREST, FARTHEST] = [0.1, 200]; // m, from the camera, of what is drawn
+const SHADOW = [0.1, 0.13, 0.2, 0.2];
 const LIGHT = [-0.36, -0.44, 0.82]; // towards it, of length 1
 /** Colours of sky, bright and dark squares. */
 const THEMES = {
@@ -10,8 +12,8 @@ const THEMES = {
   dark: { sky: [0.075, 0.09, 0.12], bright: [0.27, 0.3, 0.35], dim: [0.2, 0.225, 0.27] },
 };
 
-const SOLID_VERTEX = `#version 300 es
-in vec3 position; in vec3 normal;
+const VERTEX = `#version 300 es
+layout(location = 0) in vec3 position; layout(location = 1) in vec3 normal;
 uniform mat4 place, camera;
 out vec3 at, up;
 void main() {
@@ -19,47 +21,31 @@ void main() {
   at = world.xyz; up = mat3(place) * normal;
   gl_Position = camera * world;
 }`;
-const SOLID_FRAGMENT = `#version 300 es
+const [PLAIN, LIT, FLOOR] = [0, 1, 2]; // looks: of one colour, of one colour in the light, and the floor's squares
+const FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 at, up;
-uniform vec4 color; uniform vec3 eye, light; uniform float lit;
+uniform vec3 eye, light, sky, bright, dim; uniform vec4 color; uniform int look;
 out vec4 pixel;
 void main() {
-  vec3 n = normalize(up), e = normalize(eye - at);
-  float diffuse = max(dot(n, light), 0.0);
-  float shine = pow(max(dot(n, normalize(light + e)), 0.0), 40.0);
-  vec3 shaded = color.rgb * (0.52 + 0.16 * n.z + 0.5 * diffuse) + 0.22 * shine;
-  pixel = vec4(lit > 0.5 ? shaded : color.rgb, color.a); // a flattened body has no normals, so nothing is mixed
-}`;
-const FLOOR_FRAGMENT = `#version 300 es
-precision highp float;
-in vec3 at, up;
-uniform vec3 eye, sky, bright, dim; uniform vec4 color; uniform vec3 light; uniform float lit;
-out vec4 pixel;
-void main() {
-  vec2 wide = max(fwidth(at.xy), 1e-4), p = at.xy;
-  // the share of dark squares in the pixel, so that far squares do not flicker
-  vec2 wave = 2.0 * (abs(fract((p - 0.5 * wide) * 0.5) - 0.5) - abs(fract((p + 0.5 * wide) * 0.5) - 0.5)) / wide;
-  float dark = 0.5 - 0.5 * wave.x * wave.y;
-  float far = smoothstep(5.0, 26.0, distance(at.xy, eye.xy));
-  pixel = vec4(mix(mix(bright, dim, dark), sky, far), 1.0);
+  if (look == ${FLOOR}) {
+    vec2 wide = max(fwidth(at.xy), 1e-4), p = at.xy;
+    // the share of dark squares in the pixel, so that far squares do not flicker
+    vec2 wave = 2.0 * (abs(fract((p - 0.5 * wide) * 0.5) - 0.5) - abs(fract((p + 0.5 * wide) * 0.5) - 0.5)) / wide;
+    float dark = 0.5 - 0.5 * wave.x * wave.y;
+    float far = smoothstep(5.0, 26.0, distance(at.xy, eye.xy));
+    pixel = vec4(mix(mix(bright, dim, dark), sky, far), 1.0);
+  } else if (look == ${LIT}) {
+    vec3 n = normalize(up), e = normalize(eye - at);
+    float diffuse = max(dot(n, light), 0.0);
+    float shine = pow(max(dot(n, normalize(light + e)), 0.0), 40.0);
+    pixel = vec4(color.rgb * (0.52 + 0.16 * n.z + 0.5 * diffuse) + 0.22 * shine, color.a);
+  } else pixel = color;
 }`;
 
-/** 4×4 matrices as arrays in columns. */
-const Matrix = {
-  times(a, b) {
-    const c = new Array(16).fill(0);
-    for (let i = 0; i < 4; i++) for (let j = 0; j < 4; j++) for (let k = 0; k < 4; k++) c[4 * j + i] += a[4 * k + i] * b[4 * j + k];
-    return c;
-  },
-  perspective(angle, aspect, near, far) {
-    const f = 1 / Math.tan(angle / 2);
-    return [f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / (near - far), -1, 0, 0, (2 * far * near) / (near - far), 0];
-  },
-  /** From axes and origin. */
-  frame: (x, y, z, at) => [...x, 0, ...y, 0, ...z, 0, ...at, 1],
-  apply: (m, p) => [0, 1, 2, 3].map((i) => m[i] * p[0] + m[4 + i] * p[1] + m[8 + i] * p[2] + m[12 + i]),
-};
+/** Places of bodies: matrices in columns, from axes and origin, and of what is upright, from radius, height and (x, y), m. */
+const framed = (x, y, z, at) => [...x, 0, ...y, 0, ...z, 0, ...at, 1];
+const upright = (radius, height, [x, y], z = 0) => framed([radius, 0, 0], [0, radius, 0], [0, 0, height], [x, y, z]);
 
 const Vector = {
   minus: (a, b) => a.map((v, i) => v - b[i]),
@@ -90,37 +76,31 @@ const Mesh = {
     return Mesh.turned(angles.map((a) => [Math.cos(a), Math.sin(a), Math.cos(a), Math.sin(a)]));
   },
   /** Radius 1, from z = 0 to 1. */
-  cylinder: () => [
-    ...Mesh.turned([[0, 0, 0, -1], [1, 0, 0, -1]]),
-    ...Mesh.turned([[1, 0, 1, 0], [1, 1, 1, 0]]),
-    ...Mesh.turned([[1, 1, 0, 1], [0, 1, 0, 1]]),
-  ],
-  cone: () => [...Mesh.turned([[0, 0, 0, -1], [1, 0, 0, -1]]), ...Mesh.turned([[1, 0, 0.7, 0.7], [0, 1, 0.7, 0.7]])],
-  square: () => [[-1, -1], [1, -1], [1, 1], [-1, -1], [1, 1], [-1, 1]].flatMap(([x, y]) => [x, y, 0, 0, 0, 1]),
-  /** A band along points (x, y), dashed if `dash` > 0, m. */
-  band(points, width, dash = 0) {
+  cylinder: () => Mesh.turned([[0, 0, 0, -1], [1, 0, 0, -1], [1, 0, 1, 0], [1, 1, 1, 0], [1, 1, 0, 1], [0, 1, 0, 1]]),
+  cone: () => Mesh.turned([[0, 0, 0, -1], [1, 0, 0, -1], [1, 0, 0.7, 0.7], [0, 1, 0.7, 0.7]]),
+  /** A band along points (x, y), in dashes of this length, m. */
+  band(points, width, dash) {
     const out = [];
     let along = 0; // m, how far the line has come
     for (let i = 0; i + 1 < points.length; i++) {
-      const [a, b] = [points[i], points[i + 1]];
-      const way = [b[0] - a[0], b[1] - a[1]];
+      const [a, b] = [points[i], points[i + 1]].map(([x, y]) => [x, y]);
+      const way = Vector.minus(b, a);
       const length = Math.hypot(...way);
       if (length < 1e-9) continue;
       const side = [-way[1], way[0]].map((part) => (0.5 * width * part) / length);
-      const piece = (from, to) => {
-        const at = (share, sign) => [a[0] + share * way[0] + sign * side[0], a[1] + share * way[1] + sign * side[1], 0, 0, 0, 1];
+      const at = (share, sign) => [...Vector.plus(Vector.plus(a, way, share), side, sign), 0, 0, 0, 1];
+      for (let n = Math.floor(along / dash); n * dash < along + length; n++) {
+        if (n % 2) continue;
+        const [from, to] = [Math.max((n * dash - along) / length, 0), Math.min(((n + 1) * dash - along) / length, 1)];
         const [p, q, r, s] = [at(from, -1), at(from, 1), at(to, 1), at(to, -1)];
         out.push(...p, ...s, ...r, ...p, ...r, ...q);
-      };
-      if (!dash) piece(0, 1);
-      for (let n = Math.floor(along / dash); dash && n * dash < along + length; n++) {
-        if (n % 2 === 0) piece(Math.max((n * dash - along) / length, 0), Math.min(((n + 1) * dash - along) / length, 1));
       }
       along += length;
     }
     return out;
   },
 };
+const UNBROKEN = 1e9; // m, of a dash
 
 function rgb(color) {
   return [1, 3, 5].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
@@ -133,37 +113,34 @@ function bodyFrame(x) {
 }
 
 class Scene {
-  /** Throws where the browser has no WebGL 2. */
-  constructor(canvas, robot, look) {
+  /** Throws where the browser has no WebGL 2. `look` holds a robot's measures, colours and the scale of forces. */
+  constructor(canvas, look) {
     this.canvas = canvas;
-    this.robot = robot;
     this.look = look;
     this.theme = THEMES.light;
     const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true }));
     if (!gl) throw new Error("no WebGL 2");
-    this.solid = this.program(SOLID_VERTEX, SOLID_FRAGMENT);
-    this.floor = this.program(SOLID_VERTEX, FLOOR_FRAGMENT);
-    this.meshes = {};
-    for (const name of ["sphere", "cylinder", "cone", "square"]) this.meshes[name] = this.mesh(Mesh[name](), gl.STATIC_DRAW);
+    this.at = this.program();
+    for (const name of ["sphere", "cylinder", "cone"]) this[name] = this.mesh(Mesh[name](), gl.STATIC_DRAW);
     this.strip = this.mesh([], gl.DYNAMIC_DRAW);
     this.camera = { yaw: -2.2, pitch: 0.34, distance: 3.6, target: [0, 0, 0.5] };
   }
 
-  program(vertex, fragment) {
+  /** Compiles the shaders; returns where their uniforms are, by name. */
+  program() {
     const gl = this.gl;
     const program = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
     }
-    gl.bindAttribLocation(program, 0, "position");
-    gl.bindAttribLocation(program, 1, "normal");
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-    const names = ["place", "camera", "color", "eye", "light", "lit", "sky", "bright", "dim"];
-    return { program, at: Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)])) };
+    gl.useProgram(program);
+    const names = ["place", "camera", "color", "eye", "light", "look", "sky", "bright", "dim"];
+    return Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
   }
 
   mesh(corners, usage) {
@@ -180,6 +157,12 @@ class Scene {
     return { array, buffer, count: corners.length / 6 };
   }
 
+  /** Turns the camera by a drag, px. */
+  turn(right, down) {
+    this.camera.yaw -= right * 0.008;
+    this.camera.pitch = Math.min(Math.max(this.camera.pitch + down * 0.006, 0.05), 1.45);
+  }
+
   /** Fits the drawing buffer to the canvas, and computes where the camera is. */
   aim() {
     const { canvas, gl } = this;
@@ -188,22 +171,19 @@ class Scene {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     gl.viewport(0, 0, width, height);
     const { yaw, pitch, distance, target } = this.camera;
-    const back = [Math.cos(yaw) * Math.cos(pitch), Math.sin(yaw) * Math.cos(pitch), Math.sin(pitch)];
-    this.eye = Vector.plus(target, back, distance);
-    this.right = Vector.unit(Vector.cross([0, 0, 1], back));
-    this.up = Vector.cross(back, this.right);
-    this.back = back;
-    const [r, u, b, e] = [this.right, this.up, back, this.eye];
-    const view = [
-      r[0], u[0], b[0], 0, r[1], u[1], b[1], 0, r[2], u[2], b[2], 0,
-      -Vector.dot(r, e), -Vector.dot(u, e), -Vector.dot(b, e), 1,
-    ];
-    this.matrix = Matrix.times(Matrix.perspective(FIELD_OF_VIEW, width / height, 0.1, 200), view);
+    this.back = [Math.cos(yaw) * Math.cos(pitch), Math.sin(yaw) * Math.cos(pitch), Math.sin(pitch)];
+    this.eye = Vector.plus(target, this.back, distance);
+    this.right = Vector.unit(Vector.cross([0, 0, 1], this.back));
+    const place = framed(this.right, Vector.cross(this.back, this.right), this.back, this.eye);
+    const f = 1 / Math.tan(FIELD_OF_VIEW / 2);
+    const depth = (FARTHEST + NEAREST) / (NEAREST - FARTHEST);
+    const lens = [(f * height) / width, 0, 0, 0, 0, f, 0, 0, 0, 0, depth, -1, 0, 0, NEAREST * (depth - 1), 0];
+    this.matrix = new DOMMatrix(lens).multiply(new DOMMatrix(place).inverse());
   }
 
   /** Where a point (3,), m, is on the canvas, CSS pixels; null behind the camera. */
   project(point) {
-    const [x, y, , w] = Matrix.apply(this.matrix, point);
+    const { x, y, w } = this.matrix.transformPoint(new DOMPoint(...point));
     if (w <= 0.05) return null;
     return [((1 + x / w) / 2) * this.canvas.clientWidth, ((1 - y / w) / 2) * this.canvas.clientHeight];
   }
@@ -211,37 +191,32 @@ class Scene {
   /** The point at height z, m, that a pixel of the canvas shows; null above the horizon. */
   unproject([px, py], z) {
     const { clientWidth, clientHeight } = this.canvas;
-    const reach = Math.tan(FIELD_OF_VIEW / 2);
-    const across = reach * (clientWidth / clientHeight) * ((2 * px) / clientWidth - 1);
-    const along = reach * (1 - (2 * py) / clientHeight);
-    const ray = Vector.plus(Vector.plus(Vector.times(this.back, -1), this.right, across), this.up, along);
+    const shown = new DOMPoint((2 * px) / clientWidth - 1, 1 - (2 * py) / clientHeight, 1); // in the farthest plane
+    const far = this.matrix.inverse().transformPoint(shown);
+    const ray = Vector.minus([far.x / far.w, far.y / far.w, far.z / far.w], this.eye);
     const t = (z - this.eye[2]) / ray[2];
-    return t > 0 && t < 60 ? Vector.plus(this.eye, ray, t) : null;
+    return t > 0 && t * FARTHEST < 60 ? Vector.plus(this.eye, ray, t) : null;
   }
 
   /** A drawing: robots {x, color, u, alpha, push}, ghosts first, paths {points, color, dashed} and markers. */
   draw({ robots, paths, markers }) {
-    const gl = this.gl;
+    const { gl, at } = this;
     this.aim();
     gl.clearColor(...this.theme.sky, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
-    this.use(this.floor);
-    const [tx, ty] = this.camera.target;
-    this.put("square", Matrix.frame([60, 0, 0], [0, 60, 0], [0, 0, 1], [tx, ty, 0]), [1, 1, 1, 1]);
-    this.use(this.solid);
+    gl.uniformMatrix4fv(at.camera, false, this.matrix.toFloat32Array());
+    for (const [name, value] of Object.entries({ eye: this.eye, light: LIGHT, ...this.theme })) gl.uniform3fv(at[name], value);
+    const posts = markers.filter((marker) => marker.height >= 0.1);
+    this.put(this.cylinder, upright(60, 0, this.camera.target), [1, 1, 1, 1], FLOOR);
     gl.depthMask(false);
-    for (const marker of markers) if (marker.height < 0.1) this.drawFlat(marker);
-    for (const path of paths) this.drawBand(path.points, rgb(path.color), path.dashed ? 0.09 : 0);
-    this.drawShadows(robots, markers);
+    for (const marker of markers) if (!posts.includes(marker)) this.drawFlat(marker);
+    for (const path of paths) this.drawBand(path.points, rgb(path.color), path.dashed ? 0.09 : UNBROKEN);
+    this.drawShadows(robots, posts);
     gl.depthMask(true);
-    for (const marker of markers) {
-      if (marker.height < 0.1) continue;
-      const { position, radius, height, color } = marker;
-      this.put("cylinder", Matrix.frame([radius, 0, 0], [0, radius, 0], [0, 0, height], [...position, 0]), color);
-    }
+    for (const post of posts) this.drawPost(post);
     for (const robot of robots) if (robot.alpha === 1) this.drawRobot(robot);
     gl.enable(gl.BLEND);
     for (const robot of robots) {
@@ -254,99 +229,79 @@ class Scene {
     gl.disable(gl.BLEND);
   }
 
-  use({ program, at }) {
-    const gl = this.gl;
-    this.at = at;
-    gl.useProgram(program);
-    gl.uniformMatrix4fv(at.camera, false, this.matrix);
-    gl.uniform3fv(at.eye, this.eye);
-    gl.uniform3fv(at.light, LIGHT);
-    for (const [name, value] of Object.entries(this.theme)) gl.uniform3fv(at[name], value);
-    gl.uniform1f(at.lit, 1);
-  }
-
-  put(mesh, place, color) {
-    const gl = this.gl;
-    const { array, count } = typeof mesh === "string" ? this.meshes[mesh] : mesh;
+  /** A mesh at a place; a shadow's has no normals left, and so one colour. */
+  put({ array, count }, place, color, look = LIT) {
+    const { gl, at } = this;
     gl.bindVertexArray(array);
-    gl.uniformMatrix4fv(this.at.place, false, this.shadow ? Matrix.times(this.shadow, place) : place);
-    if (!this.shadow) gl.uniform4fv(this.at.color, color);
+    gl.uniformMatrix4fv(at.place, false, place);
+    gl.uniform4fv(at.color, this.isShadow ? SHADOW : color);
+    gl.uniform1i(at.look, this.isShadow ? PLAIN : look);
     gl.drawArrays(gl.TRIANGLES, 0, count);
   }
 
+  drawPost({ position, radius, height, color }) {
+    this.put(this.cylinder, upright(radius, height, position), color);
+  }
+
   drawRobot({ x, color, u, alpha, push }) {
-    const { ball_radius, body_radius, body_length, com_height } = this.robot;
+    const { ball_radius, body_radius, body_length, com_height } = this.look.robot;
     const ball = [x[0], x[1], ball_radius];
-    this.put("sphere", Matrix.frame([ball_radius, 0, 0], [0, ball_radius, 0], [0, 0, ball_radius], ball), [...rgb(this.look.colors.ball), alpha]);
+    this.put(this.sphere, upright(ball_radius, ball_radius, x, ball_radius), [...rgb(this.look.colors.ball), alpha]);
     const [a, b, axis] = bodyFrame(x);
     const low = Vector.plus(ball, axis, com_height - body_length / 2);
-    const place = Matrix.frame(Vector.times(a, body_radius), Vector.times(b, body_radius), Vector.times(axis, body_length), low);
-    this.put("cylinder", place, [...rgb(color), alpha]);
-    if (this.shadow) return;
+    const place = framed(Vector.times(a, body_radius), Vector.times(b, body_radius), Vector.times(axis, body_length), low);
+    this.put(this.cylinder, place, [...rgb(color), alpha]);
+    if (this.isShadow) return;
     if (u && Math.hypot(...u) > this.look.least_force) this.drawArrow(ball, Vector.times([...u, 0], this.look.force_scale), this.look.colors.force, alpha);
     if (push) this.drawArrow(Vector.plus(ball, axis, com_height), [...push, 0], this.look.colors.push, alpha);
   }
 
-  /** An arrow from a point along a vector, m. */
+  /** An arrow from a point along a level vector, m. */
   drawArrow(from, vector, color, alpha) {
     const length = Math.hypot(...vector);
     if (length < 1e-3) return;
     const head = Math.min(0.16, length);
     const axis = Vector.times(vector, 1 / length);
-    const across = Vector.unit(Vector.cross(axis, Math.abs(axis[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]));
-    const aside = Vector.cross(axis, across);
+    const aside = Vector.cross(axis, [0, 0, 1]);
     const part = (mesh, radius, size, at) => {
-      const axes = [Vector.times(across, radius), Vector.times(aside, radius), Vector.times(axis, size)];
-      this.put(mesh, Matrix.frame(...axes, at), [...rgb(color), alpha]);
+      const place = framed(Vector.times(aside, radius), [0, 0, radius], Vector.times(axis, size), at);
+      this.put(mesh, place, [...rgb(color), alpha]);
     };
-    part("cylinder", 0.022, length - head, from);
-    part("cone", 0.06, head, Vector.plus(from, axis, length - head));
+    part(this.cylinder, 0.022, length - head, from);
+    part(this.cone, 0.06, head, Vector.plus(from, axis, length - head));
   }
 
   drawFlat({ position, radius, ring, color }) {
-    if (!ring) {
-      this.gl.uniform1f(this.at.lit, 0);
-      this.put("cylinder", Matrix.frame([radius, 0, 0], [0, radius, 0], [0, 0, 0.004], [...position, 0]), color);
-      this.gl.uniform1f(this.at.lit, 1);
-      return;
-    }
-    const points = Array.from({ length: 181 }, (_, i) => (Math.PI * i) / 90).map((a) => [
-      position[0] + radius * Math.cos(a),
-      position[1] + radius * Math.sin(a),
-    ]);
+    if (!ring) return this.put(this.cylinder, upright(radius, 0.004, position), color, PLAIN);
+    const angles = Array.from({ length: 181 }, (_, i) => (Math.PI * i) / 90);
+    const points = angles.map((a) => Vector.plus(position, [Math.cos(a), Math.sin(a)], radius));
     this.drawBand(points, color.slice(0, 3), 0.16);
   }
 
   drawBand(points, color, dash) {
     const gl = this.gl;
     const corners = new Float32Array(Mesh.band(points, 0.035, dash));
-    gl.bindVertexArray(this.strip.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.strip.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, corners, gl.DYNAMIC_DRAW);
-    this.strip.count = corners.length / 6;
-    gl.uniform1f(this.at.lit, 0);
-    this.put(this.strip, Matrix.frame([1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0.006]), [...color, 1]);
-    gl.uniform1f(this.at.lit, 1);
+    this.put({ ...this.strip, count: corners.length / 6 }, upright(1, 1, [0, 0], 0.006), [...color, 1], PLAIN);
   }
 
   /** What is solid, flattened on the floor along the light; each pixel is darkened once. */
-  drawShadows(robots, markers) {
-    const gl = this.gl;
+  drawShadows(robots, posts) {
+    const { gl, at } = this;
     const [lx, ly, lz] = LIGHT;
-    this.shadow = [1, 0, 0, 0, 0, 1, 0, 0, -lx / lz, -ly / lz, 0, 0, 0, 0, 0.008, 1];
+    const flattened = new DOMMatrix([1, 0, 0, 0, 0, 1, 0, 0, -lx / lz, -ly / lz, 0, 0, 0, 0, 0.008, 1]);
+    this.isShadow = true;
     gl.enable(gl.BLEND);
     gl.enable(gl.STENCIL_TEST);
     gl.stencilFunc(gl.EQUAL, 0, 255);
     gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
-    gl.uniform4f(this.at.color, 0.1, 0.13, 0.2, 0.2);
-    gl.uniform1f(this.at.lit, 0);
+    gl.uniformMatrix4fv(at.camera, false, this.matrix.multiply(flattened).toFloat32Array());
     for (const robot of robots) this.drawRobot(robot);
-    for (const { position, radius, height } of markers) {
-      if (height >= 0.1) this.put("cylinder", Matrix.frame([radius, 0, 0], [0, radius, 0], [0, 0, height], [...position, 0]));
-    }
-    gl.uniform1f(this.at.lit, 1);
+    for (const post of posts) this.drawPost(post);
+    gl.uniformMatrix4fv(at.camera, false, this.matrix.toFloat32Array());
     gl.disable(gl.STENCIL_TEST);
     gl.disable(gl.BLEND);
-    this.shadow = null;
+    this.isShadow = false;
   }
 }
