@@ -9,11 +9,12 @@ import pytest
 from browser import start_chromium
 from builders import result
 
+from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
 from ballbot_gym.trajectory import Trajectory
 from ballbot_train.report import figures
 from ballbot_train.report.film import film_frames, write_film
-from ballbot_train.report.page import write_report
+from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Replay, Take, telling_episode
 
 HEADER = ["task", "controller", "regret", "falls"]
@@ -45,7 +46,8 @@ def page(tmp_path_factory):
     curve = Take("a", leaning(0.3, 1.0), "#1f6fb2")
     picture = figures.save(figures.trajectory_figure("a figure", [curve]), folder / "pictures" / "some-figure.png")
     pictures = {"Pictures": [picture], "Nothing": []}
-    return write_report(folder / "report.html", "A <title>", HEADER, ROWS, replays, pictures, {"commit": "abc"})
+    text = report_page("A <title>", replays, HEADER, ROWS, pictures, {"commit": "abc"})
+    return files.write(folder / "report.html", text)
 
 
 def test_the_page_holds_everything_it_shows(page):
@@ -56,10 +58,9 @@ def test_the_page_holds_everything_it_shows(page):
     assert [source for source in sources if not source.startswith(("data:", "#"))] == []
 
 
-def test_what_has_no_data_has_no_section(page, tmp_path):
+def test_what_has_no_data_has_no_section(page):
     assert "Nothing" not in page.read_text()
-    empty = write_report(tmp_path / "report.html", "t", HEADER, ROWS, [Replay("r", ())], {}, {}).read_text()
-    assert "Watch an episode" not in empty
+    assert "Watch an episode" not in report_page("t", [Replay("r", ())], HEADER, ROWS)
 
 
 def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
@@ -67,7 +68,7 @@ def test_names_with_markup_quotes_and_ampersands_are_escaped(tmp_path):
     take = Take(name, leaning(0.1, 0.1), "red", note=name)
     pictures = {name: [figures.save(figures.trajectory_figure(name, [take]), tmp_path / "'a\"&.png")]}
     replays, table = [Replay(name, (take,))], ([name], [[name, name]])
-    text = write_report(tmp_path / "r.html", name, *table, replays, pictures, {name: name}).read_text()
+    text = report_page(name, replays, *table, pictures, {name: name})
     assert "alert" in text
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(&#39;&#34;a&#34; &amp; b&#39;)&lt;/script&gt;" in text

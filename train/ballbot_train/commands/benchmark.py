@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from ballbot_gym import certified
+from ballbot_gym import certified, files
 from ballbot_gym.randomization import checked_randomization
 from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import TASKS
@@ -22,7 +22,7 @@ from ballbot_train.evaluation.evaluate import checked_episodes
 from ballbot_train.evaluation.results import HEADER, TABLE, cells, leaderboard, write_leaderboard, write_results
 from ballbot_train.executors import Workers
 from ballbot_train.report import figures
-from ballbot_train.report.page import write_report
+from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Take, certified_replay, telling_episode
 
 
@@ -85,7 +85,8 @@ def benchmark(
         pictures.append(figures.save(figure, out / "figures" / f"{task}.png"))
     title = "ballbot-gym: leaderboard" if robot == PAPER else f"ballbot-gym: leaderboard of the robot {robot}"
     shown = {"How close to the optimum": [regrets], "One certified episode of each task": pictures}
-    page = write_report(out / "report.html", title, HEADER, [cells(row) for row in rows], replays, shown, facts)
+    report = report_page(title, replays, HEADER, [cells(row) for row in rows], shown, facts)
+    page = files.write(out / "report.html", report)
     publish(out, "leaderboard", f"{episodes} certified episodes per task, physics={physics}", TABLE, rows)
     for result in done:
         if result.note:

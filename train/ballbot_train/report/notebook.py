@@ -20,7 +20,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import checked_robot
 from ballbot_gym.tasks.marker import Marker
 from ballbot_train.report import figures, labels
-from ballbot_train.report.page import replay_page
+from ballbot_train.report.page import report_page
 from ballbot_train.report.replay import Replay, Take, playable
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def _markers(shown: Sequence[Moving]) -> tuple[Marker, ...]:
 
 
 def _show(replay: Replay) -> Path | None:
-    page = replay_page(replay)
+    page = report_page(replay.title, [replay])
     if _in_notebook():
         style = f"width:100%;height:{_HEIGHT}px;border:0"
         frame = f'<iframe srcdoc="{html.escape(page)}" title="replay" style="{style}"></iframe>'

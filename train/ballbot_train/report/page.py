@@ -24,46 +24,24 @@ _WORD_COLUMNS = 2  # of a table: the first columns hold words, the others hold n
 _REPLAY_DT = 0.02  # s, between the states in the page
 
 
-def write_report(
-    path: Path,
-    title: str,
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    replays: Sequence[Replay],
-    pictures: Mapping[str, Sequence[Path]],
-    facts: Mapping[str, object],
-) -> Path:
-    """Writes the page of a leaderboard. What has no data is left out.
-
-    Args:
-        path: of the file.
-        title: heading of the page.
-        header: names of the table's columns.
-        rows: of the table, which the reader can sort by any column.
-        replays: episodes in 3D, one scene for each take, with play, pause and scrubbing.
-        pictures: PNGs by the title above them, captioned with their names.
-        facts: what the results depend on, such as versions; shown at the foot of the page.
-    """
-    shown = {
-        name: [{"name": each.stem, "base64": base64.b64encode(files.read(each)).decode()} for each in group]
-        for name, group in pictures.items()
-    }
-    return files.write(path, _page(title, replays, header, rows, shown, facts))
-
-
-def replay_page(replay: Replay) -> str:
-    """An episode in 3D as a page of its own."""
-    return _page(replay.title, [replay])
-
-
-def _page(
+def report_page(
     title: str,
     replays: Sequence[Replay],
     header: Sequence[str] = (),
     rows: Sequence[Sequence[str]] = (),
-    pictures: Mapping[str, Sequence[Mapping[str, str]]] = {},
+    pictures: Mapping[str, Sequence[Path]] = {},
     facts: Mapping[str, object] = {},
 ) -> str:
+    """The page of a leaderboard, or of replays alone, as HTML. What has no data is left out.
+
+    Args:
+        title: heading of the page.
+        replays: episodes in 3D, one scene for each take, with play, pause and scrubbing.
+        header: names of the table's columns.
+        rows: of the table, which the reader can sort by any column.
+        pictures: PNGs by the title above them, captioned with their names.
+        facts: what the results depend on, such as versions; shown at the foot of the page.
+    """
     episodes = [_episode_data(replay) for replay in replays if replay.takes]
     page = render(
         "page.html.j2",
@@ -72,7 +50,10 @@ def _page(
         rows=rows,
         word_columns=_WORD_COLUMNS,
         data=scene_data(replays[0].params) | {"episodes": episodes} if episodes else {},
-        pictures=pictures,
+        pictures={
+            name: [{"name": each.stem, "base64": base64.b64encode(files.read(each)).decode()} for each in group]
+            for name, group in pictures.items()
+        },
         facts=facts,
         style=asset("style.css"),
         scripts=[asset(name) for name in ("table.js", "scene.js", "replay.js")],

@@ -31,11 +31,8 @@ from ballbot_train.report import labels
 from ballbot_train.report.page import asset, render, scene_data
 from ballbot_train.report.printed import javascript_function, layers_of, policy_function
 
-_UNKNOWN = (
-    "body_mass",
-    "com_height",
-    "force",
-)  # factors that the reader may change, within those of the track "unknown"
+_UNKNOWN = {"body_mass": "mass", "com_height": "centre of mass", "force": "force"}
+"""Factors that the reader may change, within those of the track "unknown", and what the page calls them."""
 LARGEST = 2_000_000
 """Bytes that the page may have."""
 
@@ -113,6 +110,8 @@ def playground_page(policies: Sequence[str] = ()) -> str:
     """
     page = render(
         "playground.html.j2",
+        titles=[scenario.title for scenario in SCENARIOS],
+        unknown={label: getattr(TRACKS["unknown"], name) for name, label in _UNKNOWN.items()},
         style=asset("playground.css"),
         scripts=[Markup(engine_script(policies)), asset("scene.js"), asset("playground.js")],
     )
@@ -129,7 +128,6 @@ def engine_script(policies: Sequence[str] = ()) -> str:
     data = {
         "dt": make_task("stabilize").control_dt,
         "force_limit": params.force_limit,
-        "unknown": {name: getattr(TRACKS["unknown"], name) for name in _UNKNOWN},
         **scene_data(params),
         "push_scale": drawing.PUSH_SCALE,
         "ghost_opacity": drawing.GHOST_OPACITY,

@@ -21,12 +21,8 @@ class Playground {
     [this.playing, this.last] = [true, null];
     [this.distance, this.zoom] = [NEAR, 1];
     this.wake();
-    for (const title of new Set(DATA.scenarios.map((scenario) => scenario.title))) {
-      const chip = document.createElement("button");
-      chip.type = "button";
-      chip.textContent = title;
-      chip.onclick = () => this.open(DATA.scenarios.findIndex((scenario) => scenario.title === title));
-      find(".chips").append(chip);
+    for (const chip of find(".chips").children) {
+      chip.onclick = () => this.open(DATA.scenarios.findIndex(({ title }) => title === chip.textContent));
     }
     find(".play").onclick = () => this.setPlaying(!this.playing);
     find(".reset").onclick = () => this.open(this.index, this.driver !== null);
@@ -40,12 +36,10 @@ class Playground {
     for (const button of document.querySelectorAll(".pushes button")) {
       button.onclick = () => this.pushOnScreen(Number(button.dataset.x), Number(button.dataset.y));
     }
-    for (const slider of document.querySelectorAll(".unknown input")) {
-      [slider.min, slider.max] = DATA.unknown[slider.name].map((factor) => Math.round(100 * factor));
-      slider.oninput = () => this.setRobot();
-    }
+    this.sliders = [...document.querySelectorAll(".unknown input")];
+    for (const slider of this.sliders) slider.oninput = () => this.setRobot();
     find(".told").onclick = () => this.setRobot(KNOWN);
-    find(".drawn").onclick = () => this.setRobot(Object.values(DATA.unknown).map(([low, high]) => low + Math.random() * (high - low)));
+    find(".drawn").onclick = () => this.setRobot(this.sliders.map(({ min, max }) => (+min + Math.random() * (max - min)) / 100));
     this.listen();
     this.setRobot(KNOWN, 0);
     requestAnimationFrame((now) => this.tick(now));
@@ -75,12 +69,11 @@ class Playground {
 
   /** The robot's factors, from the sliders unless they are given, and the scenario anew. */
   setRobot(factors = null, index = this.index) {
-    const sliders = [...document.querySelectorAll(".unknown input")];
-    sliders.forEach((slider, i) => {
+    this.sliders.forEach((slider, i) => {
       if (factors) slider.value = Math.round(100 * factors[i]);
       slider.nextElementSibling.textContent = `${slider.value} %`;
     });
-    this.robot = sliders.map((slider) => Number(slider.value) / 100);
+    this.robot = this.sliders.map((slider) => Number(slider.value) / 100);
     this.isKnown = this.robot.every((factor) => factor === 1);
     find(".told").disabled = this.isKnown;
     this.open(index, Boolean(this.driver));
@@ -115,15 +108,10 @@ class Playground {
     if (this.best) this.looks.push({ ...DATA.best, alpha: DATA.ghost_opacity });
     this.due = this.scenario.push; // the push that comes by itself
     this.restart(this.scenario.state);
-    find(".readouts tbody").replaceChildren(
-      ...this.looks.map((look) => {
-        const row = document.createElement("tr");
-        for (let i = 0; i < 6; i++) row.append(document.createElement("td"));
-        row.cells[0].textContent = look.label;
-        return row;
-      }),
-    );
-    find(".names").replaceChildren(...this.looks.map(() => document.createElement("div")));
+    [...find(".readouts tbody").rows].forEach((row, i) => {
+      row.hidden = i >= this.looks.length;
+      row.cells[0].textContent = this.looks[i]?.label ?? "";
+    });
     if (this.scene) {
       const [x, y] = this.scenario.state;
       this.scene.camera.target = [x, y, 0.5];
@@ -264,8 +252,8 @@ class Playground {
       for (let clash; (clash = places.slice(0, i).find(near)); ) place[1] = clash[1] - 24;
     });
     [...find(".names").children].forEach((name, i) => {
-      name.hidden = !places[i];
-      if (!places[i]) return;
+      name.hidden = !places[i]; // of robots that there are not, too
+      if (name.hidden) return;
       const robot = this.everyone[i];
       name.style.borderColor = this.tint(this.looks[i].color);
       name.textContent = `${this.looks[i].label} ${verdict(robot) || `${(robot.tilt * DEGREES).toFixed(0)}°`}`;

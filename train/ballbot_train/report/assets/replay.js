@@ -17,65 +17,53 @@ class Replay {
     this.root = root;
     root.replay = this;
     this.data = JSON.parse(root.querySelector("script").textContent);
-    [this.time, this.playing, this.stages] = [0, false, []];
+    [this.time, this.playing] = [0, false];
     this.find = (name) => root.querySelector("." + name);
-    this.addControls();
+    this.chips = [...this.find("episodes").children];
+    this.stages = [...this.find("stages").children].map((stage) => ({ stage, scene: this.scene(stage.querySelector("canvas")) }));
+    this.chips.forEach((chip, index) => (chip.onclick = () => this.choose(index)));
+    this.find("play").onclick = () => (this.playing ? this.pause() : this.play());
+    this.find("scrub").oninput = (event) => {
+      this.pause();
+      this.seek(Number(event.target.value));
+    };
     window.addEventListener("resize", () => this.draw());
     this.night = matchMedia("(prefers-color-scheme: dark)");
     this.night.onchange = () => this.draw();
     this.choose(0);
   }
 
-  addControls() {
-    const chips = this.find("episodes");
-    this.data.episodes.forEach((episode, index) => {
-      const chip = document.createElement("button");
-      chip.className = "chip";
-      chip.textContent = episode.title;
-      chip.onclick = () => this.choose(index);
-      chips.append(chip);
-    });
-    this.find("play").onclick = () => (this.playing ? this.pause() : this.play());
-    this.find("scrub").oninput = (event) => {
-      this.pause();
-      this.seek(Number(event.target.value));
-    };
+  // What draws on a canvas, or null.
+  scene(canvas) {
+    try {
+      const scene = new Scene(canvas, this.data);
+      this.listen(canvas);
+      return scene;
+    } catch (error) {
+      canvas.replaceWith(`The robot cannot be drawn: ${error.message}`);
+      return null;
+    }
   }
 
   choose(index) {
     this.pause();
     this.episode = this.data.episodes[index];
-    [...this.find("episodes").children].forEach((chip, n) => chip.setAttribute("aria-pressed", n === index));
+    this.chips.forEach((chip, n) => chip.setAttribute("aria-pressed", n === index));
     const { takes, dt } = this.episode;
     this.end = dt * (Math.max(...takes.map((take) => take.x.length)) - 1);
     this.find("scrub").max = this.end;
-    this.find("stages").replaceChildren(...takes.map((take, n) => this.stage(take, n)));
+    // every episode uses the same stages, because a browser has only so many scenes
+    this.find("stages").replaceChildren(...takes.map((_, n) => this.stages[n].stage));
+    takes.forEach((take, n) => {
+      const { stage, scene } = this.stages[n];
+      const label = stage.querySelector("b");
+      label.textContent = take.label;
+      label.style.borderColor = take.color;
+      stage.querySelector(".note").textContent = take.note;
+      scene?.canvas.setAttribute("aria-label", `${take.label} in 3D; drag to turn the camera of every picture`);
+    });
     this.seek(this.episode.poster);
     this.root.dataset.ready = "true";
-  }
-
-  // The n-th stage, which every episode uses again, because a browser has only so many scenes.
-  stage(take, n) {
-    if (!this.stages[n]) {
-      const stage = document.createElement("div");
-      stage.className = "stage";
-      stage.innerHTML = '<div class="caption"><b></b><span class="tilt"></span></div><div class="note"></div><canvas class="view" role="img"></canvas>';
-      const canvas = stage.querySelector("canvas");
-      try {
-        this.stages[n] = { stage, scene: new Scene(canvas, this.data) };
-        this.listen(canvas);
-      } catch (error) {
-        this.stages[n] = { stage, scene: null };
-        canvas.replaceWith(`The robot cannot be drawn: ${error.message}`);
-      }
-    }
-    const { stage, scene } = this.stages[n];
-    const label = stage.querySelector("b");
-    label.textContent = take.label;
-    label.style.borderColor = take.color;
-    stage.querySelector(".note").textContent = take.note;
-    scene?.canvas.setAttribute("aria-label", `${take.label} in 3D; drag to turn the camera of every picture`);
-    return stage;
   }
 
   // A drag turns every camera, so that robots can be compared.
