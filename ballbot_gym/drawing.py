@@ -110,20 +110,17 @@ def pose(params: BallbotParams, x: np.ndarray) -> Pose:
     return Pose(ball, body, body + params.body_length / 2 * axis, turn)
 
 
-def arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:
-    """Start and end (3,), m, of the arrow of a robot's force at the ball's centre; None where there is none to draw."""
-    if robot.u is None or math.hypot(*robot.u) <= LEAST_FORCE:
-        return None
-    ball = np.array([robot.x[0], robot.x[1], params.ball_radius])
-    return ball, ball + FORCE_SCALE * np.array([*robot.u, 0.0])
+def arrows(params: BallbotParams, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.ndarray] | None]]:
+    """Colour, and start and end (3,), m, or None where there is none to draw, of the arrows of a robot's force and push.
 
-
-def push_arrow(params: BallbotParams, robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:
-    """Start and end (3,), m, of the arrow of a push at the body's centre of mass; None where there is none."""
-    if robot.push is None or not np.any(robot.push):
-        return None
-    body = pose(params, robot.x).body
-    return body, body + PUSH_SCALE * np.array([*robot.push, 0.0])
+    The force's starts at the ball's centre, and the push's at the body's centre of mass.
+    """
+    place = pose(params, robot.x)
+    drawn = ((FORCE, robot.u, FORCE_SCALE, LEAST_FORCE, place.ball), (PUSH, robot.push, PUSH_SCALE, 0.0, place.body))
+    return [
+        (color, None if part is None or math.hypot(*part) <= least else (at, at + scale * np.array([*part, 0.0])))
+        for color, part, scale, least, at in drawn
+    ]
 
 
 def ring(marker: Marker) -> np.ndarray:

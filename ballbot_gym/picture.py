@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw
 
-from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, Robot, arrow, pose, push_arrow, ring
+from ballbot_gym.drawing import BALL, Drawing, Robot, arrows, pose, ring
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 
@@ -183,7 +183,7 @@ def _robot(params: BallbotParams, robot: Robot) -> list[_Solid]:
 def _arrows(params: BallbotParams, robot: Robot) -> list[_Solid]:
     """Those of a robot's force and push."""
     solids = []
-    for ends, color in ((arrow(params, robot), FORCE), (push_arrow(params, robot), PUSH)):
+    for color, ends in arrows(params, robot):
         if ends is not None:
             start, end = ends
             neck = end - min(_HEAD_LENGTH / float(np.linalg.norm(end - start)), 0.9) * (end - start)

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrow, pose, push_arrow, ring
+from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrows, pose, ring
 from ballbot_gym.lazy import missing
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import rgb
@@ -148,7 +148,7 @@ class Viewer:
         _, ball, body, force, push, label = nodes
         place = pose(params, robot.x)
         ball.position, body.position, body.wxyz = place.ball, place.body, place.turn
-        for node, ends in ((force, arrow(params, robot)), (push, push_arrow(params, robot))):
+        for node, (_, ends) in zip((force, push), arrows(params, robot), strict=True):
             node.visible = ends is not None
             if ends is not None:
                 node.points = np.array([ends], np.float32)

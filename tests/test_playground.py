@@ -207,7 +207,8 @@ def advance(browser, steps):
     return browser.execute_script(
         "for (let i = 0; i < arguments[0]; i++) playground.advance();"
         "playground.draw(0.1);"
-        "const cells = [...document.querySelectorAll('tbody tr:not([hidden])')].map(row => [...row.cells].map(cell => cell.textContent));"
+        "const rows = [...document.querySelectorAll('tbody tr:not([hidden])')];"
+        "const cells = rows.map(row => [...row.cells].map(cell => cell.textContent));"
         "return [playground.robots.map(robot => robot.x), playground.robots.map(robot => robot.ended), cells]",
         steps,
     )

@@ -49,7 +49,7 @@ def optimize(
     optimum = find_optimum(env.task, env.params, info["state"], info["constants"], twice=True)
     trajectory = optimum.trajectory
     path = trajectory.save(out / "trajectory.npz")
-    take = figures.Take("optimum", trajectory, labels.COLORS["trajopt"])
+    take = figures.Take("optimum", trajectory, labels.color("trajopt"))
     figure = figures.trajectory_figure(env.task.id, [take], env.task.markers(info["constants"]))
     picture = figures.save(figure, out / "figure.png")
     rows = [

@@ -34,7 +34,7 @@ def paper(out: Path = Path("runs/paper"), only: tuple[str, ...] = ()) -> None:
         plan.trajectory.save(out / f"{name}.npz")
         takes = [
             figures.Take("plan", plan.trajectory.resampled(TRACKING_DT), "0.35", style="--"),
-            figures.Take(f"{simulator} under TVLQR", tracked.executed, labels.COLORS["trajopt"]),
+            figures.Take(f"{simulator} under TVLQR", tracked.executed, labels.color("trajopt")),
         ]
         figure = figures.trajectory_figure(f"{entry.figure}: {entry.title}", takes, _paper_markers(entry, plan))
         figures.save(figure, out / f"{_slug(entry.figure)}-{name}.png")
@@ -67,8 +67,8 @@ def _compare_stabilizations(names: list[str], out: Path, simulator: str) -> None
         takes = []
         for run in compare_stabilization(entry):
             episode, rate = run.episode, f"{run.rate:.0f} Hz"
-            label = f"{labels.LABELS[run.controller]}, {rate}"
-            takes.append(figures.Take(label, episode.trajectory, labels.COLORS[run.controller]))
+            label = f"{labels.label(run.controller)}, {rate}"
+            takes.append(figures.Take(label, episode.trajectory, labels.color(run.controller)))
             peak = math.degrees(np.abs(episode.trajectory.x[:, 2:4]).max())
             rows.append(
                 {

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import casadi
-import jinja2
 import numpy as np
 import torch
 
@@ -25,6 +24,7 @@ from ballbot_train.console import printable
 from ballbot_train.onnx_export import metadata
 from ballbot_train.policy import PolicyController, PolicyNetwork, load_network
 from ballbot_train.policy_files import PolicyError, PolicySpec
+from ballbot_train.report.page import render
 from ballbot_train.report.printed import c_function, c_number, layers_of, policy_function
 from ballbot_train.weights import own_defaults
 
@@ -78,13 +78,8 @@ def lqr_network(task: Task, robot: str = PAPER) -> PolicyNetwork:
 
 def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: str, filtered: bool) -> str:
     spec, params, networks = network.spec, named_robot(robot), layers_of(network)
-    templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "assets"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return templates.get_template("controller.c.j2").render(
+    source = render(
+        "controller.c.j2",
         about=_comment(about),
         spec=spec,
         params=params,
@@ -104,6 +99,7 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         numbers=_numbers,
         exact=lambda values: textwrap.fill(", ".join(map(repr, values.tolist())), 120),
     )
+    return str(source)
 
 
 def _filter(task: Task, params: BallbotParams) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ballbot_gym.tasks.marker import Marker
 from ballbot_train.evaluation.basins import AXES, BasinMap
 from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
-from ballbot_train.report.labels import LABELS, color, label
+from ballbot_train.report.labels import ORDER, color, label
 from ballbot_train.report.replay import Take
 
 _LEAST_REGRET = 0.01  # %: the left end of a logarithmic axis
@@ -76,7 +76,7 @@ def regret_figure(results: Sequence[Result]) -> Figure:
     axes[0][0].set_ylabel("episodes that succeed, %")
     # a controller may be in some of the tasks only
     shown = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    labels = sorted(shown, key=[*LABELS.values(), *shown].index)
+    labels = sorted(shown, key=[*ORDER, *shown].index)
     figure.legend([shown[label] for label in labels], labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return figure
 

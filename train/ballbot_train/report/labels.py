@@ -2,26 +2,18 @@
 
 from pathlib import Path
 
-COLORS = {
-    "lqr": "#c0392b",
-    "trajopt": "#1f6fb2",
-    "nmpc": "#e08a00",
-    "nmpc-offset-free": "#f2c14e",
-    "dagger": "#34495e",
-    "ppo": "#2e8b57",
-    "sac": "#17a2b8",
-    "shac": "#8e44ad",
+_CONTROLLERS = {
+    "lqr": ("LQR", "#c0392b"),
+    "trajopt": ("trajectory optimization + TVLQR", "#1f6fb2"),
+    "nmpc": ("NMPC", "#e08a00"),
+    "nmpc-offset-free": ("NMPC, offset-free", "#f2c14e"),
+    "dagger": ("DAgger", "#34495e"),
+    "ppo": ("PPO", "#2e8b57"),
+    "sac": ("SAC", "#17a2b8"),
+    "shac": ("SHAC", "#8e44ad"),
 }
-LABELS = {
-    "lqr": "LQR",
-    "trajopt": "trajectory optimization + TVLQR",
-    "nmpc": "NMPC",
-    "nmpc-offset-free": "NMPC, offset-free",
-    "dagger": "DAgger",
-    "ppo": "PPO",
-    "sac": "SAC",
-    "shac": "SHAC",
-}
+ORDER = [name for name, _ in _CONTROLLERS.values()]
+"""Names as figures list them."""
 YOU = "#e8590c"
 """The colour of a human."""
 OPTIMUM = "#d4a017"
@@ -29,12 +21,12 @@ OPTIMUM = "#d4a017"
 _OTHER_COLORS = ("#6b8e23", "#b9770e", "#5d6d7e", "#d35479")
 
 
-def color(controller: str, i: int) -> str:
+def color(controller: str, i: int = 0) -> str:
     """The colour of a controller; a controller without one of its own gets the `i`-th of the other colours."""
-    return COLORS.get(controller, _OTHER_COLORS[i % len(_OTHER_COLORS)])
+    return _CONTROLLERS.get(controller, ("", _OTHER_COLORS[i % len(_OTHER_COLORS)]))[1]
 
 
 def label(controller: str) -> str:
     """The name of a controller in figures; a policy file is named after its file."""
     stem = Path(controller).stem
-    return LABELS.get(stem, stem)
+    return _CONTROLLERS.get(stem, (stem, ""))[0]

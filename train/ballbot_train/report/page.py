@@ -73,13 +73,14 @@ def scene_data(params: BallbotParams) -> dict[str, object]:
 
 @functools.cache
 def _templates() -> jinja2.Environment:
-    """The templates of `assets/`, which escape every string that is not a `Markup`."""
+    """The templates of `assets/`; those of pages escape every string that is not a `Markup`."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_ASSETS),
-        autoescape=True,
+        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False}
     return environment

@@ -131,7 +131,7 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         **scene_data(params),
         "push_scale": drawing.PUSH_SCALE,
         "ghost_opacity": drawing.GHOST_OPACITY,
-        "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr", 0)},
+        "lqr": {"label": labels.label("lqr"), "color": labels.color("lqr")},
         "policies": {task: _policy_data(paths[task], network) for task, network in networks.items()},
         "you": {"label": "you", "color": labels.YOU},
         "best": {"label": "optimum", "color": labels.OPTIMUM},
@@ -166,7 +166,7 @@ def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
     name = str(read_description(path).get("training", {}).get("learner", path.stem))
     return {
         "label": labels.label(name),
-        "color": labels.color(name, 0),
+        "color": labels.color(name),
         "activation": network.spec.activation,
         **layers_of(network),
     }
