@@ -38,7 +38,7 @@ def test_the_interquartile_mean_leaves_out_the_best_and_the_worst_of_five():
 def test_a_curve_is_of_all_seeds_and_ends_where_the_first_of_them_ends(tmp_path):
     a_run(tmp_path / "seed-0", 0, [4.0, 2.0, 0.0])
     a_run(tmp_path / "seed-1", 1, [4.0, 4.0])
-    (curve,) = report.grouped(report.read_runs([tmp_path]))
+    (curve,) = report.read_curves([tmp_path])
     x, middle, low, high = curve.against("env_steps")
     assert (x[0], x[-1]) == (0.0, 1000.0)
     assert (middle[0], middle[-1]) == pytest.approx((4.0, 3.0))
@@ -51,7 +51,7 @@ def test_settings_of_one_learner_are_curves_of_their_own(tmp_path):
         a_run(tmp_path / "with" / f"seed-{seed}", seed, [1.0, 0.5])
         a_run(tmp_path / "without" / f"seed-{seed}", seed, [1.0, 0.9], settings={"products": False})
     a_run(tmp_path / "sac", 0, [1.0, 0.7], learner="sac")
-    made = report.grouped(report.read_runs([tmp_path / "with", tmp_path / "without", tmp_path / "sac"]))
+    made = report.read_curves([tmp_path / "with", tmp_path / "without", tmp_path / "sac"])
     assert [(curve.label, len(curve.runs)) for curve in made] == [("PPO, with", 2), ("PPO, without", 2), ("SAC", 1)]
 
 

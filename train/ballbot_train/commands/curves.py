@@ -18,7 +18,7 @@ def curves(runs: tuple[Path, ...], /, out: Path = Path("runs/curves")) -> None:
 
     if not runs:
         raise ValueError("give at least one folder of ballbot train")
-    drawn = report.grouped(report.read_runs(runs))
+    drawn = report.read_curves(runs)
     picture, rows = save(report.figure(drawn), out / "curves.png"), report.summary(drawn)
     print_rows("where the curves end", rows)
     console.print(f"figure: {picture}\ntable: {files.write_csv(out / 'curves.csv', rows)}")

@@ -28,30 +28,18 @@ _RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
-class TrainingRun:
-    """One training, as its folder holds it."""
-
-    folder: Path
-    task: str
-    learner: str
-    settings: str
-    """As JSON text; runs that differ in their seeds alone have the same."""
-    columns: dict[str, np.ndarray]
-    """(n,) one entry per evaluation, by the names of evaluations.csv, with "minutes" and "regret"."""
-
-
-@dataclass(frozen=True)
 class LearningCurve:
     """The same training on several seeds."""
 
     label: str
     learner: str
     task: str
-    runs: tuple[TrainingRun, ...]
+    runs: tuple[dict[str, np.ndarray], ...]
+    """Of each seed (n,) one entry per evaluation, by the names of evaluations.csv, with "minutes" and "regret"."""
 
     def against(self, axis: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """x, interquartile mean, low and high of its band, (m,) each; empty where the runs do not know x."""
-        known = [(run.columns[axis], run.columns["regret"]) for run in self.runs]
+        known = [(run[axis], run["regret"]) for run in self.runs]
         known = [(x[keep], y[keep]) for x, y in known if (keep := np.isfinite(x) & np.isfinite(y)).sum() > 1]
         if len(known) < len(self.runs):
             none = np.zeros(0)
@@ -61,7 +49,7 @@ class LearningCurve:
 
     def final(self, name: str) -> np.ndarray:
         """(n,) the last value of each seed."""
-        return np.array([run.columns[name][-1] for run in self.runs])
+        return np.array([run[name][-1] for run in self.runs])
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
@@ -76,24 +64,37 @@ def _middle_and_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     return interquartile_mean(values), low, high
 
 
-def read_runs(paths: Sequence[Path]) -> list[TrainingRun]:
-    """The trainings in folders: runs, or folders of runs.
+def read_curves(paths: Sequence[Path]) -> list[LearningCurve]:
+    """A curve for each learner and settings in folders: runs, or folders of runs.
+
+    Runs that differ in their seeds alone are of one curve. Where a learner has several on a task, folders tell them apart.
 
     Raises:
         ValueError: a folder holds none, or a run's files are damaged.
     """
-    runs = []
+    groups: dict[tuple[str, str, str], list[tuple[Path, dict[str, np.ndarray]]]] = {}
     for path in paths:
         found = sorted(path.glob("evaluations.csv")) or sorted(path.glob("*/evaluations.csv"))
         if not found:
             raise ValueError(
                 f"{path} holds no training, and neither do the folders in it; give folders of ballbot train"
             )
-        runs += [_read_run(file.parent) for file in found]
-    return runs
+        for file in found:
+            kind, columns = _read_run(file.parent)
+            groups.setdefault(kind, []).append((file.parent, columns))
+    kinds = [(task, learner) for task, learner, _ in groups]
+    curves = []
+    for (task, learner, _), members in groups.items():
+        name = label(learner)
+        if kinds.count((task, learner)) > 1:
+            own, _ = members[0]
+            name += f", {own.parent.name if own.name.startswith('seed-') else own.name}"
+        curves.append(LearningCurve(name, learner, task, tuple(columns for _, columns in members)))
+    return curves
 
 
-def _read_run(folder: Path) -> TrainingRun:
+def _read_run(folder: Path) -> tuple[tuple[str, str, str], dict[str, np.ndarray]]:
+    """Task, learner and settings, as JSON text, of a training, and its columns as in `LearningCurve.runs`."""
     config = files.read_json(folder / "config.json")
     try:
         text = files.read(folder / "evaluations.csv").decode()
@@ -102,26 +103,9 @@ def _read_run(folder: Path) -> TrainingRun:
         columns = {name: np.array([float(row[name]) for row in rows]) for name in names}
         columns["minutes"] = columns["cpu_seconds"] / 60
         columns["regret"] = columns["cost_ratio"] - 1
-        settings = json.dumps(config["settings"], sort_keys=True)
-        return TrainingRun(folder, config["task"], config["learner"], settings, columns)
+        return (config["task"], config["learner"], json.dumps(config["settings"], sort_keys=True)), columns
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise ValueError(f"{folder} holds no training of ballbot train, or a damaged one: {error!r}") from error
-
-
-def grouped(runs: Sequence[TrainingRun]) -> list[LearningCurve]:
-    """A curve for each learner and settings. Where a learner has several on a task, folders tell them apart."""
-    groups: dict[tuple[str, str, str], list[TrainingRun]] = {}
-    for run in runs:
-        groups.setdefault((run.task, run.learner, run.settings), []).append(run)
-    kinds = [(task, learner) for task, learner, _ in groups]
-    curves = []
-    for (task, learner, _), members in groups.items():
-        name = label(learner)
-        if kinds.count((task, learner)) > 1:
-            own = members[0].folder
-            name += f", {own.parent.name if own.name.startswith('seed-') else own.name}"
-        curves.append(LearningCurve(name, learner, task, tuple(members)))
-    return curves
 
 
 def figure(curves: Sequence[LearningCurve]) -> Figure:
