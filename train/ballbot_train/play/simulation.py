@@ -6,7 +6,7 @@ The robot that counts is the main one. Ghosts get the same start and the same pu
 import contextlib
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -83,14 +83,13 @@ class World:
             self.certified = certified.load(self.task, robot)
 
 
+@dataclass(eq=False)
 class Runner:
-    """A ballbot under one controller, and its episode so far."""
+    """A ballbot under one controller in an environment, and its episode so far."""
 
-    def __init__(self, name: str, controller: Controller, world: World, physics: str, hidden: Randomization):
-        """`hidden` is what the controller does not know: the true robot, its actuator, sensors and pushes."""
-        self.name, self.controller = name, controller
-        self._world, self._physics = world, physics
-        self.env = self._env_with(hidden)
+    name: str
+    controller: Controller
+    env: BallbotEnv
 
     @property
     def x(self) -> State:
@@ -119,11 +118,11 @@ class Runner:
         self._go_from(other.x)
         self.cost, self.violated, self.arrived = other.cost, other.violated, other.arrived
 
-    def set_hidden(self, hidden: Randomization) -> None:
-        """Changes what the controller does not know, in the middle of an episode."""
+    def move_to(self, env: BallbotEnv) -> None:
+        """Goes on in another environment, in the middle of an episode."""
         before = self.env.get_state()
         self.env.close()
-        self.env = self._env_with(hidden)
+        self.env = env
         self.env.reset(seed=0)
         kept = {name: getattr(before, name) for name in ("constants", "steps_left", "rng")}
         self.env.set_state(self.env.get_state()._replace(x=self.x, memory=(), **kept))
@@ -146,7 +145,7 @@ class Runner:
             pushed = dynamics.pushed(self.env.episode_params, self.x, tuple(push.tolist()))
             self.states[-1] = tuple(map(float, pushed))
             self.env.set_state(self.env.get_state()._replace(x=self.x, memory=()))
-        _, _, terminated, _, info = self.env.step(command / self._world.params.force_limit)
+        _, _, terminated, _, info = self.env.step(command / self.env.params.force_limit)
         self.states.append(tuple(info["state"].tolist()) if np.isfinite(info["state"]).all() else self.x)
         self.forces.append(tuple(info["force"].tolist()))
         self.cost += info["cost"]
@@ -162,9 +161,6 @@ class Runner:
             return np.zeros((0, 2))
         rest = plan.trajectory.x[plan.trajectory.t >= seconds]
         return rest[:: max(1, len(rest) // _PLAN_POINTS), :2]
-
-    def _env_with(self, hidden: Randomization) -> BallbotEnv:
-        return BallbotEnv(self._world.task, self._physics, robot=self._world.params, randomization=hidden)
 
     def _go_from(self, x: State) -> None:
         self.states: list[State] = [x]
@@ -388,7 +384,7 @@ class Playground:
                 runner.env.close()
                 self.runners.remove(runner)
         for name, controller in ready.items():
-            self.runners.append(Runner(name, controller, self.world, self._physics, self._hidden()))
+            self.runners.append(Runner(name, controller, self._env(self.world)))
             self.runners[-1].join(self.main)
 
     def set_plant(self, stress: str, value: float) -> None:
@@ -399,7 +395,7 @@ class Playground:
             raise ValueError(f"{stress} must be {low:g} to {high:g}, not {value:g}")
         self.plant[stress] = step * round(value / step)
         for runner in self.runners:
-            runner.set_hidden(self._hidden())
+            runner.move_to(self._env(self.world))
 
     def restart(self) -> None:
         """Begins the same episode again."""
@@ -436,7 +432,7 @@ class Playground:
         made = {name: self._made(name, world) for name in dict.fromkeys(controllers)}
         self.close()
         self.world = world
-        self.runners = [Runner(*each, world, self._physics, self._hidden()) for each in made.items()]
+        self.runners = [Runner(*each, self._env(world)) for each in made.items()]
         if episode == "rest":
             self.start_at_rest()
         elif episode is None or world.certified is None:
@@ -476,13 +472,17 @@ class Playground:
                 runner.name, runner.controller = "lqr", make_controller("lqr", self.world.task, self.world.params)
                 runner.controller.reset(0.0, *map(np.array, start))
 
-    def _hidden(self) -> Randomization:
-        """What the controllers do not know. Changes by hand take the track's place."""
+    def _env(self, world: World) -> BallbotEnv:
+        """With what the controllers do not know: the true robot, its actuator, sensors and pushes.
+
+        Changes by hand take the track's place.
+        """
         changes = [STRESSES[stress].at(value) for stress, value in self.plant.items() if value]
         changed = {
             f.name: value for each in changes for f in fields(each) if (value := getattr(each, f.name)) != f.default
         }
-        return replace(Randomization(), **changed) if changes else self._track
+        hidden = replace(Randomization(), **changed) if changes else self._track
+        return BallbotEnv(world.task, self._physics, robot=world.params, randomization=hidden)
 
     def _end(self) -> None:
         """Notes the score. The same episode begins again after a pause; if only time is over, another where the robot is."""
