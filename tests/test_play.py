@@ -74,7 +74,7 @@ def test_the_optimum_of_a_certified_episode_is_known_as_it_goes(play):
     assert playground.optimum_cost_so_far == pytest.approx(
         certified.load("stabilize", "paper").costs[STANDING], rel=1e-6
     )
-    playground.start_certified(150)  # one whose trajectory is not kept
+    playground.begin(150)  # one whose trajectory is not kept
     assert math.isnan(playground.optimum_cost_so_far)
     assert playground.optimum_cost > 0
 
@@ -167,18 +167,18 @@ def test_every_episode_of_a_track_has_a_robot_of_its_own(play):
     playground = play("turn", episode=0, randomization="unknown")
     masses = []
     for episode in range(3):
-        playground.start_certified(episode)
+        playground.begin(episode)
         masses.append(playground.main.env.episode_params.body_mass / playground.world.params.body_mass)
     assert len(set(masses)) == 3
     assert 0.7 <= min(masses) < max(masses) <= 1.4
     playground.set_plant("mass", 10.0)  # a slider takes its place
-    playground.start_certified(3)
+    playground.begin(3)
     assert playground.main.env.episode_params.body_mass == pytest.approx(1.1 * playground.world.params.body_mass)
 
 
 def test_another_task_or_robot_keeps_the_controllers_that_it_has(play):
     playground = play(ghosts=["shac"])
-    for change in (lambda: playground.set_robot("rolling"), lambda: playground.set_task("orbit")):
+    for change in (lambda: playground.set_world(robot="rolling"), lambda: playground.set_world("orbit")):
         change()
         playground.step()
         assert (playground.main.name, playground.ghosts) == ("lqr", ())  # which have no such policy
@@ -194,15 +194,15 @@ def test_a_policy_file_is_offered_where_it_fits(play, tmp_path):
     playground.step()
     assert playground.main.name == mine
     assert playground.notice == ""
-    playground.set_task("orbit")
+    playground.set_world("orbit")
     assert mine not in playground.controllers
-    playground.set_task("stabilize")
+    playground.set_world("stabilize")
     assert mine in playground.controllers
 
 
 WRONG = [
-    (lambda p: p.set_task("dance"), "unknown task dance"),
-    (lambda p: p.set_robot("teapot"), "unknown robot teapot"),
+    (lambda p: p.set_world("dance"), "unknown task dance"),
+    (lambda p: p.set_world(robot="teapot"), "unknown robot teapot"),
     (lambda p: p.set_controller("nobody"), "unknown controller 'nobody'"),
     (lambda p: p.set_controller("nowhere/policy.json"), "no such file"),
     (lambda p: p.set_controller(str(SHIPPED / "orbit-ppo.json")), "orbit"),
@@ -210,7 +210,7 @@ WRONG = [
     (lambda p: p.set_plant("mass", math.nan), "mass must be -50 to 100"),
     (lambda p: p.set_plant("mass", 1e9), "mass must be -50 to 100"),
     (lambda p: p.set_plant("weather", 1.0), "unknown change weather"),
-    (lambda p: p.start_certified(200), "episode must be 0 to 199, not 200"),
+    (lambda p: p.begin(200), "episode must be 0 to 199, not 200"),
     (lambda p: p.push(math.nan, 0.0), "a push must be finite"),
     (lambda p: p.push(math.inf, 1.0), "a push must be finite"),
 ]

@@ -109,9 +109,11 @@ class PlayPage:
         self._status = gui.add_markdown("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Play"):
-            self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_task, lambda: playground.world.task_name)
+            self._bind(gui.add_dropdown("Task", tuple(TASKS)), playground.set_world, lambda: playground.world.task_name)
             self._bind(
-                gui.add_dropdown("Robot", without_wheels()), playground.set_robot, lambda: playground.world.robot
+                gui.add_dropdown("Robot", without_wheels()),
+                lambda robot: playground.set_world(robot=robot),
+                lambda: playground.world.robot,
             )
             self._controller = gui.add_dropdown("Controller", ("lqr",))
             self._bind(self._controller, playground.set_controller, lambda: playground.main.name)
@@ -142,18 +144,18 @@ class PlayPage:
             episode = gui.add_number("Certified episode", 0, min=0, step=1)
             self._bind(
                 episode,
-                playground.start_certified,
+                playground.begin,
                 lambda: episode.value if playground.episode is None else playground.episode,
             )
             starts = {
-                "Certified": lambda: playground.start_certified(episode.value),
-                "Random": playground.start_random,
-                "At rest": playground.start_at_rest,
+                "Certified": lambda: playground.begin(episode.value),
+                "Random": partial(playground.begin, "random"),
+                "At rest": partial(playground.begin, "rest"),
             }
             self._button_group("Start", starts, hint="key: N for a random one")
         self._key("pause or play", "space", self._toggle)
         self._key("restart", "R", playground.restart)
-        self._key("random start", "N", playground.start_random)
+        self._key("random start", "N", partial(playground.begin, "random"))
 
     def _build_push(self) -> None:
         with self._gui.add_folder("Push"):

@@ -359,13 +359,11 @@ class Playground:
             raise ValueError(f"a push must be finite numbers, not {x} and {y}")
         self._pending_push = self._pending_push + np.array([x, y]) * (LARGEST_PUSH / max(length, LARGEST_PUSH))
 
-    def set_task(self, task: str) -> None:
-        """Another task, under the same controllers where it has them."""
-        self._change(task, self.world.robot)
-
-    def set_robot(self, robot: str) -> None:
-        """Another robot, in the same task, under the same controllers where it has them."""
-        self._change(self.world.task_name, robot)
+    def set_world(self, task: str | None = None, robot: str | None = None) -> None:
+        """Another task, or another robot, under the same controllers where they are made for it."""
+        world = World(task or self.world.task_name, robot or self.world.robot, self._files)
+        main = self.main.name if self.main.name in world.controllers else world.best
+        self._open(world, [main, *(ghost for ghost in self.ghosts if ghost in world.controllers)], 0)
 
     def set_controller(self, name: str) -> None:
         """Another controller for the main robot, which goes on where it is."""
@@ -401,44 +399,33 @@ class Playground:
         """Begins the same episode again."""
         self._begin(self.start, self.episode, self._at_rest)
 
-    def start_certified(self, episode: int) -> None:
-        """Begins a certified episode."""
-        known = self.world.certified
-        if known is None:
+    def begin(self, episode: int | Literal["rest", "random"]) -> None:
+        """Begins a certified episode, by its index, a random one, or one that stands at the origin until it is pushed, which
+        happens by itself.
+        """
+        task, known = self.world.task, self.world.certified
+        if episode == "random":
+            self._begin(task.sample(self._rng, self.world.params), None)
+        elif episode == "rest":
+            self._begin((np.zeros(8), task.sample(self._rng, self.world.params)[1]), None, True)
+        elif known is None:
             raise ValueError(
                 f"{self.world.task_name} has no certified episodes for {self.world.robot}; begin a random one"
             )
-        if not 0 <= episode < len(known):
+        elif not 0 <= episode < len(known):
             raise ValueError(f"episode must be 0 to {len(known) - 1}, not {episode}")
-        self._begin((known.states[episode], known.constants[episode]), episode)
-
-    def start_random(self) -> None:
-        """Begins an episode with a random start."""
-        self._begin(self.world.task.sample(self._rng, self.world.params), None)
-
-    def start_at_rest(self) -> None:
-        """Begins an episode that stands at the origin until it is pushed, which happens by itself."""
-        self._begin((np.zeros(8), self.world.task.sample(self._rng, self.world.params)[1]), None, True)
+        else:
+            self._begin((known.states[episode], known.constants[episode]), episode)
 
     # --- inside ---
 
-    def _change(self, task: str, robot: str) -> None:
-        """Opens a task for a robot, with the present controllers that are made for them."""
-        world = World(task, robot, self._files)
-        main = self.main.name if self.main.name in world.controllers else world.best
-        self._open(world, [main, *(ghost for ghost in self.ghosts if ghost in world.controllers)], 0)
-
-    def _open(self, world: World, controllers: Iterable[str], episode: int | str | None) -> None:
+    def _open(self, world: World, controllers: Iterable[str], episode: int | Literal["rest"] | None) -> None:
         made = {name: self._made(name, world) for name in dict.fromkeys(controllers)}
         self.close()
         self.world = world
         self.runners = [Runner(*each, self._env(world)) for each in made.items()]
-        if episode == "rest":
-            self.start_at_rest()
-        elif episode is None or world.certified is None:
-            self.start_random()
-        else:
-            self.start_certified(int(episode))
+        known = episode == "rest" or world.certified is not None
+        self.begin(episode if known and episode is not None else "random")
 
     def _made(self, name: str, world: World) -> Controller:
         """A controller by name, which is offered from then on if it is a policy file."""

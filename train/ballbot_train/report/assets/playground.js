@@ -186,11 +186,14 @@ class Playground {
     if (!this.playing) this.setPlaying(true);
   }
 
-  /** A push along the screen: x to the right, y away from the camera. */
-  pushOnScreen(x, y) {
+  /** What is along the screen, x to the right and y away from the camera, along the floor. */
+  onFloor(x, y) {
     const [right, back] = this.scene?.right ? [this.scene.right, this.scene.back] : [[1, 0], [0, -1]];
-    const away = Math.hypot(back[0], back[1]);
-    this.hit([0, 1].map((i) => this.impulse * (x * right[i] - (y * back[i]) / away)));
+    return Vector.plus(Vector.times(right.slice(0, 2), x), back.slice(0, 2), -y / Math.hypot(back[0], back[1]));
+  }
+
+  pushOnScreen(x, y) {
+    this.hit(Vector.times(this.onFloor(x, y), this.impulse));
   }
 
   tick(now) {
@@ -376,9 +379,7 @@ class Playground {
   /** Holds the driver's stick along the screen: x to the right, y away from the camera. */
   steer(x, y) {
     if (!this.driver) return;
-    const [right, back] = this.scene?.right ? [this.scene.right, this.scene.back] : [[1, 0], [0, -1]];
-    const away = Math.hypot(back[0], back[1]);
-    this.driver.hold(...[0, 1].map((i) => x * right[i] - (y * back[i]) / away));
+    this.driver.hold(...this.onFloor(x, y));
     if (!this.playing && (x || y) && !this.isOver(this.robots[0])) this.setPlaying(true);
   }
 
