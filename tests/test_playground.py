@@ -55,9 +55,9 @@ def engine():
 
 
 def start_of(scenario, task):
-    if scenario.episode is None:
+    if scenario.episodes[0] is None:
         return {"state": np.zeros(8), "constants": np.zeros(len(task.constant_names))}
-    return certified.load(task, "paper").options(scenario.episode)
+    return certified.load(task, "paper").options(scenario.episodes[0])
 
 
 def in_double(path, task, params):
@@ -233,10 +233,10 @@ def test_in_the_browser_an_episode_is_that_of_python_and_shows_its_regret(opened
     (by_policy, _), _, cells = advance(opened, 350)
     env = BallbotEnv("stabilize", physics="rk4")
     path = shipped_policies(env.task)[BEST["stabilize"]]
-    options = certified.load(env.task, "paper").options(SCENARIOS[1].episode)
+    options = certified.load(env.task, "paper").options(SCENARIOS[1].episodes[0])
     episode = rollout(env, in_double(path, env.task, env.params), options=options)
     np.testing.assert_allclose(by_policy, episode.trajectory.x[-1], atol=CLOSE)
-    regret = episode.cost / certified.load(env.task, "paper").costs[SCENARIOS[1].episode] - 1
+    regret = episode.cost / certified.load(env.task, "paper").costs[SCENARIOS[1].episodes[0]] - 1
     assert cells[0][5] == f"regret {100 * regret:.1f} %"
 
 

@@ -8,7 +8,7 @@ weights. The model and the tasks are printed as JavaScript from the lines that P
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,12 +45,10 @@ class Scenario:
     text: str
     """What to look at, in a sentence or two."""
     task: str
-    episode: int | None = None
-    """The certified episode that it is; None is standing at rest at the origin."""
+    episodes: tuple[int | None, ...] = (None,)
+    """The certified episodes that can be chosen; None is standing at rest at the origin. The text tells of the first one."""
     push: tuple[float, float, float] | None = None
     """A push that comes by itself: time, s, impulse, N·s, and bearing, rad."""
-    others: tuple[int, ...] = ()
-    """More certified episodes that can be chosen."""
 
 
 SCENARIOS = (
@@ -65,29 +63,25 @@ SCENARIOS = (
         "Throw",
         "All start fast and leaning, and are to come to rest on the green spot. Braking takes a lean of 40°.",
         "stabilize",
-        7,
-        others=(0, 3, 5),
+        (7, 0, 3, 5),
     ),
     Scenario(
         "Orbit",
         "From rest onto a circle at 5.5 m/s, which takes a steady lean of 43°.",
         "orbit",
-        17,
-        others=(1, 2, 3),
+        (17, 1, 2, 3),
     ),
     Scenario(
         "Turn",
         "A right-angled turn through the gate at 6.8 m/s, with as little force as possible.",
         "turn",
-        1,
-        others=(2, 3, 5),
+        (1, 2, 3, 5),
     ),
     Scenario(
         "Weave",
         "Round five obstacles, and to rest behind them. LQR does not know of obstacles.",
         "weave",
-        12,
-        others=(0, 1, 3),
+        (12, 0, 1, 3),
     ),
 )
 """Every scenario of the page."""
@@ -135,17 +129,11 @@ def engine_script(policies: Sequence[str] = ()) -> str:
         "policies": {task: _policy_data(paths[task], network) for task, network in networks.items()},
         "you": {"label": "you", "color": labels.YOU},
         "best": {"label": "optimum", "color": labels.OPTIMUM},
-        "scenarios": [_scenario_data(episode, params) for scenario in SCENARIOS for episode in _episodes(scenario)],
+        "scenarios": [_scenario_data(each, episode, params) for each in SCENARIOS for episode in each.episodes],
     }
     # Within a script, "<" could end it.
     text = json.dumps(data, separators=(",", ":"), allow_nan=False, default=_packed).replace("<", "\\u003c")
     return "\n".join([_model_script(params, networks), f"const DATA = {text};", asset("engine.js")])
-
-
-def _episodes(scenario: Scenario) -> list[Scenario]:
-    """A scenario in each of its episodes."""
-    text = "Another start of the same task."
-    return [scenario, *(replace(scenario, text=text, episode=episode, others=()) for episode in scenario.others)]
 
 
 def _policies(given: Sequence[str]) -> dict[str, Path]:
@@ -172,22 +160,22 @@ def _policy_data(path: Path, network: PolicyNetwork) -> dict[str, Any]:
     }
 
 
-def _scenario_data(scenario: Scenario, params: BallbotParams) -> dict[str, Any]:
+def _scenario_data(scenario: Scenario, episode: int | None, params: BallbotParams) -> dict[str, Any]:
     task = make_task(scenario.task)
     state, constants, optimum, best = np.zeros(8), np.zeros(0), None, None
-    if scenario.episode is not None:
+    if episode is not None:
         episodes = certified.load(task, params)
-        state, constants = episodes.states[scenario.episode], episodes.constants[scenario.episode]
-        optimum = float(episodes.costs[scenario.episode])
-        trajectory = episodes.trajectories[scenario.episode]
+        state, constants = episodes.states[episode], episodes.constants[episode]
+        optimum = float(episodes.costs[episode])
+        trajectory = episodes.trajectories[episode]
         best = {"x": np.float32(trajectory.x), "u": np.float32(trajectory.u)}
     lqr = LqrController(task, params)
     lqr.reset(0.0, state, constants)
     return {
         "title": scenario.title,
-        "text": scenario.text,
+        "text": scenario.text if episode == scenario.episodes[0] else "Another start of the same task.",
         "task": scenario.task,
-        "episode": scenario.episode,
+        "episode": episode,
         "state": state.tolist(),
         "constants": constants.tolist(),
         "duration": task.duration,
