@@ -104,24 +104,20 @@ class Playground {
     const { label, color } = DATA.policies[task];
     const learned = { label: `${label} policy`, color, alpha: 1 };
     const ghost = DATA.ghost_opacity + 0.15;
-    this.looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
-    if (this.best) this.looks.push({ ...DATA.best, alpha: DATA.ghost_opacity });
+    const looks = driven ? [{ ...DATA.you, alpha: 1 }, { ...learned, alpha: ghost }] : [learned, { ...DATA.lqr, alpha: ghost }];
+    this.everyone = this.best ? [...this.robots, this.best] : this.robots;
+    this.everyone.forEach((robot, i) => (robot.look = looks[i] ?? { ...DATA.best, alpha: DATA.ghost_opacity }));
     this.due = this.scenario.push; // the push that comes by itself
     this.restart(this.scenario.state);
     [...find(".readouts tbody").rows].forEach((row, i) => {
-      row.hidden = i >= this.looks.length;
-      row.cells[0].textContent = this.looks[i]?.label ?? "";
+      row.hidden = i >= this.everyone.length;
+      row.cells[0].textContent = this.everyone[i]?.look.label ?? "";
     });
     if (this.scene) {
       const [x, y] = this.scenario.state;
       this.scene.camera.target = [x, y, 0.5];
     }
     this.setPlaying(true);
-  }
-
-  /** The robots, and the optimum beside them. */
-  get everyone() {
-    return this.best ? [...this.robots, this.best] : this.robots;
   }
 
   /** All robots in one state, at time 0. */
@@ -222,15 +218,15 @@ class Playground {
     if (!this.scene) return;
     this.follow(states, elapsed);
     const pull = this.drag?.pull ?? (this.shown && this.time < this.shown.until ? this.shown.impulse : null);
-    const robots = states.map((x, i) => ({
-      x,
-      color: this.tint(this.looks[i].color),
-      alpha: this.looks[i].alpha,
-      u: this.everyone[i].ended ? null : this.everyone[i].force,
-      push: pull && i < 2 && !this.robots[i].ended ? pull.map((part) => part * DATA.push_scale) : null,
+    const robots = this.everyone.map((robot, i) => ({
+      x: states[i],
+      color: this.tint(robot.look.color),
+      alpha: robot.look.alpha,
+      u: robot.ended ? null : robot.force,
+      push: pull && robot !== this.best && !robot.ended ? Vector.times(pull, DATA.push_scale) : null,
     }));
-    const paths = this.everyone.map((robot, i) => ({ points: robot.path, color: this.tint(this.looks[i].color), dashed: i > 0 }));
-    this.scene.draw({ robots: [...robots].reverse(), paths: paths.reverse(), markers: this.scenario.markers });
+    const paths = this.everyone.map(({ path, look }, i) => ({ points: path, color: this.tint(look.color), dashed: i > 0 }));
+    this.scene.draw({ robots: robots.reverse(), paths: paths.reverse(), markers: this.scenario.markers });
     this.showNames(states);
   }
 
@@ -258,8 +254,8 @@ class Playground {
       name.hidden = !places[i]; // of robots that there are not, too
       if (name.hidden) return;
       const robot = this.everyone[i];
-      name.style.borderColor = this.tint(this.looks[i].color);
-      name.textContent = `${this.looks[i].label} ${verdict(robot) || `${(robot.tilt * DEGREES).toFixed(0)}°`}`;
+      name.style.borderColor = this.tint(robot.look.color);
+      name.textContent = `${robot.look.label} ${verdict(robot) || `${(robot.tilt * DEGREES).toFixed(0)}°`}`;
       const half = name.offsetWidth / 2;
       const x = Math.min(Math.max(places[i][0], half), this.scene.canvas.clientWidth - half);
       const y = Math.min(Math.max(places[i][1], 26), this.scene.canvas.clientHeight - 10);
@@ -279,7 +275,7 @@ class Playground {
         robot === this.best ? `of ${this.scenario.optimum.toFixed(1)}` : robot.failed ? verdict(robot) : this.regret(robot),
       ];
       cells.forEach((text, k) => (rows[i].cells[k + 1].textContent = text));
-      rows[i].cells[0].style.borderLeftColor = this.tint(this.looks[i].color);
+      rows[i].cells[0].style.borderLeftColor = this.tint(robot.look.color);
       rows[i].cells[5].className = robot.failed ? "bad" : this.isOver(robot) ? "good" : "";
     });
   }
