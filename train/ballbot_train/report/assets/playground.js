@@ -18,7 +18,7 @@ class Playground {
       find(".trouble").hidden = false;
       find(".trouble").textContent = `The robots cannot be drawn: ${error.message}. The numbers below are computed all the same.`;
     }
-    [this.playing, this.last] = [true, null];
+    this.playing = true;
     [this.distance, this.zoom] = [NEAR, 1];
     this.wake();
     for (const chip of find(".chips").children) {
@@ -42,7 +42,7 @@ class Playground {
     find(".drawn").onclick = () => this.setRobot(this.sliders.map(({ min, max }) => (+min + Math.random() * (max - min)) / 100));
     this.listen();
     this.setRobot(KNOWN, 0);
-    requestAnimationFrame((now) => this.tick(now));
+    everyFrame((seconds) => this.tick(seconds));
   }
 
   say(text) {
@@ -138,7 +138,6 @@ class Playground {
   setPlaying(playing) {
     this.wake();
     this.playing = playing;
-    this.last = null;
     find(".play").textContent = playing ? "Pause" : "Play";
   }
 
@@ -192,18 +191,15 @@ class Playground {
     this.hit(Vector.times(this.onFloor(x, y), this.impulse));
   }
 
-  tick(now) {
-    if (this.last !== null && this.playing && !this.drag?.robot) {
-      this.late += Math.min((now - this.last) / 1000, 0.1) * Number(find(".speed").value);
+  tick(elapsed) {
+    if (this.playing && !this.drag?.robot) {
+      this.late += elapsed * Number(find(".speed").value);
       while (this.late >= DATA.dt) {
         this.late -= DATA.dt;
         this.advance();
       }
     }
-    const elapsed = this.last === null ? 0 : Math.min((now - this.last) / 1000, 0.1);
-    this.last = now;
-    if (this.playing || this.drag || now < this.awake) this.draw(elapsed);
-    requestAnimationFrame((next) => this.tick(next));
+    if (this.playing || this.drag || performance.now() < this.awake) this.draw(elapsed);
   }
 
   /** The state of a robot between two control steps. */

@@ -108,16 +108,11 @@ class Replay {
     if ([this.end, this.episode.poster].includes(this.time)) this.time = 0;
     this.playing = true;
     this.find("play").textContent = "Pause";
-    let last = performance.now();
-    const tick = (now) => {
-      if (!this.playing) return;
-      const step = Math.min((now - last) / 1000, 0.1) * Number(this.find("speed").value);
-      last = now;
-      this.seek(this.time + Math.max(0, step));
+    everyFrame((seconds) => {
+      if (this.playing) this.seek(this.time + seconds * Number(this.find("speed").value));
       if (this.time >= this.end) this.pause();
-      else requestAnimationFrame(tick);
-    };
-    requestAnimationFrame(tick);
+      return this.playing;
+    });
   }
 
   pause() {

@@ -106,6 +106,13 @@ function rgb(color) {
   return [1, 3, 5].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
 }
 
+/** Calls `step` in every frame with the seconds since the last one, at most 0.1, until it returns false. */
+function everyFrame(step, last = performance.now()) {
+  requestAnimationFrame((now) => {
+    if (step(Math.min(Math.max(now - last, 0) / 1000, 0.1)) !== false) everyFrame(step, now);
+  });
+}
+
 /** The body's axis in state x, upwards, and the axes across it. γ turns about y, then θ about the turned −x. */
 function bodyFrame(x) {
   const [sg, cg, st, ct] = [Math.sin(x[2]), Math.cos(x[2]), Math.sin(x[3]), Math.cos(x[3])];
