@@ -153,9 +153,7 @@ def test_certified_shards_are_the_certified_set(tmp_path):
     certify(("stabilize",), 6, shards=str(tmp_path / "shards"), out=tmp_path / "out", workers=1)
     whole = files.read_npz(tmp_path / "set" / "BallbotStabilize-v0.npz")
     (arrays,) = shards.Shards(tmp_path / "shards" / "stabilize")
-    for name in ("states", "constants", "costs", "violations", "lengths", "x", "u"):
+    for name in ("states", "constants", "costs", "violations", "statuses", "lengths", "x", "u"):
         assert np.array_equal(arrays[name], whole[name]), name
-    for solved, told in zip(arrays["statuses"], whole["statuses"], strict=True):
-        assert told.startswith(f"{solved}; ")  # and how it was found
     assert arrays["episodes"].tolist() == list(range(6))
     assert json.loads((tmp_path / "shards" / "stabilize" / shards.MANIFEST).read_text())["shards"]["0"]["episodes"] == 6

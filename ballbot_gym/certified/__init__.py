@@ -6,12 +6,11 @@ for the env's discretization with physics="rk4". A set says what it was made for
 robot: a cost divided by the optimum of something else is no regret.
 """
 
-import json
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -145,8 +144,7 @@ def load(
         given = path_of(task, name, track) if path is None else Path(path)
         if not given.exists():
             raise CertificateError(f"{given}: no evaluation set of {task.id}")
-        status = given.stat()
-        found = _read(given, (status.st_mtime_ns, status.st_size), type(task), task, params, randomization)
+        found = _read((_version(given),), type(task), task, params, randomization)
         if path is None and not all(0 <= index < len(found) for index in needed):
             raise CertificateError(f"{given} has {len(found)} episodes, and not all of {shown(needed)}")
         return found
@@ -165,65 +163,67 @@ def from_cache(
 
     `statuses` say how each optimum was found.
     """
-    needed = tuple(episodes)
-    versions = cache.versions(task, params, needed, randomization)
-    return _from_cache(needed, versions, type(task), task, params, randomization)
+    needed = tuple(dict.fromkeys(episodes))
+    if not needed:
+        return None
+    try:
+        paths = [_version(cache.path(task, params, index, randomization)) for index in needed]
+        found = _read(tuple(paths), type(task), task, params, randomization)
+    except (FileNotFoundError, CertificateError):
+        return None
+    if len(found) != len(needed):
+        return None
+    for index, *begun in zip(needed, found.states, found.constants, found.drawn, strict=True):
+        starts = cache.starts(task, params, index, randomization)
+        if not any(all(map(np.array_equal, begun, start)) for start in starts):
+            return None
+    rows, arrays = max(EPISODES, max(needed) + 1), {}
+    for name in _PER_EPISODE:
+        values = getattr(found, name)
+        arrays[name] = np.full((rows, *values.shape[1:]), "" if name == "statuses" else np.nan, values.dtype)
+        arrays[name][list(needed)] = values
+    moved = dict(zip(needed, found.trajectories, strict=True))
+    first = itertools.takewhile(moved.__contains__, range(TRAJECTORIES))
+    return EvaluationSet(**arrays, trajectories=tuple(moved[index] for index in first))
 
 
-@lru_cache(maxsize=16)
-def _from_cache(
-    needed: tuple[int, ...],
-    versions: tuple[Any, ...],
-    kind: type[Task],
-    task: Task,
-    params: BallbotParams,
-    randomization: Randomization,
-) -> EvaluationSet | None:
-    """`from_cache` of files in their present versions. Steps them once, however often they are asked for."""
-    found = cache.read(task, params, needed, randomization)
-    if len(found) < len(set(needed)) or not found:
-        return None
-    rows = max(EPISODES, max(found) + 1)
-    arrays: dict[str, Any] = {name: np.full(rows, np.nan) for name in ("costs", "durations", "violations", "ideal")}
-    arrays |= {
-        "states": np.full((rows, params.state_size), np.nan),
-        "constants": np.full((rows, len(task.constant_names)), np.nan),
-    }
-    arrays["drawn"] = np.full((rows, len(cache.drawn(task, randomization, 0))), np.nan)
-    statuses = [""] * rows
-    moves = {}
-    for index, optimum in found.items():
-        t = task.control_dt * np.arange(len(optimum["x"]))
-        moves[index] = Trajectory(t, optimum["x"], optimum["u"])
-        values = (
-            *(optimum["cost"], t[-1], optimum["violation"], optimum["ideal"], optimum["state"], optimum["constants"]),
-            cache.drawn(task, randomization, index, optimum["draw"]),
-        )
-        for name, value in zip(arrays, values, strict=True):
-            arrays[name][index] = value
-        statuses[index] = f"{optimum['status']}; {json.dumps(optimum['found'])}"
-    chosen = list(moves)
-    of_moves = {name: arrays[name][chosen] for name in ("constants", "costs", "drawn")}
-    if not _holds(tuple(moves.values()), of_moves, task, params, randomization):
-        return None
-    first = range(next(i for i in range(rows + 1) if i not in moves))
-    trajectories = tuple(moves[i] for i in first[:TRAJECTORIES])
-    arrays["statuses"] = np.array(statuses)
-    for array in arrays.values():
-        array.setflags(write=False)  # everybody who loads the set gets it
-    return EvaluationSet(**arrays, trajectories=trajectories)
+def _version(path: Path) -> tuple[Path, int, int]:
+    """A file, when it was written, ns, and its size."""
+    status = path.stat()
+    return path, status.st_mtime_ns, status.st_size
 
 
 @lru_cache(maxsize=16)
 def _read(
-    path: Path,
-    version: tuple[int, int],
+    versions: tuple[tuple[Path, int, int], ...],
     kind: type[Task],
     task: Task,
     params: BallbotParams,
     randomization: Randomization,
 ) -> EvaluationSet:
-    """The set of a file in its present version, whose trajectories hold. Steps them once, however often it is asked for."""
+    """The sets of some files in their present versions as one. Of several files each has all its trajectories.
+
+    The trajectories must hold; they are stepped once, however often the set is asked for.
+    """
+    parts = [_arrays_of(path, task, params, randomization) for path, _, _ in versions]
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for array in arrays.values():
+        array.setflags(write=False)  # everybody who loads the set gets it
+    lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
+    forces = np.split(u, np.cumsum(lengths)[:-1])
+    states = np.split(x, np.cumsum(lengths + 1)[:-1])
+    times = (task.control_dt * np.arange(n + 1) for n in lengths)
+    trajectories = tuple(Trajectory(*each) for each in zip(times, states, forces, strict=True))
+    if not _holds(trajectories, arrays, task, params, randomization):
+        raise CertificateError(
+            f"{versions[0][0]}: its optimal trajectories do not move or cost in {task.problem()} as they did when they were "
+            "computed, because cost, limits or equations have changed since"
+        )
+    return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
+
+
+def _arrays_of(path: Path, task: Task, params: BallbotParams, randomization: Randomization) -> dict[str, np.ndarray]:
+    """What a file holds that `EvaluationSet.save` wrote for this very problem."""
     try:
         arrays = files.read_npz(path)
         if "drawn" not in arrays and "costs" in arrays:
@@ -236,24 +236,11 @@ def _read(
         for made, wanted in zip(made_for, (task.problem(), repr(params), repr(randomization)), strict=True):
             if made != wanted:
                 raise CertificateError(f"{path} was computed for {made}, not for {wanted}")
-        arrays |= _checked(task, params, arrays)
-        lengths, x, u = arrays["lengths"], arrays["x"], arrays["u"]
-        forces = np.split(u, np.cumsum(lengths)[:-1])
-        states = np.split(x, np.cumsum(lengths + 1)[:-1])
-        times = (task.control_dt * np.arange(n + 1) for n in lengths)
-        trajectories = tuple(Trajectory(*parts) for parts in zip(times, states, forces, strict=True))
+        return _checked(task, params, arrays)
     except CertificateError:
         raise
     except ValueError as error:
         raise CertificateError(f"{path} is no evaluation set: {error}") from error
-    for array in arrays.values():
-        array.setflags(write=False)  # everybody who loads the set gets it
-    if not _holds(trajectories, arrays, task, params, randomization):
-        raise CertificateError(
-            f"{path}: its optimal trajectories do not move or cost in {task.problem()} as they did when they were computed, "
-            "because cost, limits or equations have changed since"
-        )
-    return EvaluationSet(**{name: arrays[name] for name in _PER_EPISODE}, trajectories=trajectories)
 
 
 def _command(task: Task, params: BallbotParams, robot: str, file: bool, track: str) -> str:
@@ -298,7 +285,7 @@ def _holds(
 
 
 def _checked(task: Task, params: BallbotParams, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of numbers; raises a ValueError that names the one whose shape or values make no sense."""
+    """The arrays of a set; raises a ValueError that names the one whose shape or values make no sense."""
     n = arrays["costs"].size
     shapes = dict.fromkeys(_PER_EPISODE, (n,)) | {
         "states": (n, params.state_size),
@@ -310,7 +297,7 @@ def _checked(task: Task, params: BallbotParams, arrays: Mapping[str, np.ndarray]
             raise ValueError(f"{name} has the shape {arrays[name].shape}, and not {shape} of at least one episode")
     if arrays["statuses"].dtype.kind != "U":
         raise ValueError(f"statuses must be text, not of {arrays['statuses'].dtype}")
-    found = {name: files.numbers(arrays[name], name) for name in shapes if name != "statuses"}
+    found = {name: arrays[name] if name == "statuses" else files.numbers(arrays[name], name) for name in shapes}
     if not (found["costs"] > 0).all():
         raise ValueError("costs must be positive")
     lengths = arrays["lengths"]
@@ -321,4 +308,4 @@ def _checked(task: Task, params: BallbotParams, arrays: Mapping[str, np.ndarray]
     steps = int(lengths.sum())
     for name, shape in (("x", (steps + lengths.size, params.state_size)), ("u", (steps, params.action_size))):
         found[name] = files.numbers(arrays[name], name, shape)
-    return found
+    return found | {"lengths": lengths}

@@ -11,7 +11,7 @@ import json
 import os
 import uuid
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym import files, machine_code, traced
+from ballbot_gym import machine_code, traced
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.tasks import Task
 
-_NUMBERS = ("state", "constants", "cost", "ideal", "violation", "x", "u")
+_MOST_DRAWS = 20
 
 
 def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -37,14 +37,22 @@ def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tup
 
 
 def drawn(task: Task, randomization: Randomization, index: int, draw: int = 0) -> tuple[float, ...]:
-    """What a randomization draws for episode `index` of a task's evaluation set, the same on every machine.
+    """What a randomization that moves optima draws for episode `index` of an evaluation set, the same on every machine.
 
     A later draw takes the place of one with which nobody can do the episode.
     """
-    if not randomization.varies_episodes:
+    if not randomization.moves_optima:
         return ()
     rng = np.random.default_rng([zlib.crc32(task.id.encode()), index, draw, 1])
     return randomization.draw(tuple(rng.random(len(Randomization.DRAWN)).tolist()), task.control_dt)
+
+
+def starts(
+    task: Task, params: BallbotParams, index: int, randomization: Randomization = Randomization()
+) -> Iterator[tuple[np.ndarray, np.ndarray, tuple[float, ...]]]:
+    """Of each draw of episode `index`: initial state, constants, and what the randomization draws."""
+    for draw in range(_MOST_DRAWS):
+        yield *episode(task, params, index, draw), drawn(task, randomization, index, draw)
 
 
 def folder(task: Task, params: BallbotParams, randomization: Randomization = Randomization()) -> Path:
@@ -61,79 +69,8 @@ def folder(task: Task, params: BallbotParams, randomization: Randomization = Ran
     return base / f"{type(task).__name__}-{_digest(task, params, randomization)}"
 
 
-def write(
-    task: Task,
-    params: BallbotParams,
-    index: int,
-    optimum: Mapping[str, Any],
-    randomization: Randomization = Randomization(),
-) -> None:
-    """Keeps the optimum of an episode, unless a cheaper one is there.
-
-    Args:
-        task: and params: the problem.
-        index: of the episode.
-        optimum: "cost", "violation", "status", "x" (n+1, 8), "u" (n, 2), and "found", which says in JSON how it was found;
-            "draw", if it is not the first; "ideal", its cost without delay, if that is another.
-        randomization: what the episode's robot and actuator are drawn from.
-    """
-    path = _path(task, params, index, randomization)
-    known = read(task, params, [index], randomization).get(index)
-    if known is not None and float(known["cost"]) <= optimum["cost"]:
-        return
-    draw = int(optimum.get("draw", 0))
-    state, constants = episode(task, params, index, draw)
-    arrays = {"state": state, "constants": constants, "draw": np.array(draw)}
-    arrays |= {name: np.asarray(optimum[name]) for name in ("cost", "violation", "status", "x", "u")}
-    arrays |= {"ideal": np.asarray(optimum.get("ideal", optimum["cost"]))}
-    files.write_npz(path, arrays | {"found": np.array(json.dumps(optimum["found"]))})
-
-
-def read(
-    task: Task, params: BallbotParams, indices: Iterable[int], randomization: Randomization = Randomization()
-) -> dict[int, dict[str, Any]]:
-    """Optima of those episodes that are there, as `write` took them, with "state" and "constants". A damaged one is none."""
-    found = {}
-    for index in indices:
-        path = _path(task, params, index, randomization)
-        if not path.exists():
-            continue
-        try:
-            arrays: dict[str, Any] = dict(files.read_npz(path))
-            arrays.setdefault("ideal", arrays["cost"])
-            arrays |= {name: files.numbers(arrays[name], name) for name in _NUMBERS}
-            arrays |= {
-                "found": json.loads(str(arrays["found"])),
-                "status": str(arrays["status"]),
-                "draw": int(arrays["draw"]),
-            }
-            own = episode(task, params, index, arrays["draw"])
-            n = len(arrays["u"])
-            shapes = (arrays["x"].shape, arrays["u"].shape, arrays["cost"].shape)
-            if shapes == ((n + 1, params.state_size), (n, params.action_size), ()) and np.array_equal(
-                np.concatenate(own), np.concatenate([arrays["state"], arrays["constants"]])
-            ):
-                found[index] = arrays
-        except (ValueError, KeyError, TypeError):
-            continue
-    return found
-
-
-def versions(
-    task: Task, params: BallbotParams, indices: Iterable[int], randomization: Randomization = Randomization()
-) -> tuple[tuple[int, int] | None, ...]:
-    """When the optimum of each of some episodes was written, ns, and its size; None where there is none."""
-    paths = [_path(task, params, index, randomization) for index in indices]
-    stats = [path.stat() if path.exists() else None for path in paths]
-    return tuple(None if one is None else (one.st_mtime_ns, one.st_size) for one in stats)
-
-
-def forget(task: Task, params: BallbotParams, index: int, randomization: Randomization = Randomization()) -> None:
-    """Deletes the optimum of an episode, if there is one."""
-    _path(task, params, index, randomization).unlink(missing_ok=True)
-
-
-def _path(task: Task, params: BallbotParams, index: int, randomization: Randomization) -> Path:
+def path(task: Task, params: BallbotParams, index: int, randomization: Randomization = Randomization()) -> Path:
+    """Where the optimum of an episode is kept, as an `EvaluationSet` of this episode alone."""
     return folder(task, params, randomization) / f"{index:06d}.npz"
 
 

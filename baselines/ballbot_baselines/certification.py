@@ -1,9 +1,10 @@
 """Computes the certified evaluation sets that `ballbot_gym.certified` loads.
 
-`entries` solves a few episodes after the other and yields what JSON holds, so that the work can be divided and continued.
+`entries` solves a few episodes after the other and yields a set of each alone, so that the work can be divided and continued.
 """
 
 import itertools
+import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -16,7 +17,7 @@ from ballbot_baselines.compiled import LANES
 from ballbot_baselines.optimum import Optimum, find_optimum, second_search
 from ballbot_baselines.search import COARSE
 from ballbot_gym import dynamics
-from ballbot_gym.certified import cache
+from ballbot_gym.certified import EvaluationSet, cache
 from ballbot_gym.certified.cache import episode
 from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
@@ -26,16 +27,11 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.trajectory import Trajectory
 
-Entry = dict[str, Any]
-"""The optimum of one episode as JSON holds it: "episode" (its index), "cost", "violation", "solver", "status", and the
-optimal trajectory's "t", "x" and "u" as lists; "draw", which draw of the episode it is, where it is not the first; and
-"found", how it was found: guesses "tried", and "next_basin", by which share the next best local optimum
-costs more. JSON keeps every bit of a float. Where no optimum was found: "episode" and "error", the message."""
+Entry = tuple[int, EvaluationSet | str]
+"""The number of an episode, and a set of it alone with its optimum, or why none was found."""
 
 AT_ONCE = LANES
 """Episodes whose second searches share the processor's lanes."""
-
-_MOST_DRAWS = 20
 
 
 def entries(
@@ -65,50 +61,52 @@ def entries(
             x0, c = (np.array(part) for part in zip(*(episode(task, params, i, 0) for i in some), strict=True))
             second = second_search(task, params, x0, c)
         for k, index in enumerate(some):
-            for draw in range(_MOST_DRAWS if params.grips or randomization.moves_optima else 1):
+            found: EvaluationSet | str = ""
+            redrawn = None if params.grips or randomization.moves_optima else 1
+            for draw, start in enumerate(itertools.islice(cache.starts(task, params, index, randomization), redrawn)):
                 twice = True if second is None or draw else second.some(slice(k, k + 1))
-                entry = _solved(task, params, index, draw, randomization, twice)
-                if "error" not in entry:
+                try:
+                    found = _solved(task, params, randomization, *start, twice)
                     break
-            yield entry
+                except PlanError as error:
+                    found = str(error)
+            yield index, found
 
 
 def _solved(
-    task: Task, params: BallbotParams, index: int, draw: int, randomization: Randomization, twice: bool | BatchOptima
-) -> Entry:
-    x0, c = episode(task, params, index, draw)
-    drawn = cache.drawn(task, randomization, index, draw)
-    delay = randomization.moves_optima and drawn[5] > 0
-    try:
-        optimum = optimum_of(task, params, x0, c, randomization, drawn, twice)
-        ideal = optimum
-        if delay:
-            ideal = find_optimum(task, randomization.robot(params, drawn), x0, c, twice=True)
-    except PlanError as error:
-        return {"episode": index, "error": str(error)}
-    for found in (optimum, ideal):
-        if not found.is_optimal:
-            reason = f"only a feasible episode of cost {found.cost:.6g} was found ({found.solver_status})"
-            return {"episode": index, "error": reason}
-    trajectory = optimum.trajectory
-    return (
-        {
-            "episode": index,
-            "cost": optimum.cost,
-            "violation": optimum.violation,
-            "solver": optimum.solver,
-            "status": optimum.solver_status,
-            "found": {
-                "tried": optimum.tried,
-                "next_basin": None if math.isnan(optimum.next_basin) else optimum.next_basin,
-            },
-            "t": trajectory.t.tolist(),
-            "x": trajectory.x.tolist(),
-            "u": trajectory.u.tolist(),
-        }
-        | ({"draw": draw} if draw else {})
-        | ({"ideal": ideal.cost} if delay else {})
+    task: Task,
+    params: BallbotParams,
+    randomization: Randomization,
+    x0: np.ndarray,
+    c: np.ndarray,
+    drawn: tuple[float, ...],
+    twice: bool | BatchOptima,
+) -> EvaluationSet:
+    """The set of one episode; raises a PlanError where no optimum is found."""
+    optimum = ideal = optimum_of(task, params, x0, c, randomization, drawn, twice)
+    if drawn and drawn[5] > 0:
+        ideal = _optimal(task, randomization.robot(params, drawn), x0, c, twice=True)
+    next_basin = None if math.isnan(optimum.next_basin) else optimum.next_basin
+    found = json.dumps({"tried": optimum.tried, "next_basin": next_basin})
+    return EvaluationSet(
+        states=np.array([x0]),
+        constants=np.array([c]),
+        costs=np.array([optimum.cost]),
+        durations=np.array([task.control_dt * len(optimum.trajectory.u)]),
+        violations=np.array([optimum.violation]),
+        statuses=np.array([f"{optimum.solver}: {optimum.solver_status}; {found}"]),
+        trajectories=(optimum.trajectory,),
+        drawn=np.array([drawn]),
+        ideal=np.array([ideal.cost]),
     )
+
+
+def _optimal(*problem: Any, **options: Any) -> Optimum:
+    """What `find_optimum` finds; raises a PlanError for an episode that is merely feasible."""
+    found = find_optimum(*problem, **options)
+    if not found.is_optimal:
+        raise PlanError(f"only a feasible episode of cost {found.cost:.6g} was found ({found.solver_status})")
+    return found
 
 
 def optimum_of(
@@ -132,13 +130,13 @@ def optimum_of(
         twice: as of `find_optimum`, where no force is late.
 
     Raises:
-        PlanError: the robot violates a limit before it can be moved, or no try came to a feasible episode.
+        PlanError: the robot violates a limit before it can be moved, or no try came to an optimum.
     """
     if randomization.moves_optima:
         params = randomization.robot(params, drawn)
     delay = round(drawn[5]) if randomization.varies_actuator else 0
     if not delay:
-        return find_optimum(task, params, x0, c, twice=twice)
+        return _optimal(task, params, x0, c, twice=twice)
     dt, none, states, cost = task.control_dt, np.zeros(params.action_size), [np.asarray(x0, np.float64)], 0.0
     for k in range(delay):
         began = task.at(c, k * dt)
@@ -153,15 +151,10 @@ def optimum_of(
         # only over an even number of steps are choices of sides compared
         longer = replace(task, duration=rest.duration + dt)
         paths = [find_optimum(longer, params, states[-1], c, start=start).trajectory.x[:-1, :2]]
-    found = find_optimum(rest, params, states[-1], c, paths=paths, start=start, twice=True)
+    found = _optimal(rest, params, states[-1], c, paths=paths, start=start, twice=True)
     x = np.concatenate([states[:-1], found.trajectory.x])
     u = np.concatenate([np.zeros((delay, params.action_size)), found.trajectory.u])
     return replace(found, cost=cost + found.cost, trajectory=Trajectory(dt * np.arange(len(x)), x, u))
-
-
-def _start(task: Task, params: BallbotParams, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
-    """Initial state and constants of the episode of an entry."""
-    return episode(task, params, entry["episode"], entry.get("draw", 0))
 
 
 def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[str, np.ndarray]:
@@ -176,23 +169,23 @@ def arrays(entries: Sequence[Entry], task: Task, params: BallbotParams) -> dict[
     | x, u | (Σ lengths + n, 8), (Σ lengths, 2) | the trajectories, one after another |
     | failed, errors | (m,) | episodes without an optimum, and why |
     """
-    found = [entry for entry in entries if "error" not in entry]
-    failed = [entry for entry in entries if "error" in entry]
-    starts = [_start(task, params, entry) for entry in found]
+    found = {index: part for index, part in entries if isinstance(part, EvaluationSet)}
+    failed = {index: error for index, error in entries if isinstance(error, str)}
+    moved = [part.trajectories[0] for part in found.values()]
 
-    def joined(name: str, width: int) -> np.ndarray:
-        return np.concatenate([np.zeros((0, width)), *(np.reshape(entry[name], (-1, width)) for entry in found)])
+    def joined(name: str, *width: int) -> np.ndarray:
+        return np.concatenate([np.zeros((0, *width)), *(getattr(part, name) for part in found.values())])
 
     return {
-        "episodes": np.array([entry["episode"] for entry in found], np.int64),
-        "states": np.array([x for x, _ in starts], float).reshape(-1, params.state_size),
-        "constants": np.array([c for _, c in starts], float).reshape(len(found), len(task.constant_names)),
-        "costs": np.array([entry["cost"] for entry in found], float),
-        "violations": np.array([entry["violation"] for entry in found], float),
-        "statuses": np.array([f"{entry['solver']}: {entry['status']}" for entry in found], str),
-        "lengths": np.array([len(entry["u"]) for entry in found], np.int64),
-        "x": joined("x", params.state_size),
-        "u": joined("u", params.action_size),
-        "failed": np.array([entry["episode"] for entry in failed], np.int64),
-        "errors": np.array([entry["error"] for entry in failed], str),
+        "episodes": np.array(list(found), np.int64),
+        "states": joined("states", params.state_size),
+        "constants": joined("constants", len(task.constant_names)),
+        "costs": joined("costs"),
+        "violations": joined("violations"),
+        "statuses": np.array([part.statuses[0] for part in found.values()], str),
+        "lengths": np.array([len(trajectory.u) for trajectory in moved], np.int64),
+        "x": np.concatenate([np.zeros((0, params.state_size)), *(trajectory.x for trajectory in moved)]),
+        "u": np.concatenate([np.zeros((0, params.action_size)), *(trajectory.u for trajectory in moved)]),
+        "failed": np.array(list(failed), np.int64),
+        "errors": np.array(list(failed.values()), str),
     }

@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +55,8 @@ def known(
         ValueError: no task or robot of that name, or no optimum is known under such a randomization.
     """
     task, params = make_task(task, robot), checked_robot(robot)
+    if not randomization.moves_optima:
+        randomization = Randomization()
     needed = range(certified.EPISODES) if episodes is None else list(episodes)
     try:
         return certified.load(task, params, episodes=needed, randomization=randomization)
@@ -98,7 +101,7 @@ def compute(
         lock.acquire()
     failures = []
     try:
-        missing = _missing(task, params, needed, randomization)
+        missing = [i for i in needed if certified.from_cache(task, params, [i], randomization) is None]
         if not missing:
             return
         name = f"optima of {file_name(name_of(task) or type(task).__name__, robot_name(params))}"
@@ -110,13 +113,12 @@ def compute(
             parts = (missing[k : k + each] for k in range(0, len(missing), each))
             work = ((part, _solved, (solve, part)) for part in parts)
             solved = [solve(missing)] if workers is None else (entries for _, entries in completed(work, workers))
-            for entry in itertools.chain.from_iterable(solved):
+            for index, found in itertools.chain.from_iterable(solved):
                 advance(name, 1)
-                if "error" in entry:
-                    failures.append(f"episode {entry['episode']}: {entry['error']}")
-                    continue
-                entry["status"] = f"{entry['solver']}: {entry['status']}"
-                cache.write(task, params, entry["episode"], entry, randomization)
+                if isinstance(found, str):
+                    failures.append(f"episode {index}: {found}")
+                else:
+                    found.save(task, cache.path(task, params, index, randomization), params, randomization)
     finally:
         lock.release()
     if failures:
@@ -148,14 +150,5 @@ def _check_start(task: Task, params: BallbotParams, index: int) -> None:
             )
 
 
-def _missing(task: Task, params: BallbotParams, episodes: list[int], randomization: Randomization) -> list[int]:
-    found = cache.read(task, params, episodes, randomization)
-    for index in list(found):
-        if certified.from_cache(task, params, [index], randomization) is None:  # it does not move or cost so any more
-            cache.forget(task, params, index, randomization)
-            del found[index]
-    return [index for index in episodes if index not in found]
-
-
-def _solved(solve: Callable[[list[int]], Iterator[jobs.Entry]], part: list[int]) -> list[jobs.Entry]:
+def _solved(solve: Callable[[list[int]], Iterator[Any]], part: list[int]) -> list[Any]:
     return list(solve(part))
