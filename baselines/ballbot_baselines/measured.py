@@ -12,7 +12,7 @@ from ballbot_gym.env import make_task
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.transition import GRIP
+from ballbot_gym.tasks.transition import limit_names, outcome
 from ballbot_gym.trajectory import Trajectory
 
 _SAME_TIME = 1e-9  # s: times that differ by less are one
@@ -103,24 +103,20 @@ def _end(task: Task, params: BallbotParams, moved: Trajectory, x: np.ndarray, c:
     """The control step at which an episode through states x (n+1, 8) ends, the violated limit, and whether it succeeds."""
     if start := task.violated(x[0], task.at(c, 0.0)):
         raise ValueError(f"{task.id}: the trajectory starts beyond the limit of {start}")
-    for k in range(1, len(x)):
-        now = task.at(c, k * task.control_dt)
-        violated = task.violated(x[k], now)
-        if params.grips and not violated:
-            force = moved.force((k - 0.5) * task.control_dt)
-            grip = dynamics.limits(params, tuple(x[k - 1]), tuple(force), hold=task.control_dt)
-            violated = "" if min(grip) >= 0 else GRIP
-        if violated:
-            return k, violated, False
-        if (task.first_exit or k == task.steps) and task.is_goal(x[k], now):
-            return k, "", True
-    if len(x) <= task.steps:
+    steps, dt = np.arange(1, len(x)), task.control_dt
+    force = np.array([moved.force((k - 0.5) * dt) for k in steps]).reshape(-1, params.action_size)
+    limits = dynamics.limits(params, x[:-1], force, hold=dt)
+    did = outcome(task, x[:-1], force, x[1:], c, steps, (np.minimum.reduce(limits),) if limits else ())
+    ended = np.flatnonzero(np.broadcast_to(did.terminated + did.truncated, steps.shape))
+    if not len(ended):
         raise ValueError(
             f"the trajectory lasts {moved.duration:g} s, and the episode of {task.id} {task.duration:g} s"
             f"{' unless it reaches its goal' if task.first_exit else ''}: what the rest costs is not known; record all of "
             f"it, or give a task of that duration, such as {type(task).__name__}(duration=...)"
         )
-    return task.steps, "", False
+    end = int(ended[0])
+    violated = int(did.violated[end])
+    return end + 1, limit_names(task, params)[violated] if violated >= 0 else "", bool(did.success[end])
 
 
 def _cost(task: Task, moved: Trajectory, x: np.ndarray, c: np.ndarray) -> float:
