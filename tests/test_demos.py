@@ -144,7 +144,7 @@ def test_the_expert_recovers_from_pushes():
     recording, info = record(env, expert, np.random.default_rng(1), noise=0.02, pushes=2.0, options=start)
     assert expert.plans > 5
     assert not info["failure"]
-    assert len(recording.actions) == env.task.steps
+    assert len(recording["actions"]) == env.task.steps
     env.close()
 
 

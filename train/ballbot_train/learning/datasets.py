@@ -17,7 +17,7 @@ from ballbot_train import shards
 from ballbot_train.console import option
 from ballbot_train.policy_files import OBSERVATION_VERSION
 
-_IN_DATASET = {  # where Minari keeps the arrays of an episode, by their names in a shard
+IN_DATASET = {
     "observations": "observations",
     "states": "infos/state",
     "labels": "infos/expert_action",
@@ -26,6 +26,8 @@ _IN_DATASET = {  # where Minari keeps the arrays of an episode, by their names i
     "terminations": "terminations",
     "truncations": "truncations",
 }
+"""Where Minari keeps the arrays of an episode, by their names in a shard."""
+
 _UNFIT = (KeyError, ValueError, IndexError, TypeError)  # arrays that do not fit together
 
 
@@ -144,7 +146,7 @@ def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task) -> None:
 
 
 def _dataset(path: Path) -> dict[str, np.ndarray]:
-    """A dataset's HDF5 as arrays of a shard; see `_arrays_of`.
+    """A dataset's HDF5 as arrays of a shard; see `_demos`.
 
     Minari itself would make the env that a dataset describes, with whatever code that names, and read arrays of any size.
     """
@@ -152,14 +154,14 @@ def _dataset(path: Path) -> dict[str, np.ndarray]:
     if not main.is_file():
         raise ValueError(f"{main} is no regular file")
     size, declared = main.stat().st_size, 0
-    arrays: dict[str, list[np.ndarray]] = {name: [] for name in _IN_DATASET}
+    arrays: dict[str, list[np.ndarray]] = {name: [] for name in IN_DATASET}
     with h5py.File(main, "r") as file:
         for i in range(len(file)):
             group: Any = file[f"episode_{i}"]
-            declared += sum(group[place].nbytes for place in _IN_DATASET.values())
+            declared += sum(group[place].nbytes for place in IN_DATASET.values())
             if declared > size:
                 raise ValueError(f"its arrays declare more than the {size} bytes of {main.name}")
-            for name, place in _IN_DATASET.items():
+            for name, place in IN_DATASET.items():
                 arrays[name].append(group[place][()])
     lengths = np.array([len(each) for each in arrays["actions"]], np.int64)
     return {name: np.concatenate(parts) for name, parts in arrays.items()} | {"lengths": lengths}

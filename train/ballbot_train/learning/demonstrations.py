@@ -25,7 +25,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -50,10 +50,9 @@ from ballbot_train import jobs, shards
 from ballbot_train.console import check_names
 from ballbot_train.evaluation import controllers
 from ballbot_train.executors import Workers
-from ballbot_train.learning.datasets import metadata_of
+from ballbot_train.learning.datasets import IN_DATASET, metadata_of
 from ballbot_train.policy_files import OBSERVATION_VERSION
 
-_RECORDING = "recording"  # where an entry holds that of its episode
 _LONGER = ("observations", "states")  # than the others by one, of an episode
 _MOST_EPISODES = 1_000_000
 
@@ -101,27 +100,18 @@ class DemoConfig:
         return seeding.of_episode(self.seed + 1, i)
 
 
-@dataclass(frozen=True)
-class Recording:
-    """One episode of T steps under an expert.
+Recording = dict[str, np.ndarray]
+"""One episode of T steps under an expert.
 
-    | field | shape | meaning |
-    |---|---|---|
-    | observations | (T+1, no) float32 | |
-    | states | (T+1, 8) | order and units in `dynamics.STATE` |
-    | labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
-    | actions | (T, 2) float32 | executed |
-    | rewards | (T,) | |
-    | terminations, truncations | (T,) bool | |
-    """
-
-    observations: np.ndarray
-    states: np.ndarray
-    labels: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
-    terminations: np.ndarray
-    truncations: np.ndarray
+| array | shape | |
+|---|---|---|
+| observations | (T+1, no) float32 | |
+| states | (T+1, 8) | order and units in `dynamics.STATE` |
+| labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
+| actions | (T, 2) float32 | executed |
+| rewards | (T,) | |
+| terminations, truncations | (T,) bool | |
+"""
 
 
 class Expert:
@@ -197,11 +187,12 @@ def record(
     observation, info = env.reset(seed=seed, options=options)
     expert.reset(0.0, info["state"], info["constants"])
     std = noise * rng.random()
-    observations, states = [observation], [info["state"]]
-    labels, actions, rewards, ends = [], [], [], []
+    made: dict[str, list[Any]] = {name: [] for name in IN_DATASET}
+    made["observations"].append(observation)
+    made["states"].append(info["state"])
     pushed = done = False
     while not done:
-        t = dt * len(actions)
+        t = dt * len(made["actions"])
         if pushed:
             expert.replan(t, info["state"])
         label = expert.label(t, info["state"])
@@ -210,13 +201,10 @@ def record(
         action = np.clip(disturbed, -1, 1).astype(np.float32)
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
-        observations.append(observation)
-        states.append(info["state"])
-        labels.append(label)
-        actions.append(action)
-        rewards.append(reward)
-        ends.append((terminated, truncated))
-    return Recording(*map(np.array, (observations, states, labels, actions, rewards)), *np.array(ends).T), info
+        step = observation, info["state"], label, action, reward, terminated, truncated
+        for values, value in zip(made.values(), step, strict=True):
+            values.append(value)
+    return {name: np.array(values) for name, values in made.items()}, info
 
 
 def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progress: Callable[[int], None]) -> Path:
@@ -281,16 +269,36 @@ def write_shards(
     return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, on_progress, per_shard)
 
 
-def _recorded(config: DemoConfig, episodes: range) -> dict[str, np.ndarray]:
+def _recorded(config: DemoConfig, episodes: Sequence[int]) -> dict[str, np.ndarray]:
     """Episodes as arrays of a shard: those of their recordings, one after another, with lengths and metadata (JSON)."""
-    made = [entry for entry in _record_episodes(config, episodes) if "note" not in entry]
-    recorded: list[Recording] = [entry.pop(_RECORDING) for entry in made]
+    env = BallbotEnv(config.task, physics=config.physics, robot=config.robot)
+    expert = Expert(config.expert, env.task, env.params, config.backoff)
+    recorded, about = [], []
+    for seed in map(config.episode_seed, episodes):
+        rng = np.random.default_rng([seed, 1])  # other numbers than the env's
+        try:
+            recording, info = record(env, expert, rng, config.noise, config.pushes, seed)
+        except PlanError:  # the expert has no plan from this start
+            continue
+        facts = {
+            "seed": seed,
+            "expert": config.expert,
+            "physics": config.physics,
+            "cost": env.task.survival_pay - float(recording["rewards"].sum()),
+            "success": bool(info["success"]),
+            "failure": bool(info["failure"]),
+            "plans": expert.plans,
+            "plans_failed": expert.plans_failed,
+        }
+        recorded.append(recording)
+        about.append(json.dumps(facts))
+    env.close()
     if not recorded:
         return {}
     return {
-        **{each.name: np.concatenate([getattr(part, each.name) for part in recorded]) for each in fields(Recording)},
-        "lengths": np.array([len(part.actions) for part in recorded], np.int64),
-        "about": np.array([json.dumps(entry) for entry in made], str),
+        **{name: np.concatenate([part[name] for part in recorded]) for name in IN_DATASET},
+        "lengths": np.array([len(part["actions"]) for part in recorded], np.int64),
+        "about": np.array(about, str),
     }
 
 
@@ -306,31 +314,6 @@ def dataset_folder(out: Path) -> Path:
     except (ValueError, TypeError):
         raise ValueError(f"a dataset's folder is named NAME-vNUMBER, as stabilize-trajopt-v0, not {out.name}") from None
     return out
-
-
-def _record_episodes(config: DemoConfig, episodes: Sequence[int]) -> Iterator[jobs.Entry]:
-    """Yields the metadata of each episode, and its recording."""
-    env = BallbotEnv(config.task, physics=config.physics, robot=config.robot)
-    expert = Expert(config.expert, env.task, env.params, config.backoff)
-    for i in episodes:
-        rng = np.random.default_rng([config.episode_seed(i), 1])  # other numbers than the env's
-        try:
-            recording, info = record(env, expert, rng, config.noise, config.pushes, config.episode_seed(i))
-        except PlanError as error:
-            yield {"seed": config.episode_seed(i), "note": str(error)}  # the expert has no plan from this start
-            continue
-        yield {
-            "seed": config.episode_seed(i),
-            "expert": config.expert,
-            "physics": config.physics,
-            "cost": env.task.survival_pay - float(recording.rewards.sum()),
-            "success": bool(info["success"]),
-            "failure": bool(info["failure"]),
-            "plans": expert.plans,
-            "plans_failed": expert.plans_failed,
-            _RECORDING: recording,
-        }
-    env.close()
 
 
 def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Path) -> None:
@@ -376,10 +359,8 @@ def _buffers(arrays: Mapping[str, np.ndarray]) -> Iterator[EpisodeBuffer]:
     for k, length in enumerate(arrays["lengths"].tolist()):
         start, end = end, end + length
         cut: dict[str, Any] = {  # Minari's annotations say lists
-            each.name: arrays[each.name][start + k : end + k + 1]
-            if each.name in _LONGER
-            else arrays[each.name][start:end]
-            for each in fields(Recording)
+            name: arrays[name][start + k : end + k + 1] if name in _LONGER else arrays[name][start:end]
+            for name in IN_DATASET
         }
         infos = {"expert_action": cut.pop("labels"), "state": cut.pop("states")}
         yield EpisodeBuffer(seed=json.loads(arrays["about"][k])["seed"], infos=infos, **cut)
