@@ -7,7 +7,7 @@ robot: a cost divided by the optimum of something else is no regret.
 """
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -29,7 +29,6 @@ EPISODES = 200
 TRAJECTORIES = 20
 _FEW = 5  # trajectories in the file of a track, of which there are many, and of a robot with wheels, whose states are larger
 
-_ENDS = (slice(None, -1), slice(1, None))  # of control steps
 _SAME = 1e-6  # of states and, relative, of costs: what rounding differs by between machines is far less
 
 
@@ -214,7 +213,7 @@ def _read(
     states = np.split(x, np.cumsum(lengths + 1)[:-1])
     times = (task.control_dt * np.arange(n + 1) for n in lengths)
     trajectories = tuple(Trajectory(*each) for each in zip(times, states, forces, strict=True))
-    if not _holds(trajectories, arrays, task, params, randomization):
+    if not _holds(arrays, task, params, randomization):
         raise CertificateError(
             f"{versions[0][0]}: its optimal trajectories do not move or cost in {task.problem()} as they did when they were "
             "computed, because cost, limits or equations have changed since"
@@ -262,21 +261,16 @@ def _command(task: Task, params: BallbotParams, robot: str, file: bool, track: s
     )
 
 
-def _holds(
-    trajectories: Sequence[Trajectory],
-    of_episodes: Mapping[str, np.ndarray],
-    task: Task,
-    params: BallbotParams,
-    randomization: Randomization,
-) -> bool:
-    """Whether trajectories of the first of some episodes move, cost and keep the limits as when they were found."""
-    dt = task.control_dt
-    constants, known, drawn = (of_episodes[name][: len(trajectories)] for name in ("constants", "costs", "drawn"))
-    number = np.repeat(np.arange(len(trajectories)), [len(trajectory.u) for trajectory in trajectories])
-    before, after = (np.concatenate([trajectory.x[part] for trajectory in trajectories]) for part in _ENDS)
-    u, c = np.concatenate([trajectory.u for trajectory in trajectories]), constants[number]
-    began, ended = (task.at(c, np.concatenate([trajectory.t[part] for trajectory in trajectories])) for part in _ENDS)
-    robot = randomization.robot(params, tuple(drawn[number].T)) if randomization.moves_optima else params
+def _holds(arrays: Mapping[str, np.ndarray], task: Task, params: BallbotParams, randomization: Randomization) -> bool:
+    """Whether the trajectories, of the first episodes, move, cost and keep the limits as when they were found."""
+    dt, lengths, u = task.control_dt, arrays["lengths"], arrays["u"]
+    number = np.repeat(np.arange(len(lengths)), lengths)
+    step = np.arange(len(u)) - (np.cumsum(lengths) - lengths)[number]
+    row = np.arange(len(u)) + number  # each trajectory has a state more than steps
+    before, after, c = arrays["x"][row], arrays["x"][row + 1], arrays["constants"][number]
+    began, ended = (task.at(c, dt * k) for k in (step, step + 1))
+    robot = randomization.robot(params, tuple(arrays["drawn"][number].T)) if randomization.moves_optima else params
+    known = arrays["costs"][: len(lengths)]
     with np.errstate(all="ignore"):  # of damaged files
         moved = np.abs(dynamics.step(robot, before, u, dt, dynamics.substeps_for(dt)) - after) <= _SAME
         found = np.bincount(number, dt * np.broadcast_to(task.cost(before, u, began), len(u)), len(known))
@@ -287,17 +281,16 @@ def _holds(
 def _checked(task: Task, params: BallbotParams, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of a set; raises a ValueError that names the one whose shape or values make no sense."""
     n = arrays["costs"].size
-    shapes = dict.fromkeys(_PER_EPISODE, (n,)) | {
+    if n == 0:
+        raise ValueError("it has no episode")
+    if arrays["statuses"].dtype.kind != "U" or arrays["statuses"].shape != (n,):
+        raise ValueError(f"statuses must be {n} texts, not {arrays['statuses'].shape} of {arrays['statuses'].dtype}")
+    shapes = dict.fromkeys(("costs", "durations", "violations", "ideal"), (n,)) | {
         "states": (n, params.state_size),
         "constants": (n, len(task.constant_names)),
+        "drawn": (n, arrays["drawn"].shape[-1]),
     }
-    shapes["drawn"] = (n, arrays["drawn"].shape[-1])
-    for name, shape in shapes.items():
-        if n == 0 or arrays[name].shape != shape:
-            raise ValueError(f"{name} has the shape {arrays[name].shape}, and not {shape} of at least one episode")
-    if arrays["statuses"].dtype.kind != "U":
-        raise ValueError(f"statuses must be text, not of {arrays['statuses'].dtype}")
-    found = {name: arrays[name] if name == "statuses" else files.numbers(arrays[name], name) for name in shapes}
+    found = {name: files.numbers(arrays[name], name, shape) for name, shape in shapes.items()}
     if not (found["costs"] > 0).all():
         raise ValueError("costs must be positive")
     lengths = arrays["lengths"]
@@ -308,4 +301,4 @@ def _checked(task: Task, params: BallbotParams, arrays: Mapping[str, np.ndarray]
     steps = int(lengths.sum())
     for name, shape in (("x", (steps + lengths.size, params.state_size)), ("u", (steps, params.action_size))):
         found[name] = files.numbers(arrays[name], name, shape)
-    return found | {"lengths": lengths}
+    return found | {"lengths": lengths, "statuses": arrays["statuses"]}
