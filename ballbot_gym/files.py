@@ -62,17 +62,13 @@ def _read_at_most(file: IO[bytes], size: int) -> bytes:
     return b"".join(pieces)
 
 
-def read_json(path: str | Path, limit: int = JSON_LIMIT) -> Any:
-    """What a file of JSON holds.
+def read_json(path: str | Path, limit: int = JSON_LIMIT, content: bytes | None = None) -> Any:
+    """What a file of JSON holds, whose content may have been read already; errors name the path.
 
     Raises:
         FileError: as `read`, or it holds no JSON.
     """
-    return json_of(read(path, limit), path, limit)
-
-
-def json_of(content: bytes, path: str | Path, limit: int = JSON_LIMIT) -> Any:
-    """As `read_json`, of content that was read already; errors name the path."""
+    content = read(path, limit) if content is None else content
     if len(content) > limit:
         raise FileError(f"{path} holds more than {limit / 2**20:.0f} MiB of JSON, the most that is read")
     try:
@@ -83,21 +79,18 @@ def json_of(content: bytes, path: str | Path, limit: int = JSON_LIMIT) -> Any:
         raise FileError(f"{path} holds no JSON: {error}") from error
 
 
-def read_npz(path: str | Path, limit: int = READ_LIMIT) -> dict[str, np.ndarray]:
+def read_npz(path: str | Path, limit: int = READ_LIMIT, content: bytes | None = None) -> dict[str, np.ndarray]:
     """The arrays of an .npz file by name. Sizes are checked before anything is unpacked, and no object is loaded.
 
     Args:
         path: the file.
         limit: bytes of all arrays together.
+        content: of the file, if it was read already; errors name the path.
 
     Raises:
         FileError: as `read`; or it is no .npz file, is damaged or encrypted, or its arrays are larger than `limit`.
     """
-    return arrays_of(read(path, limit), path, limit)
-
-
-def arrays_of(content: bytes, path: str | Path, limit: int = READ_LIMIT) -> dict[str, np.ndarray]:
-    """As `read_npz`, of content that was read already; errors name the path."""
+    content = read(path, limit) if content is None else content
     members = unzipped(content, path, limit, ".npz file")
     try:
         read_array = (

@@ -209,7 +209,7 @@ def _read_zip(path: Path) -> tuple[list[Any], str, bool, dict[str, Any] | None, 
     for name in ("data", "policy.pth"):
         if name not in members:
             raise PolicyError(f"{path} is no saved Stable-Baselines3 model: it holds no {name}")
-    data = files.json_of(members["data"], f"data in {path}", _DATA_LIMIT)
+    data = files.read_json(f"data in {path}", _DATA_LIMIT, members["data"])
     weights = saved_by_torch(members["policy.pth"], f"policy.pth in {path}")
     made_by = str(data["policy_class"].get("__module__", ""))
     if not made_by.startswith(_MODULES):

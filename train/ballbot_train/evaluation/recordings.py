@@ -136,7 +136,7 @@ def read(path: str | Path, content: bytes | None = None) -> Recording:
     Raises:
         FileError: it is missing, damaged, too large, or no recording.
     """
-    arrays = files.arrays_of(content or files.read(path, LARGEST_FILE), path, _LARGEST_UNPACKED)
+    arrays = files.read_npz(path, _LARGEST_UNPACKED, content or files.read(path, LARGEST_FILE))
     if unknown := arrays.keys() - _ARRAYS:
         raise files.FileError(f"{path} holds {', '.join(sorted(unknown))}, which no recording has: costs are computed")
     if missing := _ARRAYS - arrays.keys():
@@ -149,7 +149,7 @@ def read(path: str | Path, content: bytes | None = None) -> Recording:
     for name, shape in shapes.items():
         if arrays[name].shape != shape or arrays[name].dtype != np.uint8:
             raise files.FileError(f"{path}: {name} has the shape {arrays[name].shape}, and not {shape} of uint8")
-    facts = files.json_of(text.tobytes(), path, _ABOUT_LIMIT)
+    facts = files.read_json(path, _ABOUT_LIMIT, text.tobytes())
     if not isinstance(facts, dict):
         raise files.FileError(f"{path} is no recording: about holds no object")
     return Recording(
