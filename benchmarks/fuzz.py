@@ -198,7 +198,7 @@ def _demos(folder: Path) -> tuple[list[Path], Callable[[], Any], tuple[type, ...
     from ballbot_train.learning.datasets import load_demos
     from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
-    out = write_demos(DemoConfig("turn", "lqr", 2, "rk4"), folder / "tiny-v0", 1, lambda count: None)
+    out = write_demos(DemoConfig("turn", "lqr", 2, "rk4"), folder / "tiny-v0", 1)
     paths = [out / "data" / "metadata.json", out / "data" / "main_data.hdf5"]
     return paths, lambda: load_demos(out, make_task("turn")), (ValueError,)
 

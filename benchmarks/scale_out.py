@@ -195,7 +195,7 @@ def leaderboard(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndar
 
 def dataset(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
     config = DemoConfig("stabilize", "lqr", episodes=episodes, physics="rk4")
-    return vars(load_demos(write_demos(config, out / "demos-v0", workers, lambda count: None), make_task("stabilize")))
+    return vars(load_demos(write_demos(config, out / "demos-v0", workers), make_task("stabilize")))
 
 
 def kill(episodes: int) -> list[Row]:

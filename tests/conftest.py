@@ -83,7 +83,7 @@ def demos(tmp_path_factory):
     from ballbot_train.learning.demonstrations import DemoConfig, write_demos
 
     config = DemoConfig("stabilize", "lqr", episodes=4, physics="rk4")
-    return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1, lambda count: None)
+    return write_demos(config, tmp_path_factory.mktemp("demos") / "tiny-v0", 1)
 
 
 @pytest.fixture

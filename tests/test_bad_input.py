@@ -409,8 +409,8 @@ DEMOS = [
     (lambda f: DemoConfig(episodes=0), "episodes must be 1 to 1000000, not 0"),
     (lambda f: DemoConfig(noise=math.nan), "noise must be finite and at least 0"),
     (lambda f: DemoConfig(expert="me"), "unknown expert me; known: lqr"),
-    (lambda f: write_demos(DemoConfig(), f / "name", 1, lambda n: None), "is named NAME-vNUMBER"),
-    (lambda f: write_demos(DemoConfig(), f / "mine-v0", 0, lambda n: None), "workers must be at least 1"),
+    (lambda f: write_demos(DemoConfig(), f / "name", 1), "is named NAME-vNUMBER"),
+    (lambda f: write_demos(DemoConfig(), f / "mine-v0", 0), "workers must be at least 1"),
     (lambda f: Backoff(margin=-0.1), "Backoff: margin must be at least 0"),
 ]
 

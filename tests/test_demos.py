@@ -25,7 +25,7 @@ from ballbot_train.policy_files import shipped_policies
 
 def make(out, **changes):
     fields = {"task": "stabilize", "expert": "lqr", "episodes": 3, "physics": "rk4"} | changes
-    return write_demos(DemoConfig(**fields), out, workers=1, on_progress=lambda count: None)
+    return write_demos(DemoConfig(**fields), out, workers=1)
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,7 @@ def results(out, workers):
 
 def demonstrations(out, workers):
     config = DemoConfig("stabilize", "lqr", episodes=16, physics="rk4")
-    return vars(load_demos(write_demos(config, out / "demos-v0", workers, lambda count: None), make_task("stabilize")))
+    return vars(load_demos(write_demos(config, out / "demos-v0", workers), make_task("stabilize")))
 
 
 @pytest.mark.parametrize("made", [certified_shards, results, demonstrations])

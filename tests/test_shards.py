@@ -1,6 +1,7 @@
 """Data sets as shards hold what one file would hold, survive a kill, and are read one shard at a time."""
 
 import json
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -27,10 +28,10 @@ def numbered(log, numbers):
     return {"i": np.array(numbers)}
 
 
-def made(url, out, episodes, about=None, on_progress=lambda count: None):
+def made(url, out, episodes, about=None):
     about = {"seed": 1} if about is None else about
     log = str(out.parent / "log")
-    return shards.make(url, about, episodes, partial(numbered, log), out, 1, on_progress, per_shard=7)
+    return shards.make(url, about, episodes, partial(numbered, log), out, 1, "numbers", per_shard=7)
 
 
 @pytest.mark.parametrize("where", ["folder", "memory"])
@@ -46,21 +47,32 @@ def test_every_episode_is_in_one_shard_in_order(where, tmp_path):
         fsspec.filesystem("memory").rm("/set-of-numbers", recursive=True)
 
 
-def test_a_killed_run_goes_on_and_writes_no_shard_twice(tmp_path):
+def test_a_killed_run_goes_on_and_writes_no_shard_twice(tmp_path, monkeypatch):
     url, counted = str(tmp_path / "set"), []
 
-    def killed(count):
-        counted.append(count)
-        if sum(counted) >= 11:
-            raise KeyboardInterrupt
+    @contextmanager
+    def killed(totals):
+        def advance(name, count):
+            counted.append(count)
+            if sum(counted) >= 11:
+                raise KeyboardInterrupt
 
+        yield advance
+
+    @contextmanager
+    def kept(totals):
+        assert totals == {"numbers": 20}
+        yield lambda name, count: counted.append(count)
+
+    monkeypatch.setattr(shards, "progress_bars", killed)
     with pytest.raises(KeyboardInterrupt):
-        made(url, tmp_path / "out", 20, on_progress=killed)
+        made(url, tmp_path / "out", 20)
     first = Path(url) / "shard-000000.npz"
     assert [path.name for path in Path(url).glob("*.npz")] == [first.name]
     stamp = first.stat().st_mtime_ns
-    counted = []
-    made(url, tmp_path / "out", 20, on_progress=counted.append)
+    counted.clear()
+    monkeypatch.setattr(shards, "progress_bars", kept)
+    made(url, tmp_path / "out", 20)
     assert sum(counted) == 20
     assert first.stat().st_mtime_ns == stamp
     assert sorted(map(int, (tmp_path / "log").read_text().split())) == list(range(20))
@@ -95,8 +107,8 @@ def test_a_damaged_manifest_is_named(text, tmp_path):
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demos")
-    write_demos(CONFIG, folder / "demos-v0", 1, lambda count: None)
-    write_shards(CONFIG, str(folder / "set"), folder / "out", 1, lambda count: None, per_shard=3)
+    write_demos(CONFIG, folder / "demos-v0", 1)
+    write_shards(CONFIG, str(folder / "set"), folder / "out", 1, per_shard=3)
     return folder
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from ballbot_gym import files
 from ballbot_gym.lazy import missing
 from ballbot_train import jobs
+from ballbot_train.console import progress_bars
 from ballbot_train.executors import Workers, completed
 
 try:
@@ -70,7 +71,7 @@ class Shards:
 
     def _parse(self, text: bytes) -> None:
         try:
-            manifest = files.json_of(text, MANIFEST)
+            manifest = files.read_json(MANIFEST, content=text)
             if manifest["version"] != _VERSION:
                 raise ValueError(f"version {manifest['version']}")
             self.about = dict(manifest["about"])
@@ -110,7 +111,7 @@ class Shards:
             raise ShardError(f"{path} cannot be read: {error}") from error
         if hashlib.sha256(content).hexdigest() != shard["sha256"]:
             raise ShardError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
-        return files.arrays_of(content, path, _LIMIT)
+        return files.read_npz(path, _LIMIT, content)
 
     def _content(self, name: str, limit: int) -> bytes:
         """Of a file of the set. Raises a FileError where it is larger than `limit` bytes."""
@@ -171,7 +172,7 @@ def make(
     function: Callable[[range], Arrays],
     out: Path,
     workers: int | Workers,
-    on_progress: Callable[[int], None],
+    named: str,
     per_shard: int = EPISODES,
 ) -> Shards:
     """Makes what is missing of a set, episode by episode on workers, and keeps nothing of a shard that is written.
@@ -184,7 +185,7 @@ def make(
             none. They are joined along their first axis.
         out: folder of this machine for what is unfinished, by which a killed run continues.
         workers: a number of processes, or `Workers`.
-        on_progress: called with a number of episodes that are there.
+        named: what the progress bar calls it.
         per_shard: episodes of a shard.
 
     Raises:
@@ -207,11 +208,11 @@ def make(
         for shard in range(-(-episodes // per_shard)):
             parts = parts_of(shard)
             if shard in shards.numbers and shards.episodes_of(shard) == sum(map(len, parts)):
-                on_progress(sum(map(len, parts)))
+                advance(named, sum(map(len, parts)))
                 continue
             for part, path in parts.items():
                 if path.exists():
-                    on_progress(len(part))
+                    advance(named, len(part))
                 else:
                     yield part, function, (part,)
             join(shard)  # a killed run may have had all of it
@@ -227,9 +228,10 @@ def make(
         for path in parts.values():
             path.unlink()
 
-    for part, arrays in completed(missing(), workers):
-        files.write(parts_of(part.start // per_shard)[part], files.npz(arrays, compressed=False))
-        on_progress(len(part))
-        join(part.start // per_shard)
+    with progress_bars({named: episodes}) as advance:
+        for part, arrays in completed(missing(), workers):
+            files.write(parts_of(part.start // per_shard)[part], files.npz(arrays, compressed=False))
+            advance(named, len(part))
+            join(part.start // per_shard)
     jobs.release(out, "set.json")
     return shards

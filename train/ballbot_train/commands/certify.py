@@ -14,7 +14,7 @@ from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import TASKS
 from ballbot_train import jobs
 from ballbot_train.commands.options import WorkersOption
-from ballbot_train.console import RobotName, check_least, check_some, console, progress_bars
+from ballbot_train.console import RobotName, check_least, check_some, console
 from ballbot_train.evaluation import optima
 from ballbot_train.executors import Workers
 from ballbot_train.provenance import provenance
@@ -81,19 +81,15 @@ def certify(
 def _certify_shards(tasks: tuple[str, ...], episodes: int, url: str, out: Path, workers: Workers, robot: str) -> None:
     from ballbot_train.shards import make
 
-    settings = robot_setting(robot)
-    with progress_bars(dict.fromkeys(tasks, episodes)) as advance:
-        for name in tasks:
-            made = make(
-                f"{url.rstrip('/')}/{name}",
-                {"certified": make_task(name, robot).problem(), "version": provenance()["version"], **settings},
-                episodes,
-                partial(_optima, name, robot),
-                out / name,
-                workers,
-                partial(advance, name),
-            )
-            console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")
+    for name in tasks:
+        about = {
+            "certified": make_task(name, robot).problem(),
+            "version": provenance()["version"],
+            **robot_setting(robot),
+        }
+        set_url, function = f"{url.rstrip('/')}/{name}", partial(_optima, name, robot)
+        made = make(set_url, about, episodes, function, out / name, workers, name)
+        console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards")
 
 
 def _optima(task: str, robot: str, episodes: range) -> dict[str, np.ndarray]:

@@ -1,7 +1,6 @@
 """`ballbot demos`: demonstrations of an expert as a Minari dataset."""
 
 import shlex
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from ballbot_gym.robots import file_name
 from ballbot_train.commands.options import UNNAMED, WorkersOption
-from ballbot_train.console import console, progress_bars
+from ballbot_train.console import console
 from ballbot_train.executors import Workers
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos, write_shards
 
@@ -30,13 +29,11 @@ def demos(
         workers: who does the work.
     """
     kind, folder = f"{file_name(config.task, config.robot)}-{config.expert}", Path("runs") / "demos"
-    with progress_bars({f"{config.task} {config.expert}": config.episodes}) as advance:
-        progress = partial(advance, f"{config.task} {config.expert}")
-        if shards is not None:
-            made = write_shards(config, shards, out or folder / f".{kind}.shards", workers, progress)
-            console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards", markup=False)
-            return
-        folder = write_demos(config, out or folder / f"{kind}-v0", workers, progress)
+    if shards is not None:
+        made = write_shards(config, shards, out or folder / f".{kind}.shards", workers)
+        console.print(f"{made.url}: {made.episodes} episodes in {len(made.numbers)} shards", markup=False)
+        return
+    folder = write_demos(config, out or folder / f"{kind}-v0", workers)
     import minari
 
     dataset = minari.MinariDataset(folder / "data")

@@ -24,7 +24,7 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -207,14 +207,13 @@ def record(
     return {name: np.array(values) for name, values in made.items()}, info
 
 
-def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progress: Callable[[int], None]) -> Path:
+def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:
     """Makes a dataset in parallel processes. A killed run continues when it is started again.
 
     Args:
         config: settings of the dataset.
         out: folder of the dataset, named by its id, NAME-vNUMBER. It appears when the dataset is complete.
         workers: a number of processes, or `Workers`.
-        on_progress: called with the number of episodes that have been added.
 
     Returns:
         The folder.
@@ -229,12 +228,11 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers, on_progre
     if out.exists():
         jobs.check_same(metadata_of(out)["demos"], described, out, "a dataset")
         shutil.rmtree(unfinished, ignore_errors=True)  # a kill may have left it
-        on_progress(config.episodes)
         return out
     Workers.of(workers)
     jobs.claim(unfinished, described, "dataset.json")
     try:
-        made = write_shards(config, str(unfinished / "set"), unfinished / "episodes", workers, on_progress)
+        made = write_shards(config, str(unfinished / "set"), unfinished / "episodes", workers)
         _assemble(config, made, unfinished, out)
         shutil.rmtree(unfinished, ignore_errors=True)
     finally:
@@ -247,7 +245,6 @@ def write_shards(
     url: str,
     out: Path,
     workers: int | Workers,
-    on_progress: Callable[[int], None],
     per_shard: int = shards.EPISODES,
 ) -> shards.Shards:
     """Makes a dataset of any size as shards, which `load_demos` and `StreamedDemos` read. A killed run continues.
@@ -257,7 +254,6 @@ def write_shards(
         url: folder of the set, on this machine or on any storage that fsspec knows.
         out: folder of this machine for what is unfinished.
         workers: a number of processes, or `Workers`.
-        on_progress: called with the number of episodes that have been added.
         per_shard: episodes of a shard.
 
     Raises:
@@ -266,7 +262,8 @@ def write_shards(
     described = asdict(config)
     del described["episodes"]
     about = {"demos": described, "task": repr(make_task(config.task)), "observation_version": OBSERVATION_VERSION}
-    return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, on_progress, per_shard)
+    named = f"{config.task} {config.expert}"
+    return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, named, per_shard)
 
 
 def _recorded(config: DemoConfig, episodes: Sequence[int]) -> dict[str, np.ndarray]:
