@@ -36,23 +36,19 @@ def episode(task: Task, params: BallbotParams, index: int, draw: int = 0) -> tup
     return task.sample(np.random.default_rng(seed), params)
 
 
-def drawn(task: Task, randomization: Randomization, index: int, draw: int = 0) -> tuple[float, ...]:
-    """What a randomization that moves optima draws for episode `index` of an evaluation set, the same on every machine.
-
-    A later draw takes the place of one with which nobody can do the episode.
-    """
-    if not randomization.moves_optima:
-        return ()
-    rng = np.random.default_rng([zlib.crc32(task.id.encode()), index, draw, 1])
-    return randomization.draw(tuple(rng.random(len(Randomization.DRAWN)).tolist()), task.control_dt)
-
-
 def starts(
     task: Task, params: BallbotParams, index: int, randomization: Randomization = Randomization()
 ) -> Iterator[tuple[np.ndarray, np.ndarray, tuple[float, ...]]]:
-    """Of each draw of episode `index`: initial state, constants, and what the randomization draws."""
+    """Initial state, constants and what a randomization that moves optima draws, of each draw of `episode`.
+
+    A later draw takes the place of one with which nobody can do the episode. All are the same on every machine.
+    """
     for draw in range(_MOST_DRAWS):
-        yield *episode(task, params, index, draw), drawn(task, randomization, index, draw)
+        drawn: tuple[float, ...] = ()
+        if randomization.moves_optima:
+            rng = np.random.default_rng([zlib.crc32(task.id.encode()), index, draw, 1])
+            drawn = randomization.draw(tuple(rng.random(len(Randomization.DRAWN)).tolist()), task.control_dt)
+        yield *episode(task, params, index, draw), drawn
 
 
 def folder(task: Task, params: BallbotParams, randomization: Randomization = Randomization()) -> Path:
