@@ -172,19 +172,31 @@ def test_a_folder_of_several_controllers_must_be_told_which(submitted, tmp_path)
         submit(tmp_path / "nothing", "mine", "", tmp_path)
 
 
-def test_motions_survive_the_way_through_text_and_file(rng, tmp_path):
+def test_motions_survive_the_way_through_bytes_and_file(rng, tmp_path):
     lengths = [3, 0, 5]
     motions = [
         (rng.integers(-(2**36), 2**36, (n + 1 if n else 0, 8)), rng.integers(-(2**28), 2**28, (n, 2))) for n in lengths
     ]
-    for motion in motions:
-        for sent, arrived in zip(motion, recordings.from_text(recordings.to_text(motion)), strict=True):
-            np.testing.assert_array_equal(sent, arrived)
+    grids = recordings.GRID, recordings.ACTION_GRID
+    made = [
+        recordings.Recording({}, np.array([n]), *(grid * part for grid, part in zip(grids, motion, strict=True)))
+        for n, motion in zip(lengths, motions, strict=True)
+    ]
+    arrived = [recordings.read("bytes", recordings.to_bytes(each)) for each in made]
     ran = make_task("turn"), "turn", named_robot("paper"), "rk4", "mine"
-    read = recordings.read(recordings.write_in(tmp_path, motions, *ran))
-    assert read.lengths.tolist() == lengths
-    np.testing.assert_array_equal(np.rint(read.states / recordings.GRID), np.concatenate([x for x, _ in motions]))
-    np.testing.assert_array_equal(read.actions / recordings.ACTION_GRID, np.concatenate([u for _, u in motions]))
+    joined = recordings.read(recordings.write_in(tmp_path, arrived, *ran))
+    assert joined.lengths.tolist() == lengths
+    everything = tuple(map(np.concatenate, zip(*motions, strict=True)))
+    for read, wanted in [*zip(arrived, motions, strict=True), (joined, everything)]:
+        for part, grid, whole in zip((read.states, read.actions), grids, wanted, strict=True):
+            np.testing.assert_array_equal(np.rint(part / grid), whole)
+
+
+def test_of_a_simulation_that_exploded_what_no_number_holds_is_cut_off():
+    exploded = recordings.Recording({}, np.array([1]), np.array([8 * [0.0], 8 * [-np.inf]]), np.array([[1e200, -1.0]]))
+    read = recordings.read("bytes", recordings.to_bytes(exploded))
+    assert read.states[1].tolist() == 8 * [-(2.0**36) * recordings.GRID]
+    assert read.actions[0].tolist() == [2.0**36 * recordings.ACTION_GRID, -1.0]
 
 
 ENTRIES = read_entries()

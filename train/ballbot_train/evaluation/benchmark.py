@@ -1,5 +1,6 @@
 """Every controller of every task on the certified episodes, in parallel processes and resumably."""
 
+import base64
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -203,7 +204,7 @@ def run_groups(
     for group in groups:
         entries = [entry for _ in parts for entry in next(done)]
         if record:
-            motions = [recordings.from_text(entry.pop("motion")) for entry in entries]
+            motions = [recordings.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
             task, params = make_task(group.task, group.robot), named_robot(group.robot)
             who = group.physics, group.controller, registry.policy_digest(group.controller, task, group.robot)
             recordings.write_in(out, motions, task, group.task, params, *who)
@@ -242,8 +243,8 @@ def _episode_entries(
     believed = make_task(group.task, made_for), named_robot(made_for)
     made = registry.make_packed(group.controller, packed, *believed)
     env = shown_to(made, env)
-    motions: list[recordings.Motion] = []
+    motions: list[recordings.Recording] = []
     results = run_episodes(env, made, group.controller, group.task, episodes, seed, known, motions)
     env.close()
     for result, motion in zip(results, motions, strict=True):
-        yield columns(result) | ({"motion": recordings.to_text(motion)} if record else {})
+        yield columns(result) | ({"motion": base64.b64encode(recordings.to_bytes(motion)).decode()} if record else {})

@@ -129,7 +129,7 @@ def evaluate(
         env = shown_to(controller, env)
         known = optima.known(env.task, env.params, indices, workers, env.randomization)
         named = name or _name(policy), name_of(env.task) or type(env.task).__name__.lower()
-        motions: list[recordings.Motion] = []
+        motions: list[recordings.Recording] = []
         results = run_episodes(env, controller, *named, indices, 0, known, motions)
         row = summarize(results)
         if out is not None:
@@ -176,7 +176,7 @@ def run_episodes(
     episodes: Iterable[int],
     seed: int = 0,
     known: certified.EvaluationSet | None = None,
-    motions: list[recordings.Motion] | None = None,
+    motions: list[recordings.Recording] | None = None,
 ) -> list[Result]:
     """Runs certified episodes under any controller; one that finds no plan has failed the episode.
 
@@ -216,6 +216,6 @@ def run_episodes(
                 "effort": float(np.hypot(*run.trajectory.u.T).mean()),
             }
         if motions is not None:
-            motions.append(recordings.rounded(None if run is None else run.trajectory, env.params))
+            motions.append(recordings.of_episode(None if run is None else run.trajectory, env.params))
         results.append(Result(task, name, i, env.physics, optimum=float(known.costs[i]), **measures))
     return results

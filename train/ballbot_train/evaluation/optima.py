@@ -95,12 +95,12 @@ def compute(
     jobs.make_folder(folder)
     lock = filelock.FileLock(folder / "computing.lock")
     try:
-        lock.acquire(timeout=0)
+        held = lock.acquire(timeout=0)
     except filelock.Timeout:
         console.print(f"another process computes optima of {task.id}; waiting for it")
-        lock.acquire()
+        held = lock.acquire()
     failures = []
-    try:
+    with held:
         missing = [i for i in needed if certified.from_cache(task, params, [i], randomization) is None]
         if not missing:
             return
@@ -119,8 +119,6 @@ def compute(
                     failures.append(f"episode {index}: {found}")
                 else:
                     found.save(task, cache.path(task, params, index, randomization), params, randomization)
-    finally:
-        lock.release()
     if failures:
         raise PlanError(
             f"no optimum of {task.id} for\n"

@@ -13,10 +13,8 @@ An .npz file holds
 | actions | (5, 2, steps) uint8 | all actions in turn |
 """
 
-import base64
 import json
 import re
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,9 +42,6 @@ _ARRAYS = {"about", "lengths", "states", "actions"}
 _BYTES = 5  # of a second difference
 _MOST = 2**36  # grid units, of which no second difference needs more
 
-Motion = tuple[np.ndarray, np.ndarray]
-"""States (n+1, 8) and actions (n, 2) of an episode, both int64, in units of the grids; (0, 8) and (0, 2) without a plan."""
-
 
 @dataclass(frozen=True)
 class Recording:
@@ -60,31 +55,16 @@ class Recording:
     actions: np.ndarray
 
 
-def rounded(trajectory: Trajectory | None, params: BallbotParams) -> Motion:
-    """The motion of an episode on the grids. What no whole number holds, as of a simulation that exploded, is cut off."""
+def of_episode(trajectory: Trajectory | None, params: BallbotParams) -> Recording:
+    """What was done in one episode; None is that no plan was found."""
     if trajectory is None:
-        return np.zeros((0, 8), np.int64), np.zeros((0, 2), np.int64)
-    parts = trajectory.x / GRID, trajectory.u / params.force_limit / ACTION_GRID
-    states, actions = (np.rint(np.clip(part, -_MOST, _MOST)).astype(np.int64) for part in parts)
-    return states, actions
-
-
-def to_text(motion: Motion) -> str:
-    """A motion as text, for what holds JSON."""
-    return base64.b64encode(zlib.compress(b"".join(part.astype("<i8").tobytes() for part in motion))).decode()
-
-
-def from_text(text: str) -> Motion:
-    """The motion of what `to_text` gave."""
-    numbers = np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i8")
-    steps = len(numbers) // 10
-    states = 8 * (steps + 1) if len(numbers) else 0
-    return numbers[:states].reshape(-1, 8), numbers[states:].reshape(-1, 2)
+        return Recording({}, np.zeros(1, np.int64), np.zeros((0, 8)), np.zeros((0, 2)))
+    return Recording({}, np.array([len(trajectory.u)]), trajectory.x, trajectory.u / params.force_limit)
 
 
 def write_in(
     out: Path,
-    motions: Sequence[Motion],
+    episodes: Sequence[Recording],
     task: Task,
     name: str,
     robot: BallbotParams,
@@ -106,10 +86,9 @@ def write_in(
         "policy": policy,
         "versions": {key: str(made_by[key]) for key in ("version", "commit", "python", "numpy")},
     }
-    states, actions = (np.concatenate(parts) for parts in zip(*motions, strict=True))
-    lengths = np.array([len(part) for _, part in motions])
+    joined = (np.concatenate([getattr(each, part) for each in episodes]) for part in ("lengths", "states", "actions"))
     path = out / FOLDER / file_of(name, about["robot"], Path(controller).stem)
-    return write(path, about, Recording({}, lengths, GRID * states, ACTION_GRID * actions))
+    return write(path, about, Recording(about, *joined))
 
 
 def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
@@ -119,19 +98,24 @@ def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
 
 def write(path: Path, about: Mapping[str, Any], recording: Recording) -> Path:
     """Writes a recording, with other words about it."""
-    states, actions = (
-        np.rint(part / grid).astype(np.int64)
-        for part, grid in ((recording.states, GRID), (recording.actions, ACTION_GRID))
-    )
-    text = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    arrays = {"about": text, "lengths": recording.lengths.astype(np.uint32)}
-    return files.write_npz(path, arrays | {"states": _packed(states), "actions": _packed(actions)})
+    return files.write(path, to_bytes(recording, about))
+
+
+def to_bytes(recording: Recording, about: Mapping[str, Any] = {}) -> bytes:
+    """The content of a recording's file, with other words about it."""
+    arrays = {
+        "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
+        "lengths": recording.lengths.astype(np.uint32),
+        "states": _packed(recording.states / GRID),
+        "actions": _packed(recording.actions / ACTION_GRID),
+    }
+    return files.npz(arrays)
 
 
 def read(path: str | Path, content: bytes | None = None) -> Recording:
     """What `write` wrote. Sizes are checked before anything is unpacked, and nothing in the file is executed.
 
-    Args: content: of the file, if it is read already.
+    Args: content: as `to_bytes` gives it, if it is read already.
 
     Raises:
         FileError: it is missing, damaged, too large, or no recording.
@@ -157,8 +141,12 @@ def read(path: str | Path, content: bytes | None = None) -> Recording:
     )
 
 
-def _packed(whole: np.ndarray) -> np.ndarray:
-    """The second differences of int64 (n, m) along n, as planes of their bytes (5, m, n); small numbers have zeros there."""
+def _packed(values: np.ndarray) -> np.ndarray:
+    """The second differences of (n, m) along n, as planes of their bytes (5, m, n); small numbers have zeros there.
+
+    Values are rounded. What no whole number holds, as of a simulation that exploded, is cut off.
+    """
+    whole = np.rint(np.clip(values, -_MOST, _MOST)).astype(np.int64)
     differences = np.diff(whole, 2, axis=0, prepend=np.zeros((2, whole.shape[1]), np.int64))
     zigzag = np.ascontiguousarray(((differences << 1) ^ (differences >> 63)).T.astype("<u8"))
     return zigzag.view(np.uint8).reshape(whole.shape[1], -1, 8).transpose(2, 0, 1)[:_BYTES]
