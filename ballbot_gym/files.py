@@ -92,10 +92,8 @@ def read_npz(path: str | Path, limit: int = READ_LIMIT, content: bytes | None = 
     """
     content = read(path, limit) if content is None else content
     members = unzipped(content, path, limit, ".npz file")
+    read_array = np.lib.format.read_array  # it loads no objects, and fails where an array is shorter than it says
     try:
-        read_array = (
-            np.lib.format.read_array
-        )  # which loads no objects, and fails where an array is shorter than it says
         return {name.removesuffix(".npy"): read_array(io.BytesIO(array)) for name, array in members.items()}
     except Exception as error:  # NumPy's headers have dozens of ways to fail, and all mean the same
         raise FileError(f"{path} is no .npz file, or a damaged one: {error}") from error

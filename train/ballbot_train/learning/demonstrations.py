@@ -25,10 +25,12 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
+from unittest.mock import patch
 
 import gymnasium
 import minari
@@ -100,20 +102,6 @@ class DemoConfig:
         return seeding.of_episode(self.seed + 1, i)
 
 
-Recording = dict[str, np.ndarray]
-"""One episode of T steps under an expert.
-
-| array | shape | |
-|---|---|---|
-| observations | (T+1, no) float32 | |
-| states | (T+1, 8) | order and units in `dynamics.STATE` |
-| labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
-| actions | (T, 2) float32 | executed |
-| rewards | (T,) | |
-| terminations, truncations | (T,) bool | |
-"""
-
-
 class Expert:
     """A controller as a teacher: it gives its action in states of an episode that others control, and replans if told to."""
 
@@ -165,7 +153,7 @@ def record(
     pushes: float,
     seed: int | None = None,
     options: dict[str, Any] | None = None,
-) -> tuple[Recording, dict[str, Any]]:
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Records an episode of an expert under noise and pushes.
 
     Args:
@@ -178,7 +166,16 @@ def record(
         options: as for `env.reset`.
 
     Returns:
-        The recording and the last step's info.
+        The arrays of a shard of this episode of T steps, and the last step's info:
+
+        | array | shape | |
+        |---|---|---|
+        | observations | (T+1, no) float32 | |
+        | states | (T+1, 8) | order and units in `dynamics.STATE` |
+        | labels | (T, 2) float32 | the expert's actions, in [−1, 1] |
+        | actions | (T, 2) float32 | executed |
+        | rewards | (T,) | |
+        | terminations, truncations | (T,) bool | |
 
     Raises:
         PlanError: the expert has no plan from the start.
@@ -222,7 +219,11 @@ def write_demos(config: DemoConfig, out: Path, workers: int | Workers) -> Path:
         ValueError: `out` is not named as a dataset, or holds another one.
         PlanError: no episode could be started.
     """
-    out = dataset_folder(out)
+    out = Path(out).absolute()
+    try:
+        parse_dataset_id(out.name)
+    except (ValueError, TypeError):
+        raise ValueError(f"a dataset's folder is named NAME-vNUMBER, as stabilize-trajopt-v0, not {out.name}") from None
     described = asdict(config)
     unfinished = out.with_name(f".{out.name}.unfinished")
     if out.exists():
@@ -299,20 +300,6 @@ def _recorded(config: DemoConfig, episodes: Sequence[int]) -> dict[str, np.ndarr
     }
 
 
-def dataset_folder(out: Path) -> Path:
-    """The absolute path of a dataset's folder.
-
-    Raises:
-        ValueError: the folder's name cannot be a dataset's id.
-    """
-    out = Path(out).absolute()
-    try:
-        parse_dataset_id(out.name)
-    except (ValueError, TypeError):
-        raise ValueError(f"a dataset's folder is named NAME-vNUMBER, as stabilize-trajopt-v0, not {out.name}") from None
-    return out
-
-
 def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Path) -> None:
     """Writes the dataset under a temporary name, and renames it."""
     parts = [arrays for arrays in made if arrays]
@@ -323,26 +310,18 @@ def _assemble(config: DemoConfig, made: shards.Shards, unfinished: Path, out: Pa
     shutil.rmtree(root, ignore_errors=True)
     task = make_task(config.task, config.robot)
     env = gymnasium.make(task.id, physics=config.physics, robot=config.robot)
-    before = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(root)  # Minari offers no other way to choose the folder
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
-            dataset = minari.create_dataset_from_buffers(
-                dataset_id=out.name,
-                buffer=[each for arrays in parts for each in _buffers(arrays)],
-                env=env,
-                algorithm_name=config.expert,
-                description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
-                requirements=[f"ballbot-gym>={importlib.metadata.version('ballbot-gym')}"],
-                data_format="hdf5",
-            )
-    finally:
-        if before is None:
-            del os.environ["MINARI_DATASETS_PATH"]
-        else:
-            os.environ["MINARI_DATASETS_PATH"] = before
-        env.close()
+    # Minari offers no other way to choose the folder
+    with closing(env), patch.dict(os.environ, MINARI_DATASETS_PATH=str(root)), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*is set to None.*")  # authors, whom a run does not know
+        dataset = minari.create_dataset_from_buffers(
+            dataset_id=out.name,
+            buffer=[each for arrays in parts for each in _buffers(arrays)],
+            env=env,
+            algorithm_name=config.expert,
+            description=f"{config.expert} on {task.id}, with exploration; see ballbot_train.learning.demonstrations.",
+            requirements=[f"ballbot-gym>={importlib.metadata.version('ballbot-gym')}"],
+            data_format="hdf5",
+        )
     dataset.storage.update_episode_metadata(about)
     dataset.storage.update_metadata(
         {"task": repr(task), "observation_version": OBSERVATION_VERSION, "demos": asdict(config)}
