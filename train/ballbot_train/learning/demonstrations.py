@@ -262,7 +262,11 @@ def write_shards(
     """
     described = asdict(config)
     del described["episodes"]
-    about = {"demos": described, "task": repr(make_task(config.task)), "observation_version": OBSERVATION_VERSION}
+    about = {
+        "demos": described,
+        "task": repr(make_task(config.task, config.robot)),
+        "observation_version": OBSERVATION_VERSION,
+    }
     named = f"{config.task} {config.expert}"
     return shards.make(url, about, config.episodes, partial(_recorded, config), out, workers, named, per_shard)
 
