@@ -125,7 +125,7 @@ def test_ppo_trains_on_from_a_policy_of_any_shape_and_its_critic_first(linear):
     assert not torch.equal(parameters(learner), given_weights)
     seen = 9 * observed(50, 9)
     with torch.no_grad():
-        expected = learner._actor.network(seen)
+        expected = learner._actor(seen)
     np.testing.assert_allclose(learner._model.predict(seen.numpy(), deterministic=True)[0], expected, atol=1e-6)
     second = started(seed=1)
     second.load_state_dict(through_a_file(run(started(), 3).state_dict()))

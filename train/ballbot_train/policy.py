@@ -5,7 +5,7 @@ This module imports torch; `policy_files` reads descriptions without it.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.rollout import ActionController
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.symmetry import FRAMES, REACH
+from ballbot_gym.tasks.symmetry import REACH
 from ballbot_train.policy_files import (
     OBSERVATION_VERSION,
     PolicyError,
@@ -28,7 +28,7 @@ from ballbot_train.policy_files import (
     paths_of,
     read_description,
 )
-from ballbot_train.routes import Routes
+from ballbot_train.routes import Routes, stacked
 from ballbot_train.weights import checked, linear_layers, own_precision
 
 try:
@@ -63,16 +63,18 @@ class PolicyNetwork(torch.nn.Module):
         super().__init__()
         self.spec = spec
         own: dict[str, Any] = {"device": device, "dtype": torch.float32}  # whatever torch's defaults are
-        self._frame = None if spec.frame is None else FRAMES[spec.frame]
         told, none = [1] * _TOLD * spec.informed, ((-1,) * spec.observations, (-1,) * spec.actions)
         self._mirrors = [
             (torch.tensor([*signs, *(spec.history * (*signs, *action)), *told], **own), torch.tensor(action, **own))
             for signs, action in (*spec.mirrors, *[none] * (spec.odd and spec.informed))
         ]
-        self.routes = Routes(spec.frame, spec.routes, device) if spec.frame is not None and spec.routes else None
-        inputs = spec.observations if self._frame is None else self._frame.size
-        inputs += spec.history * (inputs + spec.actions) + _TOLD * spec.informed
-        self._steady = self._frame.steady if self._frame is not None and spec.centred else None
+        self._frame = spec.seen_in
+        self.present = spec.observations if self._frame is None else self._frame.size
+        """Numbers of the present observation as the frame shows it."""
+        self.routes = None
+        if self._frame is not None and self._frame.route is not None:
+            self.routes = Routes(self._frame.route, spec.routes, device)
+        inputs = self.present + spec.history * (self.present + spec.actions) + _TOLD * spec.informed
         self.linear = torch.nn.Linear(inputs, spec.actions, bias=not spec.odd, **own) if spec.linear else None
         widths = (inputs, *spec.hidden, spec.actions)
         self.mlp = linear_layers(widths, _ACTIVATIONS[spec.activation], bias=not spec.odd, **own)
@@ -100,25 +102,27 @@ class PolicyNetwork(torch.nn.Module):
         told = observation[..., :0]
         if self.spec.informed:
             observation, told = observation[..., :-_TOLD], (observation[..., -_TOLD:] - 1.0) / _TOLD_SCALE
-        if self._frame is not None and observation.ndim == 1 and torch.is_inference_mode_enabled():
-            # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
-            seen = tuple(observation.tolist())
-            features, back = self.features(seen if self.routes is None else seen + self.routes.alone(seen))
-            output = self._in_frame((*features, *told.tolist()), observation.new_tensor)
-            forwards, sideways = output.tolist()
-            return observation.new_tensor(back((forwards, sideways)))
-        if self.routes is not None:
-            observation = self.routes.behind(observation)
         if self._frame is not None:
-            features, back = self.features(observation.unbind(-1))
-            action = self._in_frame((*features, *told.unbind(-1)), lambda values: torch.stack(values, -1))
-            return torch.stack(back((action[..., 0], action[..., 1])), -1)
+            # one observation at a time: a frame's many small steps take plain numbers a tenth of what they take tensors
+            plain = observation.ndim == 1 and torch.is_inference_mode_enabled()
+            features, back = self.features(self._seen(observation, plain))
+            features = (*features, *(told.tolist() if plain else told.unbind(-1)))
+            action = self.centred(self._sum(stacked(features, observation)), features)
+            if self.spec.squash == "tanh_in_frame":
+                action = REACH * torch.tanh(action)
+            return stacked(back(tuple(action.tolist()) if plain else action.unbind(-1)), observation)
         if self.spec.informed:
             observation = torch.cat([observation, told], -1)
         total = self._sum(observation)
         for signs, action_signs in self._mirrors:
             total = total + action_signs * self._sum(signs * observation)
         return total / (1 + len(self._mirrors)) if self._mirrors else total
+
+    def _seen(self, observation: torch.Tensor, plain: bool = False) -> tuple[Any, ...]:
+        """The numbers of an observation, and behind them the sides of routes, if any; then no gradient goes back."""
+        observation = observation if self.routes is None else observation.detach()
+        numbers = tuple(observation.tolist()) if plain else observation.unbind(-1)
+        return numbers if self.routes is None else (*numbers, *self.routes.sides(numbers))
 
     def features(self, observation: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
         """Features of the present observation, and behind them those of the past ones with their actions; the way back."""
@@ -136,53 +140,39 @@ class PolicyNetwork(torch.nn.Module):
             features = (*features, *then, *(a * x + b * y for a, b in axes))
         return features, back
 
-    def _in_frame(self, features: tuple[Any, ...], stack: Callable[[Any], torch.Tensor]) -> torch.Tensor:
-        """Action in the frame (..., 2) before it is squashed; stack: makes tensors (..., n) of n values."""
-        output = self._sum(stack(features))
-        if self._steady is not None:
-            output = centred(output, features, self._sum, self.kept, self.spec.squash, stack)
-        return REACH * torch.tanh(output) if self.spec.squash == "tanh_in_frame" else output
+    def shown(self, observation: torch.Tensor) -> torch.Tensor:
+        """(B, no + past) to (B, `present` + past): the present observation as the frame shows it, the past as it is."""
+        if self._frame is None:
+            return observation
+        own, past = observation[..., : self.spec.observations], observation[..., self.spec.observations :]
+        features, _ = self._frame.features(self._seen(own))
+        return torch.cat([stacked(features, observation), past], -1)
+
+    def centred(self, output: torch.Tensor, features: tuple[Any, ...]) -> torch.Tensor:
+        """The network's output (..., 2) for features of its frame, before it is squashed. A centred policy's is less what the
+        network gives in the steady motion, and has what keeps that motion instead.
+        """
+        if not self.spec.centred:
+            return output
+        kept, action = self.kept(features)
+        output = output - self._sum(stacked(kept, output))
+        needed = stacked(action, output)
+        if self.spec.squash != "clip":
+            reach = REACH if self.spec.squash == "tanh_in_frame" else 1
+            needed = (needed / reach).clamp(-0.999, 0.999).atanh()
+        return output + needed
 
     def kept(self, features: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, Any]]:
         """Features of the steady motion, as if it had gone on for all of the history, and the action that keeps it."""
-        assert self._steady is not None
         assert self._frame is not None
-        kept, action = self._steady(features[: self._frame.size])
-        told = features[self._frame.size :] if self.spec.informed else ()
+        assert self._frame.steady is not None
+        kept, action = self._frame.steady(features[: self.present])
+        told = features[self.present :] if self.spec.informed else ()
         return (*kept, *(self.spec.history * (*kept, *action)), *told), action
 
     def _sum(self, inputs: torch.Tensor) -> torch.Tensor:
         output = self.mlp(inputs)
         return output if self.linear is None else output + self.linear(inputs)
-
-
-def centred(
-    output: torch.Tensor,
-    features: tuple[Any, ...],
-    network: Callable[[torch.Tensor], torch.Tensor],
-    steady: Callable[[tuple[Any, ...]], tuple[tuple[Any, ...], tuple[Any, Any]]],
-    squash: str,
-    stack: Callable[[Any], torch.Tensor],
-) -> torch.Tensor:
-    """A network's output (..., 2), less what it is in the frame's steady motion, and what keeps that motion instead.
-
-    Args:
-        output: of the network for these features, before it is squashed.
-        features: of the frame.
-        network: from features (..., size) to outputs (..., 2).
-        steady: as of `Frame`.
-        squash: as of `PolicySpec`.
-        stack: makes tensors (..., n) of n values.
-    """
-    kept, action = steady(features)
-    return output - network(stack(kept)) + _unsquashed(stack(action), squash)
-
-
-def _unsquashed(action: torch.Tensor, squash: str) -> torch.Tensor:
-    """What a network has to give for an action (..., 2) in the world or a frame, before it is squashed."""
-    if squash == "clip":
-        return action
-    return (action / (REACH if squash == "tanh_in_frame" else 1)).clamp(-0.999, 0.999).atanh()
 
 
 class PolicyController(ActionController):
@@ -241,10 +231,9 @@ def load_network(path: str | Path, task: Task, robot: str | None = PAPER) -> Pol
     described = read_description(path)["spec"]
     try:
         spec = PolicySpec.read(described)
-    except KeyError as error:
-        raise PolicyError(f"{description_path} is not a policy: its spec has no {error}") from error
-    except (ValueError, TypeError) as error:
-        raise PolicyError(f"{description_path} is not a policy: {error}") from error
+    except (KeyError, ValueError, TypeError) as error:
+        lacks = "its spec has no " if isinstance(error, KeyError) else ""
+        raise PolicyError(f"{description_path} is not a policy: {lacks}{error}") from error
     trained_on, wanted = (text.split("(")[0] if robot is None else text for text in (spec.task, task.problem()))
     if trained_on != wanted:
         raise PolicyError(f"{description_path} was trained on {trained_on}, not on {wanted}")

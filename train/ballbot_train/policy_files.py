@@ -14,7 +14,7 @@ from ballbot_gym.checks import check_history
 from ballbot_gym.randomization import ROBOT_FACTORS, TRACKS
 from ballbot_gym.robots import PAPER, ROBOTS, file_name, named_robot
 from ballbot_gym.tasks import TASKS, Task
-from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_gym.tasks.symmetry import FRAMES, Frame
 
 OBSERVATION_VERSION = 1
 """Raised whenever what any task observes changes, so that older policies are refused instead of misled."""
@@ -113,12 +113,19 @@ class PolicySpec:
                 )
         if self.odd and self.activation != "tanh":
             raise ValueError(f"odd needs the activation tanh, not {self.activation}")
-        if bool(self.routes) != (self.frame in FRAMES and FRAMES[self.frame].route is not None):
+        if self.frame not in (None, *FRAMES):
+            raise ValueError(f"no frame {self.frame!r}; known: {', '.join(FRAMES)}")
+        if bool(self.routes) != (self.seen_in is not None and self.seen_in.route is not None):
             raise ValueError(
                 f"routes must be given for a frame with a route, and for no other, not for {self.frame!r:.200}"
             )
-        if self.centred and (self.frame not in FRAMES or FRAMES[self.frame].steady is None):
+        if self.centred and (self.seen_in is None or self.seen_in.steady is None):
             raise ValueError(f"centred needs a frame with a steady motion, not {self.frame!r:.200}")
+
+    @property
+    def seen_in(self) -> Frame | None:
+        """The frame in which the network sees and acts."""
+        return None if self.frame is None else FRAMES[self.frame]
 
     @property
     def actions(self) -> int:
@@ -138,15 +145,12 @@ class PolicySpec:
         Raises:
             KeyError, TypeError, ValueError: it describes none.
         """
-        layers = {"hidden": described["hidden"], "routes": described.get("routes", ())}
-        for name, units in layers.items():
-            if not isinstance(units, list | tuple):
-                raise ValueError(f"{name} must be a list of whole numbers, not {units!r:.200}")
-        mirrors = tuple((tuple(signs), tuple(action)) for signs, action in described.get("mirrors", ()))
-        if described.get("frame") not in (None, *FRAMES):
-            raise ValueError(f"no frame {described['frame']!r}; known: {', '.join(FRAMES)}")
-        shapes = {name: tuple(units) for name, units in layers.items()}
-        fields: dict[str, Any] = {**described, **shapes, "mirrors": mirrors}
+        fields: dict[str, Any] = {"routes": (), "mirrors": (), **described}
+        for name in ("hidden", "routes"):
+            if not isinstance(fields[name], list | tuple):
+                raise ValueError(f"{name} must be a list of whole numbers, not {fields[name]!r:.200}")
+            fields[name] = tuple(fields[name])
+        fields["mirrors"] = tuple((tuple(signs), tuple(action)) for signs, action in fields["mirrors"])
         return cls(**fields)
 
     @classmethod

@@ -7,10 +7,11 @@ episode, so it does not waver.
 
 import functools
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 from ballbot_gym.lazy import missing
-from ballbot_gym.tasks.symmetry import FRAMES
+from ballbot_gym.tasks.symmetry import Route
 from ballbot_train.weights import linear_layers
 
 try:
@@ -25,12 +26,10 @@ class Routes(torch.nn.Module):
     Its outputs, before the greatest is taken, belong to the 2^n choices of obstacles that are passed on the farther side.
     """
 
-    def __init__(self, frame: str, hidden: tuple[int, ...], device: str = "cpu"):
-        """Args: frame: name in `FRAMES` of one with sides; hidden: units of the hidden layers; device: of the weights."""
+    def __init__(self, route: Route, hidden: tuple[int, ...], device: str = "cpu"):
+        """Args: route: of a frame; hidden: units of the hidden layers; device: of the weights."""
         super().__init__()
         own: dict[str, Any] = {"device": device, "dtype": torch.float32}
-        route = FRAMES[frame].route
-        assert route is not None
         self.route = route
         self.mlp = linear_layers((3 * route.obstacles, *hidden, 2**route.obstacles), torch.nn.Tanh, **own)
         self._choices: torch.Tensor
@@ -42,18 +41,20 @@ class Routes(torch.nn.Module):
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(..., n) 1 for every obstacle that is passed on its left, −1 on its right, of observations (..., no)."""
-        best = self.mlp(self.layout(observation)).argmax(-1)
-        return torch.stack(self.route.sides(observation.unbind(-1), self._choices[best].unbind(-1)), -1)
+        return torch.stack(self.sides(observation.unbind(-1)), -1)
 
-    def alone(self, observation: tuple[float, ...]) -> tuple[float, ...]:
-        """The sides (n) of one observation (no), in plain numbers, which take less time than tensors do."""
-        best = int(self.mlp(self._choices.new_tensor(self.route.layout(observation))).argmax())
-        return self.route.sides(observation, farther_choices(self.route.obstacles)[best])
-
-    def behind(self, observation: torch.Tensor) -> torch.Tensor:
-        """(..., no + n) observations with the sides behind them, as the frame's features take them."""
+    def sides(self, seen: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The same (n) for the numbers of an observation (no), which are tensors or plain ones. No gradient reaches them."""
         with torch.no_grad():
-            return torch.cat([observation, self(observation)], -1)
+            best = self.mlp(stacked(self.route.layout(seen), self._choices)).argmax(-1)
+            if isinstance(seen[0], torch.Tensor):
+                return self.route.sides(seen, self._choices[best].unbind(-1))
+            return self.route.sides(seen, farther_choices(self.route.obstacles)[int(best)])
+
+
+def stacked(values: Sequence[Any], like: torch.Tensor) -> torch.Tensor:
+    """(..., n) of n tensors (...), or of n plain numbers a tensor as another one is."""
+    return torch.stack(tuple(values), -1) if isinstance(values[0], torch.Tensor) else like.new_tensor(values)
 
 
 @functools.cache

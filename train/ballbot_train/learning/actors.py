@@ -1,7 +1,7 @@
 """The shapes of actors that respect the symmetry of their task, and running averages of actors."""
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch.optim.swa_utils import AveragedModel
@@ -40,53 +40,59 @@ def spec_for(
     Raises:
         ValueError: the task does not have the symmetry that the settings ask for.
     """
-    fields: dict[str, Any] = {"hidden": hidden, "linear": linear, "squash": "tanh" if linear else "clip"}
-    fields |= {"history": history, "informed": informed}
-    frame, missing = None, ""
     symmetry = "none" if named_robot(robot).wheels is not None else symmetry
-    if symmetry == "odd":
-        fields["odd"] = True
-        missing = "" if any(set(mirror.state) == {-1} for mirror in task.mirrors) else "odd symmetry"
-    elif symmetry == "mirrors":
-        fields["mirrors"] = tuple((task.observation_signs(mirror), mirror.action) for mirror in task.mirrors)
-        missing = "" if task.mirrors else "mirror images"
-    elif symmetry == "routes":
-        frame, missing, fields["routes"] = task.routed_frame, "routes", _ROUTES
-    elif symmetry == "frame":
-        frame, missing = task.frame, "frame"
-    elif symmetry == "fine_frame":
-        frame, missing = task.fine_frame, "fine frame"
-    elif symmetry == "centred":
-        frame, missing, fields["centred"] = task.fine_frame or task.frame, "frame with a steady motion", True
-        frame = frame if frame is not None and FRAMES[frame].steady is not None else None
-    if frame is not None:
-        fields["frame"] = frame
-    elif missing:
+    steady = task.fine_frame or task.frame
+    frames = {
+        "routes": task.routed_frame,
+        "frame": task.frame,
+        "fine_frame": task.fine_frame,
+        "centred": steady if steady is not None and FRAMES[steady].steady is not None else None,
+    }
+    lacks = {
+        "odd": not any(set(mirror.state) == {-1} for mirror in task.mirrors) and "odd symmetry",
+        "mirrors": not task.mirrors and "mirror images",
+        "centred": not frames["centred"] and "frame with a steady motion",
+    }
+    missing = lacks.get(symmetry, frames.get(symmetry, "") is None and symmetry.replace("_", " "))
+    if missing:
         others = 'give "none", "mirrors", "frame" or another as its symmetry'
         raise ValueError(f"{task.id} has no {missing}; {others}")
-    return PolicySpec.of(task, robot, **fields)
-
-
-def retargeted(start: PolicySpec, mine: PolicySpec) -> PolicySpec:
-    """The shape of a policy to start from, perhaps of another robot and its episodes, for the task and robot of `mine`."""
-    return replace(
-        start, task=mine.task, robot=mine.robot, history=mine.history, informed=start.informed or mine.informed
+    mirrors = task.mirrors if symmetry == "mirrors" else ()
+    return PolicySpec.of(
+        task,
+        robot,
+        hidden=hidden,
+        linear=linear,
+        odd=symmetry == "odd",
+        frame=frames.get(symmetry),
+        routes=_ROUTES if symmetry == "routes" else (),
+        centred=symmetry == "centred",
+        mirrors=tuple((task.observation_signs(mirror), mirror.action) for mirror in mirrors),
+        squash="tanh" if linear else "clip",
+        history=history,
+        informed=informed,
     )
 
 
-def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
-    """A policy to start from, with the history of `mine`: what it sees or is told more it makes nothing of at first.
+def started(network: PolicyNetwork, mine: PolicySpec, any_shape: bool = True) -> PolicyNetwork:
+    """A policy to start from, perhaps of another robot and its episodes, for the task, robot and history of `mine`.
+
+    What it sees or is told more it makes nothing of at first.
 
     Raises:
-        ValueError: it sees a longer past than `mine`, or is told more, or commands another number of motors.
+        ValueError: it sees a longer past than `mine`, or is told more, or commands another number of motors; or its shape is
+            another, and not any is admitted.
     """
-    spec = retargeted(network.spec, mine)
-    if network.spec.history > mine.history:
-        raise ValueError(f"the policy to start from sees {network.spec.history} earlier observations; give --history")
+    start, informed = network.spec, network.spec.informed or mine.informed
+    spec = replace(start, task=mine.task, robot=mine.robot, history=mine.history, informed=informed)
+    if spec != mine and not any_shape:
+        raise ValueError(f"a policy of {start} cannot start one of {mine}; give --hidden or --symmetry")
+    if start.history > mine.history:
+        raise ValueError(f"the policy to start from sees {start.history} earlier observations; give --history")
     if spec.informed != mine.informed:
         raise ValueError("the policy to start from is told the robot; give --informed")
-    if (spec.actions, spec.observations) != (network.spec.actions, network.spec.observations):
-        raise ValueError(f"a policy of {network.spec.robot} cannot start one of {mine.robot}, which has other motors")
+    if (spec.actions, spec.observations) != (start.actions, start.observations):
+        raise ValueError(f"a policy of {start.robot} cannot start one of {mine.robot}, which has other motors")
     made = PolicyNetwork(spec)
     weights, shapes = network.state_dict(), made.state_dict()
     for name, weight in weights.items():
@@ -94,12 +100,6 @@ def started(network: PolicyNetwork, mine: PolicySpec) -> PolicyNetwork:
         weights[name] = torch.nn.functional.pad(weight, (0, more))  # what is seen more comes last
     made.load_state_dict(weights)
     return made
-
-
-def check_start(start: PolicySpec, mine: PolicySpec) -> None:
-    """Raises a ValueError where a policy to start from differs in shape."""
-    if retargeted(start, mine) != mine:
-        raise ValueError(f"a policy of {start} cannot start one of {mine}; give --hidden or --symmetry")
 
 
 def average_of(actor: torch.nn.Module, updates: int) -> AveragedModel:

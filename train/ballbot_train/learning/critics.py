@@ -4,86 +4,54 @@ The value of a control problem is nearly a quadratic form. A tanh network alone 
 rests beside the goal. A linear path over the products of all pairs of observed quantities fits it exactly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
 
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import FRAMES
-from ballbot_train.routes import Routes
 from ballbot_train.weights import linear_layers
 
 _LEAST_COST = 0.02  # of the mean cost to go; advantages are relative to no less
 
 
-class CriticInputs:
-    """An observation as a critic sees it: in the task's frame if one is named, and with the products of its entries."""
+class QuadraticCritic(torch.nn.Module):
+    """The sum of a network and a linear path, both on what is seen and on the products of all its pairs, squares included."""
 
     def __init__(
         self,
-        observations: int,
-        products: bool = True,
-        frame: str | None = None,
-        routes: Routes | None = None,
+        entries: int,
+        hidden: Sequence[int],
+        activation: type[torch.nn.Module],
         past: int = 0,
+        shown: Callable[[torch.Tensor], torch.Tensor] = lambda observation: observation,
     ):
         """Args:
-        observations: their number.
-        products: of all pairs, squares included.
-        frame: name in `FRAMES`, or None.
-        routes: of the actor, for a frame with a route.
-        past: numbers of earlier observations and actions behind them, which are seen as they are.
+        entries: numbers that are seen.
+        hidden: units of the network's hidden layers.
+        activation: after each of them.
+        past: numbers behind the entries, without products, of earlier observations and actions.
+        shown: from observations to both, as `PolicyNetwork.shown`.
         """
-        self._routes, self._own = routes, observations if past else None
-        self._frame = None if frame is None else FRAMES[frame]
-        entries = observations if self._frame is None else self._frame.size
-        self._pairs = torch.triu_indices(entries, entries) if products else None
-        self.size = entries + (0 if self._pairs is None else self._pairs.shape[1]) + past
-        """Number of inputs."""
-
-    def __call__(self, observation: torch.Tensor) -> torch.Tensor:
-        """(B, observations + past) to (B, size)."""
-        if self._own is not None:
-            own, past = observation[..., : self._own], observation[..., self._own :]
-            return torch.cat([self._of_present(own), past], -1)
-        return self._of_present(observation)
-
-    def _of_present(self, observation: torch.Tensor) -> torch.Tensor:
-        if self._routes is not None:
-            observation = self._routes.behind(observation)
-        if self._frame is not None:
-            observation = torch.stack(self._frame.features(observation.unbind(-1))[0], -1)
-        if self._pairs is None:
-            return observation
-        first, second = self._pairs
-        return torch.cat([observation, observation[:, first] * observation[:, second]], -1)
-
-
-class QuadraticCritic(torch.nn.Module):
-    """The sum of a network and a linear path, both on what `CriticInputs` gives."""
-
-    def __init__(
-        self, inputs: CriticInputs, hidden: Sequence[int], activation: type[torch.nn.Module], value: float = 0.0
-    ):
-        """Args: hidden: units of the network's hidden layers; value: of every state at the start, about."""
         super().__init__()
-        self._inputs = inputs
-        self.mlp = linear_layers((inputs.size, *hidden, 1), activation)
-        self.linear = torch.nn.Linear(inputs.size, 1)
-        self.start_at(value)
+        self._shown, self._entries, self._pairs = shown, entries, torch.triu_indices(entries, entries)
+        size = entries + self._pairs.shape[1] + past
+        self.mlp = linear_layers((size, *hidden, 1), activation)
+        self.linear = torch.nn.Linear(size, 1)
+        self.start_flat()
 
-    def start_at(self, value: float) -> None:
-        """Makes all values about `value`."""
+    def start_flat(self) -> None:
+        """Makes all values about the linear path's bias."""
         with torch.no_grad():
             self.linear.weight.zero_()
-            self.linear.bias.fill_(value)
             cast(torch.nn.Linear, self.mlp[-1]).weight.mul_(0.1)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(B, observations) to values (B, 1)."""
-        seen = self._inputs(observation)
-        return self.mlp(seen) + self.linear(seen)
+        shown, (first, second) = self._shown(observation), self._pairs
+        seen, past = shown[:, : self._entries], shown[:, self._entries :]
+        inputs = torch.cat([seen, seen[:, first] * seen[:, second], past], -1)
+        return self.mlp(inputs) + self.linear(inputs)
 
 
 def value_of_living(task: Task, reward_scale: float, gamma: float) -> float:

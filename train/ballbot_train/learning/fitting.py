@@ -1,6 +1,6 @@
 """Supervised fitting: labelled observations, and a policy network that is fitted to them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,9 +48,9 @@ class Samples:
 class Fit:
     """Fits a network to samples: Adam on the weighted mean squared error of its actions."""
 
-    def __init__(self, network: torch.nn.Module):
-        """Args: network: from observations (n, no) to actions (n, 2)."""
-        self.network = network
+    def __init__(self, network: torch.nn.Module, act: Callable[[torch.Tensor], torch.Tensor] | None = None):
+        """Args: network: to fit; act: with it, from observations (n, no) to actions (n, 2); default, what it gives."""
+        self.network, self._act = network, act or network
         self._optimizer = torch.optim.Adam(network.parameters())
 
     def run(
@@ -61,7 +61,7 @@ class Fit:
         total = 0.0
         for _ in range(gradient_steps):
             drawn = torch.as_tensor(rng.integers(len(samples), size=min(batch_size, len(samples))))
-            error = (self.network(samples.observations[drawn]) - samples.actions[drawn]) ** 2
+            error = (self._act(samples.observations[drawn]) - samples.actions[drawn]) ** 2
             weights = samples.weights[drawn]
             loss = (weights * error.mean(1)).sum() / weights.sum()
             self._optimizer.zero_grad()

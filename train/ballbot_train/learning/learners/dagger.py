@@ -41,7 +41,7 @@ from ballbot_gym.robots import robot_name
 from ballbot_gym.rollout import PlanError
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry, check_start, spec_for, started
+from ballbot_train.learning.actors import RoutedSymmetry, spec_for, started
 from ballbot_train.learning.datasets import StreamedDemos, load_demos
 from ballbot_train.learning.fitting import Fit, Samples, start_as_lqr
 from ballbot_train.learning.routing import fit_routes
@@ -210,20 +210,15 @@ class Dagger:
         self._task, self._params, self._seed = task, params, seed
         self._randomization, self._history = randomization, history
         torch.manual_seed(seed)
-        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
-        start_as_lqr(self._network, task, params)
-        self._fit = Fit(self._network)
-        none, self._spread = np.zeros((0, self._network.spec.seen)), _SPREAD[: params.state_size]
+        self.network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
+        start_as_lqr(self.network, task, params)
+        self._fit = Fit(self.network)
+        none, self._spread = np.zeros((0, self.network.spec.seen)), _SPREAD[: params.state_size]
         self._streamed = samples if isinstance(samples, StreamedDemos) else None
         self._samples = samples if isinstance(samples, Samples) else Samples.of(none, np.zeros((0, params.action_size)))
         if start is not None:
-            check_start(start.spec, self.network.spec)
-            self.network.load_state_dict(started(start, self.network.spec).state_dict())
+            self.network.load_state_dict(started(start, self.network.spec, any_shape=False).state_dict())
             self._warm = True
-
-    @property
-    def network(self) -> PolicyNetwork:
-        return self._network
 
     def iterate(self) -> dict[str, float]:
         config, figures, routes = self.config, {}, self.network.routes
@@ -458,8 +453,7 @@ class Dagger:
         """The path on the sides that the learner's routes choose, or None where it has none."""
         if self.network.routes is None:
             return None
-        with torch.no_grad():
-            sides = self.network.routes(torch.as_tensor(np.asarray(self._task.observe(x, c)), dtype=torch.float32))
+        sides = self.network.routes(torch.as_tensor(np.asarray(self._task.observe(x, c)), dtype=torch.float32))
         return [self._task.routed_path(x, c, tuple(map(int, sides.tolist())))]
 
     def _track(self, plans: Sequence[_Plan], rng: np.random.Generator) -> None:

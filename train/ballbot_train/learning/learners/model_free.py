@@ -144,7 +144,8 @@ class ModelFree(ABC):
     def _set_model(
         self,
         model: BaseAlgorithm,
-        actor: nn.Module,
+        actor: PolicyNetwork,
+        start: PolicyNetwork | None,
         optimizers: Sequence[torch.optim.Optimizer],
         buffer: RolloutBuffer | NStepReplayBuffer,
         value_biases: Sequence[torch.Tensor],
@@ -153,18 +154,24 @@ class ModelFree(ABC):
 
         Args:
             model: PPO or SAC.
-            actor: from observation to mean action.
+            actor: the network of the mean action.
+            start: of the actor's shape, whose weights it takes.
             optimizers: the actor's first.
             buffer: of what the actor met.
             value_biases: of the outputs of all critics.
         """
         self._model: Any = model  # PPO or SAC, which both have a gamma
         self._actor, self._optimizers, self._buffer, self._value_biases = actor, optimizers, buffer, value_biases
+        if start is not None:
+            actor.load_state_dict(start.state_dict())
+        with torch.no_grad():
+            for bias in value_biases:
+                bias.fill_(self._value_of_living(self._gamma))
         self._average = average_of(actor, _AVERAGED_ITERATIONS)
         model.set_logger(Logger(folder=None, output_formats=[]))
         model._last_obs = self._env.reset()
         model._last_episode_starts = np.ones(self._settings.num_envs, bool)
-        self._imitation = None if self._demos is None else Fit(actor)
+        self._imitation = None if self._demos is None else Fit(actor, self._act)
         optimizers[0].register_step_pre_hook(self._add_imitation)
         self._random = _global_random()
 
@@ -182,14 +189,14 @@ class ModelFree(ABC):
         weigh_gradients(several, self._value_of_living(self._model.gamma))
 
     @property
-    def _kept(self) -> nn.Module:
-        """The running average of the actor; while it is cloned, the actor."""
-        return self._actor if self.iteration <= self._clone_iterations else self._average.module
-
-    @property
-    @abstractmethod
     def network(self) -> PolicyNetwork:
-        """The policy learnt so far."""
+        """The running average of the actor; while it is cloned, the actor."""
+        cloned = self.iteration <= self._clone_iterations
+        return self._actor if cloned else cast(PolicyNetwork, self._average.module)
+
+    @abstractmethod
+    def _act(self, seen: torch.Tensor) -> torch.Tensor:
+        """The mean actions (n, 2) of the actor for observations (n, no), both as the envs show them."""
 
     def _raise_gamma(self, gamma: float) -> None:
         """Sets the discount factor, and moves all values by what it changes in the value of living for ever."""
@@ -310,7 +317,7 @@ class ModelFree(ABC):
         """Adds the gradient of the imitation loss, in demonstrated states that are drawn, to that of a step of the actor."""
         if self._demos is not None and not self._critic_only:
             drawn = torch.randint(len(self._demos), (_CLONE_BATCH,))
-            actions = self._actor(self._demos.observations[drawn])
+            actions = self._act(self._demos.observations[drawn])
             loss = nn.functional.mse_loss(actions, self._demos.actions[drawn])
             (self._imitation_weight * (1 - self._progress) * loss).backward()
 

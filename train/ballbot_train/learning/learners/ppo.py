@@ -4,7 +4,7 @@
 complex dexterous manipulation with deep reinforcement learning and demonstrations", 2018.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +21,7 @@ from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
-from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, relative_advantages
+from ballbot_train.learning.critics import QuadraticCritic, relative_advantages
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
 from ballbot_train.policy import PolicyNetwork
@@ -147,32 +147,25 @@ class RelativeRollouts(RolloutBuffer):
         self.advantages = relative_advantages(returns, values, self._living(self.gamma)).numpy()
 
 
-class MeanAction(torch.nn.Module):
-    """A policy network as the mean of the actions: before its output is clipped, so that the gradient does not end there."""
-
-    def __init__(self, network: PolicyNetwork):
-        super().__init__()
-        self.network = network
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        network = self.network
-        return network(observation) if network.spec.squash == "tanh" else network.raw(observation)
+def _mean(network: PolicyNetwork, observation: torch.Tensor) -> torch.Tensor:
+    """The mean of the actions: before the policy's output is clipped, so that the gradient does not end there."""
+    return network(observation) if network.spec.squash == "tanh" else network.raw(observation)
 
 
-class Branches(torch.nn.Module):
-    """Actor and critic in the place of SB3's `MlpExtractor`. Their outputs are mean actions and values."""
+class Branches(MlpExtractor):
+    """Actor and critic as SB3's networks, whose outputs are mean actions and values."""
 
     latent_dim_pi, latent_dim_vf = 2, 1
 
-    def __init__(self, actor: MeanAction, critic: QuadraticCritic):
-        super().__init__()
-        self.actor, self.critic = actor, critic
-
-    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.actor(features), self.critic(features)
+    def __init__(self, spec: PolicySpec):
+        """Args: spec: of the actor; the critic sees the present in its frame."""
+        torch.nn.Module.__init__(self)
+        self.actor = PolicyNetwork(spec)
+        seen, past = self.actor.present, spec.seen - spec.observations
+        self.critic = QuadraticCritic(seen, spec.hidden, torch.nn.Tanh, past, self.actor.shown)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        return self.actor(features)
+        return _mean(self.actor, features)
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
         return self.critic(features)
@@ -181,46 +174,27 @@ class Branches(torch.nn.Module):
 class BranchedPolicy(ActorCriticPolicy):
     """SB3's policy around an actor that respects a symmetry and a critic that sees products."""
 
-    def __init__(
-        self, *args: Any, spec: PolicySpec, weights: Mapping[str, Any] | None, value: float, warm: bool, **kwargs: Any
-    ):
-        """Args:
-        spec: of the actor.
-        weights: of the actor at the start; default, random ones.
-        value: of every state at the start.
-        warm: whether the critic has a learning rate of its own.
-        """
-        self._spec, self._weights, self._value, self._warm = spec, weights, value, warm
+    def __init__(self, *args: Any, spec: PolicySpec, **kwargs: Any):
+        """Args: spec: of the actor."""
+        self._spec = spec
         super().__init__(*args, **kwargs)
 
+    @property
+    def branches(self) -> Branches:
+        return cast(Branches, self.mlp_extractor)
+
     def _build_mlp_extractor(self) -> None:
-        network = PolicyNetwork(self._spec)
-        own = self._spec.observations
-        inputs = CriticInputs(own, frame=self._spec.frame, routes=network.routes, past=self.features_dim - own)
-        self.branches = Branches(MeanAction(network), QuadraticCritic(inputs, self._spec.hidden, torch.nn.Tanh))
-        self.mlp_extractor = cast(MlpExtractor, self.branches)
+        self.mlp_extractor = Branches(self._spec)
 
     def _build(self, lr_schedule: Schedule) -> None:
-        super()._build(
-            lr_schedule
-        )  # which initializes all layers as if they were inner ones; the branches hold the last too
+        super()._build(lr_schedule)  # initializes all layers as if they were inner ones; the branches hold the last too
         self.action_net = self.value_net = cast(torch.nn.Linear, torch.nn.Identity())
-        network = self.branches.actor.network
-        if self._weights is not None:
-            network.load_state_dict(self._weights)
-        else:
-            with torch.no_grad():  # so that the first policy does next to nothing
-                cast(torch.nn.Linear, network.mlp[-1]).weight.mul_(0.01)
-        self.branches.critic.start_at(self._value)
-        rate: dict[str, Any] = {"lr": lr_schedule(1)}
-        if not self._warm:
-            self.optimizer = self.optimizer_class(self.parameters(), **rate, **self.optimizer_kwargs)
-            return
-        groups: Any = [
-            {"params": list(part.parameters()), **rate} for part in (self.branches.actor, self.branches.critic)
-        ]
-        self.optimizer = self.optimizer_class(groups, **self.optimizer_kwargs)
-        self.optimizer.register_step_pre_hook(_keep_critic_rate)
+        actor, critic = self.branches.actor, self.branches.critic
+        with torch.no_grad():  # so that the first policy does next to nothing
+            cast(torch.nn.Linear, actor.mlp[-1]).weight.mul_(0.01)
+        critic.start_flat()
+        groups: Any = [{"params": list(part.parameters())} for part in (actor, critic)]
+        self.optimizer = self.optimizer_class(groups, **{"lr": lr_schedule(1), **self.optimizer_kwargs})
 
 
 def _keep_critic_rate(optimizer: torch.optim.Optimizer, *_: object) -> None:
@@ -264,12 +238,7 @@ class Ppo(ModelFree):
             gae_lambda=config.gae_lambda,
             clip_range=CLIP_RANGE,
             max_grad_norm=MAX_GRAD_NORM,
-            policy_kwargs={
-                "spec": spec,
-                "weights": None if start is None else start.state_dict(),
-                "value": self._value_of_living(self._gamma),
-                "warm": warm,
-            },
+            policy_kwargs={"spec": spec},
             rollout_buffer_class=RelativeRollouts if config.relative_advantages else None,
             rollout_buffer_kwargs={"living": self._value_of_living} if config.relative_advantages else None,
             seed=seed,
@@ -280,12 +249,13 @@ class Ppo(ModelFree):
         self._log_std.requires_grad_(False)
         if config.relative_values:  # the critic's last layer, which the policy has as an identity
             policy.value_net.register_forward_hook(self._weigh)
-        branches = policy.branches
-        self._set_model(model, branches.actor, (policy.optimizer,), model.rollout_buffer, [branches.critic.linear.bias])
+        if warm:
+            policy.optimizer.register_step_pre_hook(_keep_critic_rate)
+        actor, critic = policy.branches.actor, policy.branches.critic
+        self._set_model(model, actor, start, (policy.optimizer,), model.rollout_buffer, [critic.linear.bias])
 
-    @property
-    def network(self) -> PolicyNetwork:
-        return cast(MeanAction, self._kept).network
+    def _act(self, seen: torch.Tensor) -> torch.Tensor:
+        return _mean(self._actor, seen)
 
     def _improve(self) -> dict[str, float]:
         std = schedules.geometric(self.config.std, self.config.final_std, self._progress)

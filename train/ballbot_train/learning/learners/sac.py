@@ -5,8 +5,9 @@ online reinforcement learning with offline data", 2023). `ModelFree` says what e
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -21,15 +22,14 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks import Task
-from ballbot_gym.tasks.symmetry import FRAMES, Frame
-from ballbot_train.learning.actors import check_start, spec_for
-from ballbot_train.learning.critics import CriticInputs, QuadraticCritic, highest_value
+from ballbot_train.learning.actors import spec_for, started
+from ballbot_train.learning.critics import QuadraticCritic, highest_value
 from ballbot_train.learning.curricula import FAILURE_PRICE
 from ballbot_train.learning.datasets import Demos, load_demos
 from ballbot_train.learning.frames import demos_in_frame
 from ballbot_train.learning.learners.model_free import ModelFree, ModelFreeConfig
 from ballbot_train.learning.state import load_state, state_of
-from ballbot_train.policy import PolicyNetwork, centred
+from ballbot_train.policy import PolicyNetwork
 from ballbot_train.policy_files import Mirrors
 
 
@@ -181,54 +181,35 @@ class SymmetricReplay(NStepReplayBuffer):
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class CentredMean(torch.nn.Module):
-    """The mean action of an actor in a frame, which keeps the frame's steady motion exactly; see `PolicyNetwork`."""
+class OwnActor(Actor):
+    """SB3's actor as a policy network, whose mean actions may be centred."""
 
-    def __init__(self, mlp: torch.nn.Module, frame: Frame):
-        super().__init__()
-        self.mlp, self._steady = mlp, frame.steady
-
-    def raw(self, features: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-        """(n, 2) before it is squashed, of features (n, size) and what the network gives for them."""
-        assert self._steady is not None
-        of = output, features.unbind(-1), self.mlp, self._steady
-        return centred(*of, "tanh_in_frame", lambda values: torch.stack(values, -1))
-
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(self.raw(features, self.mlp(features)))
-
-
-class CentredActor(Actor):
-    """SB3's actor with a centred mean."""
-
-    def __init__(self, *args: Any, frame: Frame, **kwargs: Any):
-        """Args: frame: that the envs show; the others are SB3's."""
+    def __init__(self, *args: Any, network: PolicyNetwork, **kwargs: Any):
+        """Args: network: it gets SB3's layers in place of its own; the others are SB3's."""
         super().__init__(*args, **kwargs)
-        self.mean = CentredMean(torch.nn.Sequential(*self.latent_pi, self.mu), frame)
+        network.mlp = torch.nn.Sequential(*self.latent_pi, self.mu)
+        self.network = network
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         output, log_std, more = super().get_action_dist_params(obs)
-        return self.mean.raw(cast(torch.Tensor, obs), output), log_std, more
+        return self.network.centred(output, cast(torch.Tensor, obs).unbind(-1)), log_std, more
 
 
 class OwnPolicy(SACPolicy):
-    """SB3's policy with critics of another network, and an actor that may be centred."""
+    """SB3's policy with a policy network as its actor, and critics of another network."""
 
-    def __init__(self, *args: Any, products: bool, layer_norm: bool, value: float, centre: Frame | None, **kwargs: Any):
+    def __init__(self, *args: Any, actor: Callable[..., Actor], products: bool, layer_norm: bool, **kwargs: Any):
         """Args:
+        actor: makes one as SB3's `Actor` is made.
         products: whether critics see products.
         layer_norm: whether the layers of others are normalized.
-        value: that critics expect everywhere at the start, about.
-        centre: the frame of a centred actor.
         """
-        self._products, self._layer_norm, self._value, self._centre = products, layer_norm, value, centre
+        self._actor, self._products, self._layer_norm = actor, products, layer_norm
         super().__init__(*args, **kwargs)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        if self._centre is None:
-            return super().make_actor(features_extractor)
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return CentredActor(**kwargs, frame=self._centre).to(self.device)
+        return self._actor(**kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         critic = super().make_critic(features_extractor)
@@ -240,24 +221,15 @@ class OwnPolicy(SACPolicy):
 
     def _critic(self, inputs: int, hidden: list[int]) -> torch.nn.Module:
         if self._products:
-            return QuadraticCritic(CriticInputs(inputs), hidden, self.activation_fn, self._value)
+            return QuadraticCritic(inputs, hidden, self.activation_fn)
         after: Any = [torch.nn.LayerNorm] if self._layer_norm else None
-        critic = torch.nn.Sequential(*create_mlp(inputs, 1, hidden, self.activation_fn, post_linear_modules=after))
-        torch.nn.init.constant_(last_bias(critic), self._value)
-        return critic
+        return torch.nn.Sequential(*create_mlp(inputs, 1, hidden, self.activation_fn, post_linear_modules=after))
 
 
 def last_bias(critic: torch.nn.Module) -> torch.Tensor:
     """The bias of a critic's output."""
     last = critic.linear if isinstance(critic, QuadraticCritic) else cast(torch.nn.Sequential, critic)[-1]
     return cast(torch.nn.Linear, last).bias
-
-
-def copy_layers(source: torch.nn.Module, to: torch.nn.Module) -> None:
-    """Copies the weights of linear layers, in order."""
-    layers = ((part for part in module.modules() if isinstance(part, torch.nn.Linear)) for module in (source, to))
-    for given, taken in zip(*layers, strict=True):
-        taken.load_state_dict(given.state_dict())
 
 
 class Sac(ModelFree):
@@ -276,8 +248,9 @@ class Sac(ModelFree):
         if demos is not None and config.n_steps > 1:
             raise ValueError("n_steps must be 1 with demonstrations, which are single steps")
         spec = spec_for(task, config.symmetry, config.hidden)
-        frame = None if spec.frame is None else FRAMES[spec.frame]
-        self._spec = replace(spec, activation="silu", squash="tanh" if frame is None else "tanh_in_frame")
+        frame = spec.seen_in
+        spec = replace(spec, activation="silu", squash="tanh" if frame is None else "tanh_in_frame")
+        start = None if start is None else started(start, spec, any_shape=False)
         given = None if demos is None else load_demos(demos, task)
         if given is not None and task.first_exit:
             given = given.without_pay(task, FAILURE_PRICE)
@@ -286,6 +259,7 @@ class Sac(ModelFree):
         warm = demos is not None or start is not None
         super().__init__(task, params, config, given, warm, frame, None if warm else _CONTROL_DT)
         self.config, self._imitation_weight = config, _IMITATION_WEIGHT
+        network = PolicyNetwork(spec)
         model = SAC(
             OwnPolicy,
             self._env,
@@ -300,7 +274,7 @@ class Sac(ModelFree):
             replay_buffer_kwargs={
                 "demos": given,
                 "reward_scale": self._reward_scale,
-                "mirrors": self._spec.mirrors,
+                "mirrors": spec.mirrors,
                 "n_steps": config.n_steps,
                 "gamma": self._gamma,
             },
@@ -309,10 +283,9 @@ class Sac(ModelFree):
             policy_kwargs={
                 "net_arch": list(config.hidden),
                 "activation_fn": torch.nn.SiLU,
+                "actor": partial(OwnActor, network=network),
                 "products": config.products,
                 "layer_norm": warm,
-                "value": self._value_of_living(self._gamma),
-                "centre": frame if spec.centred else None,
             },
             seed=seed,
             device="cpu",
@@ -332,23 +305,15 @@ class Sac(ModelFree):
             model.critic.register_forward_hook(self._weigh)
         self._set_model(
             model,
-            actor.mean
-            if isinstance(actor, CentredActor)
-            else torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh()),
+            network,
+            start,
             (actor.optimizer, model.critic.optimizer, cast(torch.optim.Optimizer, model.ent_coef_optimizer)),
             self._replay,
             [last_bias(critic) for critic in (*model.critic.q_networks, *model.critic_target.q_networks)],
         )
-        if start is not None:
-            check_start(start.spec, self._spec)
-            for module in (self._actor, self._average.module):
-                copy_layers(start.mlp, module)
 
-    @property
-    def network(self) -> PolicyNetwork:
-        network = PolicyNetwork(self._spec)
-        copy_layers(self._kept, network)
-        return network
+    def _act(self, seen: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self._actor.centred(self._actor.mlp(seen), seen.unbind(-1)))
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {"log_ent_coef": self._log_ent_coef.detach()} | state_of(self, ["_replay"])

@@ -25,14 +25,12 @@ from ballbot_gym.robots import robot_name
 from ballbot_gym.seeding import spawned
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
-from ballbot_train.learning.actors import RoutedSymmetry, check_start, spec_for, started
-from ballbot_train.learning.critics import CriticInputs
+from ballbot_train.learning.actors import RoutedSymmetry, spec_for, started
 from ballbot_train.learning.fitting import start_as_lqr
 from ballbot_train.learning.routing import fit_routes
 from ballbot_train.learning.state import load_state, state_of
 from ballbot_train.learning.whole_episodes import WholeEpisodes, grip_penalty
 from ballbot_train.policy import PolicyNetwork
-from ballbot_train.routes import Routes
 from ballbot_train.weights import linear_layers
 
 
@@ -104,7 +102,7 @@ _DEEP = 0.15  # shortfall of a clearance from which its penalty grows linearly
 _ENDLESS = 10**6  # control steps: longer than any episode in training
 _HARD_AMONG = 16  # episodes that are drawn for each hard one
 _STATE = (
-    *("iteration", "_network", "critic", "target", "_policy_optimizer", "_critic_optimizer"),
+    *("iteration", "network", "critic", "target", "_policy_optimizer", "_critic_optimizer"),
     *("_batch", "_drawn", "_start", "_random"),
 )
 
@@ -128,19 +126,11 @@ class Critic(torch.nn.Module):
     Where the policy sees the task's frame, the critic does too.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        params: BallbotParams,
-        hidden: tuple[int, ...],
-        frame: str | None = None,
-        routes: Routes | None = None,
-        past: int = 0,
-    ):
+    def __init__(self, task: Task, params: BallbotParams, policy: PolicyNetwork, hidden: tuple[int, ...]):
         super().__init__()
-        own = task.observation_size(params)
-        self._inputs = CriticInputs(own, products=False, frame=frame, routes=routes, past=past)
-        self.mlp = linear_layers((self._inputs.size, *hidden, 1), torch.nn.Tanh)
+        self._shown = policy.shown
+        past = policy.spec.seen - policy.spec.observations
+        self.mlp = linear_layers((policy.present + past, *hidden, 1), torch.nn.Tanh)
         for part in self.mlp[-1].parameters():
             torch.nn.init.zeros_(part)
         gain = equilibrium_gain(task, params)
@@ -152,7 +142,7 @@ class Critic(torch.nn.Module):
         if self.p is not None:
             error = observation[..., : len(self.p)]
             scale = ((error @ self.p) * error).sum(-1) + 1e-3
-        return torch.nn.functional.softplus(self.mlp(self._inputs(observation))[..., 0] + _SOFTPLUS_ONE) * scale
+        return torch.nn.functional.softplus(self.mlp(self._shown(observation))[..., 0] + _SOFTPLUS_ONE) * scale
 
 
 class Shac:
@@ -174,14 +164,12 @@ class Shac:
         self.iterations, self.evaluations = config.iterations, config.evaluations
         self._own = task
         self.task = replace(task, duration=_ENDLESS * task.control_dt)  # episodes never run out of time in training
-        self._network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
-        start_as_lqr(self._network, task, params)
-        past = history * (task.observation_size(params) + params.action_size)
-        seen = self._network.spec.frame, self._network.routes, past
-        self.critic = Critic(task, params, config.hidden, *seen)
-        self.target = Critic(task, params, config.hidden, *seen)
+        self.network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
+        start_as_lqr(self.network, task, params)
+        self.critic = Critic(task, params, self.network, config.hidden)
+        self.target = Critic(task, params, self.network, config.hidden)
         self.target.load_state_dict(self.critic.state_dict())
-        self._policy_optimizer = torch.optim.Adam(self._network.parameters(), config.learning_rate, betas=(0.7, 0.95))
+        self._policy_optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate, betas=(0.7, 0.95))
         rate = config.critic_learning_rate
         self._critic_optimizer = torch.optim.Adam(self.critic.parameters(), rate, betas=(0.7, 0.95))
         wheels, long = params.wheels is not None, config.iterations >= _COMPILE_FROM
@@ -195,24 +183,19 @@ class Shac:
         if long and not wheels:  # else the batch compiles its part
             self._step = torch.compile(self._step, fullgraph=True, dynamic=False, options=COMPILE_OPTIONS)
 
-    @property
-    def network(self) -> PolicyNetwork:
-        return self._network
-
     def start_from(self, network: PolicyNetwork) -> None:
         """Takes the weights of a policy, to be improved; it may have been trained on another robot and its episodes.
 
         Raises:
             ValueError: its network differs in shape from this one.
         """
-        check_start(network.spec, self._network.spec)
-        self._network.load_state_dict(started(network, self._network.spec).state_dict())
+        self.network.load_state_dict(started(network, self.network.spec, any_shape=False).state_dict())
         self._finetuning = True
 
     def iterate(self) -> dict[str, float]:
         config = self.config
-        if self._network.routes is not None and self.iteration == 0 and not self._finetuning:
-            fit_routes(self._network.routes, self._own, self._batch.params, self._seed)
+        if self.network.routes is not None and self.iteration == 0 and not self._finetuning:
+            fit_routes(self.network.routes, self._own, self._batch.params, self._seed)
         rate = self._annealed(config.learning_rate)
         self._policy_optimizer.param_groups[0]["lr"] = rate
         self._critic_optimizer.param_groups[0]["lr"] = self._annealed(config.critic_learning_rate)
@@ -229,7 +212,7 @@ class Shac:
         loss = weight * (loss + discount * alive * self.target(last))
         self._policy_optimizer.zero_grad()
         loss.mean().backward()
-        norm = torch.nn.utils.clip_grad_norm_(self._network.parameters(), _MAX_GRAD_NORM)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRAD_NORM)
         if torch.isfinite(norm) and not (self._finetuning and self.iteration < _WARMUP_ITERATIONS):
             self._policy_optimizer.step()
         critic_loss = self._learn_values(log, last.detach())
@@ -284,14 +267,16 @@ class Shac:
         """One control step of every env; compiled."""
         config, task = self.config, self.task
         observation = self._batch.observe(state)
-        new, result = self._batch.transition(state, self._network(observation))
+        new, result = self._batch.transition(state, self.network(observation))
         before, force = state.x.unbind(0), result.force.unbind(0)
         x, c = result.final_x.unbind(0), state.c.unbind(0)
         cost = task.cost(before, force, c) * task.control_dt
         cost = cost + _FAILURE_PENALTY * result.failure
         shaped = cost
         if config.margin_penalty:
-            for margin in self._one_way_margins(observation, x, c) if config.one_way else task.margins(x, c):
+            routes = self.network.routes if config.one_way else None
+            sides = () if routes is None else routes.sides(observation.unbind(-1))
+            for margin in task.one_way_margins(x, c, sides) if config.one_way else task.margins(x, c):
                 shortfall = (config.margin_clearance - margin).clamp(min=0)
                 squared = shortfall**2 - (shortfall - _DEEP).clamp(min=0) ** 2
                 shaped = shaped + config.margin_penalty * task.control_dt * squared
@@ -305,12 +290,6 @@ class Shac:
         start = torch.where(done[:, None], result.observation, start)
         record = _Record(observation.detach(), cost.detach(), result.success, result.failure)
         return new, start, alive, discount, loss, record
-
-    def _one_way_margins(self, observation: torch.Tensor, x: Any, c: Any) -> tuple[Any, ...]:
-        """Margins (B,) of states x that are open on the sides of the policy's routes alone, or on the task's choice."""
-        routes = self._network.routes
-        sides = () if routes is None else routes(observation).detach().unbind(-1)
-        return self.task.one_way_margins(x, c, sides)
 
     def _learn_values(self, log: list["_Record"], last: torch.Tensor) -> float:
         """Fits the critic to the cost of the window from each of its steps on; returns the loss.
