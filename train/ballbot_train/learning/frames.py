@@ -16,13 +16,11 @@ def demos_in_frame(demos: Demos, frame: Frame) -> Demos:
     """Demonstrations with features in place of observations, and actions as the frame has them."""
     observations, axes = seen_in(frame, demos.observations)
     next_observations, _ = seen_in(frame, demos.next_observations)
-    return replace(
-        demos,
-        observations=observations,
-        next_observations=next_observations,
-        actions=_to_frame(axes, demos.actions),
-        executed=_to_frame(axes, demos.executed),
-    )
+    turned = {
+        name: np.einsum("nji,nj->ni", axes, getattr(demos, name)) / np.float32(REACH)
+        for name in ("actions", "executed")
+    }
+    return replace(demos, observations=observations, next_observations=next_observations, **turned)
 
 
 def seen_in(frame: Frame, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,8 +41,3 @@ def _columns(parts: tuple[np.ndarray, ...]) -> np.ndarray:
 def to_world(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """Actions (n, 2) in [-1, 1] of the frame whose directions are the columns of axes (n, 2, 2), as actions of the world."""
     return np.clip(REACH * np.einsum("nij,nj->ni", axes, actions), -1.0, 1.0)
-
-
-def _to_frame(axes: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """The actions of the frame that `to_world` turns into actions (n, 2) of the world."""
-    return np.einsum("nji,nj->ni", axes, actions) / np.float32(REACH)
