@@ -193,10 +193,8 @@ class BallbotBatch:
         self.state: BatchState | None = None
         self.most_steps = self.task.steps  # fewer truncate episodes sooner; neither pay nor goal changes
         self.restarts = True  # else envs stay at the ends of their episodes
-        for name in DERIVED:
-            getattr(
-                self.params, name
-            )  # else torch.compile would see another robot at the second step, and compile anew
+        for name in DERIVED:  # else torch.compile would see another robot at the second step, and compile anew
+            getattr(self.params, name)
         self._substeps = dynamics.substeps_for(self.task.control_dt)
         self.randomization.delay_steps(self.task.control_dt)  # raises an error where it is no whole number of these
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
@@ -484,8 +482,9 @@ class BallbotBatch:
         constants = task.draw_constants(z_constants, self.params) if c is None else c.unbind(0)
         state = task.start(z[: task.state_draws], constants, self.params) if x is None else x.unbind(0)
         zero = torch.zeros_like(episode)
-        rows = noise.draw(z[task.state_draws :][: noise.episode_draws], task.control_dt) if varied else ()
-        rows = rows if drawn is None else drawn.unbind(0)
+        rows = () if drawn is None else drawn.unbind(0)
+        if varied and drawn is None:
+            rows = noise.draw(z[task.state_draws :][: noise.episode_draws], task.control_dt)
         still = torch.zeros_like(seed, dtype=self.dtype)
         forces = self.params.action_size
         actuator = noise.resting((still,) * forces, task.control_dt)

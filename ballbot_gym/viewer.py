@@ -148,7 +148,7 @@ class Viewer:
         _, ball, body, force, push, label = nodes
         place = pose(params, robot.x)
         ball.position, body.position, body.wxyz = place.ball, place.body, place.turn
-        for node, (_, ends) in zip((force, push), arrows(params, robot), strict=True):
+        for node, (_, ends) in zip((force, push), arrows(place, robot), strict=True):
             node.visible = ends is not None
             if ends is not None:
                 node.points = np.array([ends], np.float32)

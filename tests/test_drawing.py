@@ -28,10 +28,10 @@ def test_the_quaternion_turns_about_y_by_gamma_then_about_minus_x_by_theta(param
 
 def test_the_arrows_start_in_the_ball_and_in_the_body_and_small_forces_have_none(params):
     pushed = Robot(LEANING, u=np.array([100.0, 0.0]), push=np.array([0.0, 50.0]))
-    (_, (start, end)), (_, (struck, thrown)) = arrows(params, pushed)
+    (_, (start, end)), (_, (struck, thrown)) = arrows(pose(params, LEANING), pushed)
     assert start == pytest.approx([0.5, -0.2, params.ball_radius])
     assert end - start == pytest.approx([100 * FORCE_SCALE, 0, 0])
     assert struck == pytest.approx(pose(params, LEANING).body)
     assert thrown - struck == pytest.approx([0, 50 * PUSH_SCALE, 0])
     for none in (Robot(LEANING, u=np.array([1.0, 0.0]), push=np.zeros(2)), Robot(LEANING)):
-        assert [ends for _, ends in arrows(params, none)] == [None, None]
+        assert [ends for _, ends in arrows(pose(params, LEANING), none)] == [None, None]
