@@ -26,7 +26,7 @@ def page() -> str:
         boards.setdefault((entry.task, entry.robot, entry.physics), []).append(entry)
     tasks = list(TASKS)
     order = sorted(boards, key=lambda board: (board[1] != PAPER, *board[1:], tasks.index(board[0])))
-    parts = (f"## {_title(*board)}\n\n{_table(boards[board])}{_films(boards[board])}" for board in order)
+    parts = (f"## {_title(*board)}\n\n{_table(boards[board])}" for board in order)
     text = "\n".join(parts)
     return _TABLES.sub(lambda match: f"{match[1]}\n{text}\n{match[2]}", PAGE.read_text(encoding="utf-8"))
 
@@ -35,13 +35,9 @@ def _title(task: str, robot: str, physics: str) -> str:
     return task.capitalize() + (f", {robot}" if robot != PAPER else "") + f", in {PHYSICS_NAMES[physics]}"
 
 
-def _ranked(entries: Sequence[Entry]) -> list[Entry]:
-    """Fewer failures first, then less regret."""
-    return sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
-
-
 def _table(entries: Sequence[Entry]) -> str:
-    ranked = _ranked(entries)
+    """Rows with fewer failures first, then those with less regret."""
+    ranked = sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
     lines = [
         [
             entry.name,
@@ -52,29 +48,22 @@ def _table(entries: Sequence[Entry]) -> str:
         ]
         for entry, group in zip(ranked, _groups(ranked), strict=True)
     ]
-    table = markdown(_HEADER, lines)
-    for entry in entries:
+    rows = markdown(_HEADER, lines).splitlines()  # links in what was handed in are escaped; ours come after that
+    for i, entry in enumerate(ranked, 2):
+        facts, best, worst = rows[i].removesuffix(" |").rsplit(" | ", 2)
+        rows[i] = f"{facts} | {_filmed(entry, best)} | {_filmed(entry, worst)} |"
         if entry.link:
-            table = table.replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |")
-    return table
+            rows[i] = rows[i].replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |", 1)
+    return "\n".join(rows) + "\n"
 
 
-def _films(entries: Sequence[Entry]) -> str:
-    """The films of best and worst episodes, folded."""
-    lines = []
-    for entry in _ranked(entries):
-        films = {film(entry, episode): episode for episode in extremes(entry)}
-        if all((FILMS / name).exists() for name in films):
-            shown = (f"![{episode}](pictures/films/{name})" for name, episode in films.items())
-            lines.append(f"| {entry.name} | {' | '.join(shown)} |\n")
-    if not lines:
-        return ""
-    head = "| controller | best episode | worst episode |\n| --- | --- | --- |\n"
-    summary = "<summary>Films of best and worst episodes</summary>"
-    return f'\n<details markdown="1">{summary}\n\n{head}{"".join(lines)}\n</details>\n'
+def _filmed(entry: Entry, episode: str) -> str:
+    """An episode's number, linked to its film if there is one."""
+    name = film(entry, episode)
+    return f"[{episode}](pictures/films/{name})" if (FILMS / name).exists() else episode
 
 
-def film(entry: Entry, episode: int) -> str:
+def film(entry: Entry, episode: int | str) -> str:
     """Name of a film."""
     return f"{Path(entry.file).stem}-{episode}.webp"
 
