@@ -125,9 +125,11 @@ def test_demonstrations_in_shards_are_those_of_one_dataset(demos):
 def test_shards_of_a_robot_are_of_its_own_task(tmp_path):
     config = DemoConfig("orbit", "lqr", episodes=2, physics="rk4", robot="rolling")
     write_shards(config, str(tmp_path / "set"), tmp_path / "out", 1)
-    assert len(load_demos(tmp_path / "set", make_task("orbit", "rolling")).actions) > 0
+    assert len(load_demos(tmp_path / "set", make_task("orbit", "rolling"), "rolling").actions) > 0
     with pytest.raises(ValueError, match="holds demonstrations of Orbit"):
         load_demos(tmp_path / "set", make_task("orbit"))
+    with pytest.raises(ValueError, match="of the robot rolling, not of paper; make others with --robot"):
+        load_demos(tmp_path / "set", make_task("orbit", "rolling"))
 
 
 def test_a_stream_gives_every_shard_once_per_epoch_in_an_order_of_its_own(demos):

@@ -12,6 +12,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.checks import LARGEST
+from ballbot_gym.robots import PAPER
 from ballbot_gym.tasks import Task
 from ballbot_train import shards
 from ballbot_train.console import option
@@ -78,16 +79,16 @@ class Demos:
 class StreamedDemos:
     """Demonstrations that are read shard by shard, for datasets that do not fit into memory."""
 
-    def __init__(self, url: str | Path, task: Task, seed: int = 0):
-        """Args: url: of a set of `ballbot demos --shards`; task: the set must be made for it; seed: of the order of shards.
+    def __init__(self, url: str | Path, task: Task, seed: int = 0, robot: str = PAPER):
+        """Args: url: of a set of `ballbot demos --shards`; task, robot: as of `load_demos`; seed: of the order of shards.
 
         Raises:
-            ValueError: there is no such set, or it is of another task or observation version.
+            ValueError: there is no such set, or it is of another task, robot or observation version.
         """
         self._shards, self._task, self._seed = shards.Shards(url), task, seed
         if self._shards.about is None or "demos" not in self._shards.about or not self._shards.numbers:
             raise ValueError(f'{url} is no dataset of "ballbot demos --shards", or an empty one')
-        _check_made_for(str(url), self._shards.about, task)
+        _check_made_for(str(url), self._shards.about, task, robot)
 
     def at(self, iteration: int) -> Demos:
         """The demonstrations of an iteration: one shard, which depends on seed and iteration alone.
@@ -114,30 +115,34 @@ class StreamedDemos:
             ) from error
 
 
-def load_demos(path: str | Path, task: Task) -> Demos:
+def load_demos(path: str | Path, task: Task, robot: str = PAPER) -> Demos:
     """Reads a dataset of `ballbot demos`, all its episodes.
 
     Args:
         path: folder of the dataset, or the URL of shards.
         task: the dataset must have been made for this very task.
+        robot: name of the robot that it must show.
 
     Raises:
-        ValueError: there is no such dataset, or it is damaged, or of another task or observation version.
+        ValueError: there is no such dataset, or it is damaged, or of another task, robot or observation version.
     """
     if shards.is_set(path):
-        return StreamedDemos(path, task).all()
+        return StreamedDemos(path, task, robot=robot).all()
     path = Path(path)
-    _check_made_for(str(path), metadata_of(path), task)
+    _check_made_for(str(path), metadata_of(path), task, robot)
     try:
         return _demos(_dataset(path), len(task.observation_scale))
     except Exception as error:  # h5py has dozens of ways to refuse a damaged file
         raise ValueError(f'{path} is damaged; make it anew with "ballbot demos" ({error!r:.300})') from error
 
 
-def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task) -> None:
-    """Raises a ValueError for demonstrations of another task or observation version."""
+def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task, robot: str) -> None:
+    """Raises a ValueError for demonstrations of another task, robot or observation version."""
     if metadata.get("task") != repr(task):
         raise ValueError(f"{path} holds demonstrations of {metadata.get('task')}, not of {task!r}")
+    shown = str(metadata["demos"].get("robot", PAPER)).rpartition(":")[2]
+    if shown != robot:
+        raise ValueError(f"{path} holds demonstrations of the robot {shown}, not of {robot}; make others with --robot")
     if metadata.get("observation_version") != OBSERVATION_VERSION:
         raise ValueError(
             f"{path} holds observations of version {metadata.get('observation_version')}, this is {OBSERVATION_VERSION}; "

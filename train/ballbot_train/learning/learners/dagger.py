@@ -198,7 +198,8 @@ class Dagger:
         history: int = 0,
     ):
         """As of `Algorithm.make`. Demonstrations are its first samples."""
-        samples = _first_samples(demos, task, config, seed, randomization is not None or history > 0)
+        on_track, robot = randomization is not None or history > 0, robot_name(params)
+        samples = _first_samples(demos, task, robot, config, seed, on_track)
         if randomization is not None and not config.batch_episodes:
             raise ValueError("on a track, optima are found at once: give --batch-episodes 512")
         if config.batch_episodes and not batched.solves(task, params):
@@ -210,7 +211,7 @@ class Dagger:
         self._task, self._params, self._seed = task, params, seed
         self._randomization, self._history = randomization, history
         torch.manual_seed(seed)
-        self.network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot_name(params)))
+        self.network = PolicyNetwork(spec_for(task, config.symmetry, config.hidden, True, history, robot))
         start_as_lqr(self.network, task, params)
         self._fit = Fit(self.network)
         none, self._spread = np.zeros((0, self.network.spec.seen)), _SPREAD[: params.state_size]
@@ -529,7 +530,7 @@ class Dagger:
 
 
 def _first_samples(
-    demos: str | Path | None, task: Task, config: DaggerConfig, seed: int, on_track: bool
+    demos: str | Path | None, task: Task, robot: str, config: DaggerConfig, seed: int, on_track: bool
 ) -> Samples | StreamedDemos | None:
     """Demonstrations, if there are any; raises a ValueError where they do not fit."""
     if demos is None:
@@ -543,8 +544,8 @@ def _first_samples(
     if is_set(demos):
         if config.gathering_iterations:
             raise ValueError(f"{demos} is a set of shards, which dagger only clones: give --gathering-iterations 0")
-        return StreamedDemos(demos, task, seed)
-    loaded = load_demos(demos, task)
+        return StreamedDemos(demos, task, seed, robot)
+    loaded = load_demos(demos, task, robot)
     weights = np.full(len(loaded), 1 / max(loaded.median_cost(task), _MIN_COST))
     return Samples.of(loaded.observations, loaded.actions, weights)
 

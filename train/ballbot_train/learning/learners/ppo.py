@@ -18,6 +18,7 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import robot_name
 from ballbot_gym.tasks import Task
 from ballbot_train.learning import schedules
 from ballbot_train.learning.actors import spec_for, started
@@ -224,7 +225,7 @@ class Ppo(ModelFree):
         if start is not None:
             start = started(start, spec)
             spec = start.spec
-        given = None if demos is None else load_demos(demos, task)
+        given = None if demos is None else load_demos(demos, task, robot_name(params))
         super().__init__(task, params, config, given, warm, backwards=config.backwards, **world)
         self.config = config
         model = PPO(

@@ -21,6 +21,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSample
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from ballbot_gym.params import BallbotParams
+from ballbot_gym.robots import robot_name
 from ballbot_gym.tasks import Task
 from ballbot_train.learning.actors import spec_for, started
 from ballbot_train.learning.critics import QuadraticCritic, highest_value
@@ -251,7 +252,7 @@ class Sac(ModelFree):
         frame = spec.seen_in
         spec = replace(spec, activation="silu", squash="tanh" if frame is None else "tanh_in_frame")
         start = None if start is None else started(start, spec, any_shape=False)
-        given = None if demos is None else load_demos(demos, task)
+        given = None if demos is None else load_demos(demos, task, robot_name(params))
         if given is not None and task.first_exit:
             given = given.without_pay(task, FAILURE_PRICE)
         if given is not None and frame is not None:
