@@ -68,7 +68,7 @@ gallery: $(VENV)/installed
 
 # RLlib is tested where it is installed; it pins another Gymnasium, so that it cannot be here. RL Zoo wants an older dateutil,
 # and torchrl an older tensordict; without this minimum pip takes a torchrl from before Gymnasium 1.
-CLIENTS := torchrl>=0.14 skrl rl-zoo3 rsl-rl-lib minari[create]
+CLIENTS := torchrl>=0.14 skrl rl-zoo3 rsl-rl-lib
 
 clients: $(VENV)/installed
 	$(BIN)/python -m venv .venv-clients

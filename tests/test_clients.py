@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "clients.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.+?)\n.*?```python\n(.*?)```", PAGE, re.MULTILINE | re.DOTALL))
 OURS = {"ballbot_gym", "ballbot_train"}
-NEEDS = {"RL Baselines3 Zoo": {"rl_zoo3"}, "Minari": {"jax"}, "RLlib": {"tree"}}  # besides what the code imports
+NEEDS = {"RL Baselines3 Zoo": {"rl_zoo3"}, "RLlib": {"tree"}}  # besides what the code imports
 
 
 def libraries(title):
@@ -29,7 +29,7 @@ def test_client_runs_as_documented(title, tmp_path):
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)}")
     # in a process of its own, because clients start threads and set global state
-    environment = os.environ | {"MINARI_DATASETS_PATH": str(tmp_path), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
+    environment = os.environ | {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
     done = subprocess.run(
         [sys.executable, "-c", SECTIONS[title]], cwd=tmp_path, env=environment, capture_output=True, text=True
     )
@@ -40,5 +40,5 @@ def test_every_client_that_make_installs_has_a_section():
     makefile = (ROOT / "Makefile").read_text()
     listed = re.search(r"^CLIENTS := (.*)$", makefile, re.MULTILINE)[1].split()
     imported = set().union(*map(libraries, SECTIONS))
-    modules = {"torchrl>=0.14": "torchrl", "rl-zoo3": "rl_zoo3", "rsl-rl-lib": "rsl_rl", "minari[create]": "minari"}
+    modules = {"torchrl>=0.14": "torchrl", "rl-zoo3": "rl_zoo3", "rsl-rl-lib": "rsl_rl"}
     assert {modules.get(name, name) for name in listed} <= imported
