@@ -30,7 +30,7 @@ def run(stress, episodes, out, seed=0):
 def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
     results = run("delay", 3, tmp_path)
     plain = benchmark.benchmark({"stabilize": ["lqr"]}, 3, "rk4", tmp_path / "plain", 1)
-    rows = leaderboard(results, "stress", "level")
+    rows = leaderboard(results)
     assert [tuple(row.told.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == summarize(plain).cost_mean
     costs = [row.cost_mean for row in rows]
@@ -50,7 +50,7 @@ def test_the_same_seed_draws_the_same_pushes(tmp_path):
 def test_files_hold_the_rows_and_the_figure_is_drawn(tmp_path):
     failed = {"failure": True, "success": False}
     results = [result(NONE, 0.0), result("mass", -20.0), result("mass", 20.0, **failed), result("lag", 20.0)]
-    rows = leaderboard(results, "stress", "level")
+    rows = leaderboard(results)
     write_results("robustness", rows, results, {"commit": "none"}, tmp_path)
     document = json.loads((tmp_path / "robustness.json").read_text())
     assert [(row["stress"], row["level"]) for row in document["rows"]] == [tuple(r.told.values()) for r in results]

@@ -71,7 +71,7 @@ def benchmark(
         publish(out, "tracks", title, robustness.TRACK_TABLE, rows)
         return
     done = run_benchmark(chosen, episodes, physics, out, workers, seed, robot)
-    rows = leaderboard(done, seed=seed)
+    rows = leaderboard(done, seed)
     write_leaderboard(rows, done, facts, out)
     regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")
     replays, pictures = [], []

@@ -53,7 +53,7 @@ def robustness(
     settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     facts = open_run(out, workers, policy_digests(chosen, robot), robot, **settings)
     results = run_groups(stressed.groups_of(chosen, stresses, physics, robot), episodes, out, workers, seed)
-    rows = leaderboard(results, "stress", "level", seed=seed)
+    rows = leaderboard(results, seed)
     labels = {name: stress.label for name, stress in stressed.STRESSES.items()}
     write_results("robustness", rows, results, facts, out, stresses=labels)
     for task in chosen:

@@ -87,7 +87,7 @@ def transfer(
             robot,
             made_for=own,
             friction=friction,
-            told={"made_for": own, "robot": robot, "friction": floor(robot, friction).friction},
+            told={"made_for": own, "robot": robot, "friction": floor(robot, friction).friction, "physics": engine},
         )
         for own, by_task in chosen.items()
         for task, names in by_task.items()
@@ -96,7 +96,7 @@ def transfer(
         for engine in engines
     ]
     results = run_groups(groups, episodes, out, workers, seed)
-    rows = leaderboard(results, "made_for", "robot", "friction", "physics", seed=seed)
+    rows = leaderboard(results, seed)
     write_results("transfer", rows, results, facts, out, _IN_CSV, regret=_REGRET)
     publish(out, "transfer", f"{episodes} certified episodes of {robot} per task", _TABLE, rows)
     console.print(f"matrix: {out / 'transfer.csv'}")

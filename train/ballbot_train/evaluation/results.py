@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -124,6 +124,7 @@ def summarize(results: Sequence[Result], seed: int = 0) -> Row:
         effort_mean=float(np.mean([result.effort for result in standing])) if standing else math.nan,
         plan_ms_median=1e3 * median(result.plan_seconds for result in results),
         step_us_median=1e6 * median(result.step_seconds for result in results),
+        told=results[0].told,
     )
 
 
@@ -134,22 +135,12 @@ def columns(entry: Any) -> dict[str, Any]:
     return named | told
 
 
-def leaderboard(results: Sequence[Result], *keys: str, seed: int = 0) -> list[Row]:
-    """One row for each task, controller and values of other columns, in the order of the results.
-
-    Args:
-        results: episodes.
-        keys: names of those columns, by which the rows are told apart too.
-        seed: of the bootstrap.
-    """
+def leaderboard(results: Sequence[Result], seed: int = 0) -> list[Row]:
+    """One row for each task, controller and what the results are told by, in their order; seed is of the bootstrap."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in results:
-        named = columns(result)
-        groups.setdefault(tuple(named[key] for key in ("task", "controller", *keys)), []).append(result)
-    return [
-        replace(summarize(group, seed), told=dict(zip(keys, values, strict=True)))
-        for (_, _, *values), group in groups.items()
-    ]
+        groups.setdefault((result.task, result.controller, *result.told.items()), []).append(result)
+    return [summarize(group, seed) for group in groups.values()]
 
 
 def write_results(

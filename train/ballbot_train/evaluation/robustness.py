@@ -150,7 +150,7 @@ def track_rows(results: Sequence[Result], robot: str = PAPER, seed: int = 0) -> 
     regrets: dict[tuple[str, str, str], dict[int, float]] = {}
     for result in results:
         regrets.setdefault((result.told["stress"], result.task, result.controller), {})[result.episode] = result.regret
-    plain, rows = leaderboard(results, "stress", seed=seed), []
+    plain, rows = leaderboard(results, seed), []
     for row in plain:
         track, task = row.told["stress"], row.task
         rivals = [other for other in plain if (other.told["stress"], other.task) == (track, task)]
