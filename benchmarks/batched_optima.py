@@ -46,7 +46,7 @@ class Row:
 def measured(name: str, episodes: int, seed: int) -> Row:
     """Solves the same episodes in both ways."""
     task, params = make_task(name), default_params()
-    x0, c = fresh.draw(task, range(episodes), seed, "training", "paper")
+    x0, c, _ = fresh.draw(task, range(episodes), seed, "training", "paper")
     find_optimum(task, params, x0[0], c[0])  # compiles
     find_optima(task, params, x0[:1], c[:1])
     costs, alone, seconds = np.full(episodes, np.nan), np.full(episodes, np.nan), np.zeros(2)

@@ -51,7 +51,7 @@ def test_fresh_episodes_are_neither_certified_nor_for_validation_nor_of_another_
 
 
 def test_every_task_measures_its_episodes_in_finite_numbers(task):
-    for x, c in zip(*fresh.draw(task, range(20), 0), strict=True):
+    for x, c, _ in zip(*fresh.draw(task, range(20), 0), strict=True):
         assert all(math.isfinite(value) for value in task.measures(x, c, default_params()).values())
 
 

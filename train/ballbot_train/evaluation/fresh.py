@@ -29,7 +29,7 @@ from ballbot_gym.rollout import Controller, PlanError
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import limit_names
 from ballbot_train import jobs
-from ballbot_train.evaluation.controllers import is_expert, is_saved_model, make_controller
+from ballbot_train.evaluation.controllers import is_expert, make_controller
 from ballbot_train.evaluation.evaluate import Predictor
 from ballbot_train.evaluation.results import to_json
 from ballbot_train.evaluation.statistics import share_interval
@@ -198,8 +198,10 @@ def draw(
     seed: int,
     purpose: Literal["evaluation", "validation", "training"] = "evaluation",
     robot: str = PAPER,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Initial states (n, 8) and constants (n, nc) of fresh episodes.
+    randomization: Randomization = Randomization(),
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Initial states (n, 8) and constants (n, nc) of fresh episodes, and what a randomization draws for them, (n, 6 or 14),
+    or (n, 0) where it draws nothing.
 
     Args:
         task: the task.
@@ -207,36 +209,23 @@ def draw(
         seed: of the set.
         purpose: what the set is for; sets for different purposes share no episode.
         robot: by name.
+        randomization: what robots and actuators are drawn from.
     """
-    entropy, params = zlib.crc32(task.id.encode()), named_robot(robot)
-    sequences = (np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, i)) for i in episodes)
-    drawn = [task.sample(np.random.default_rng(sequence), params) for sequence in sequences]
-    return np.array([x for x, _ in drawn]), np.array([c for _, c in drawn])
+    entropy, params, drawn = zlib.crc32(task.id.encode()), named_robot(robot), []
 
+    def rng(*key: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, *key)))
 
-def draw_robots(
-    task: Task,
-    episodes: Iterable[int],
-    seed: int,
-    randomization: Randomization,
-    purpose: Literal["evaluation", "validation", "training"] = "evaluation",
-) -> np.ndarray:
-    """(n, 6 or 14) what a randomization draws for the episodes that `draw` draws; (n, 0) where it draws nothing."""
-    if not randomization.varies_episodes:
-        return np.zeros((len(list(episodes)), 0))
-    entropy = zlib.crc32(task.id.encode())
-    drawn = []
     for i in episodes:
-        rng = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(_PURPOSES[purpose], seed, i, 1)))
-        drawn.append(randomization.draw(tuple(rng.random(len(Randomization.DRAWN)).tolist()), task.control_dt))
-    return np.array(drawn)
+        z = tuple(rng(i, 1).random(len(Randomization.DRAWN)).tolist()) if randomization.varies_episodes else ()
+        drawn.append((*task.sample(rng(i), params), randomization.draw(z, task.control_dt) if z else ()))
+    x, c, robots = map(np.array, zip(*drawn, strict=True))
+    return x, c, robots
 
 
 def history_of(policy: Any, task: Task, robot: str = PAPER) -> int:
     """How many earlier observations a policy wants to see, that is given as to `as_batch_policy`."""
     if isinstance(policy, str | Path):
-        if is_saved_model(str(policy)):
-            return 0
         policy = getattr(_controller(str(policy), task, robot), "network", None)
     return getattr(getattr(policy, "spec", None), "history", 0)
 
@@ -332,8 +321,7 @@ def evaluate_fresh(
     task, params, varied = make_task(task, robot), named_robot(robot), checked_randomization(randomization)
     check_fresh(episodes, seed)
     world: dict[str, Any] = {"randomization": varied, "history": history_of(policy, task, robot)}
-    drawn = draw_robots(task, range(episodes), seed, varied)
-    states, constants = draw(task, range(episodes), seed, robot=robot)
+    states, constants, drawn = draw(task, range(episodes), seed, robot=robot, randomization=varied)
     runs = []
     for start in range(0, episodes, _BATCH):
         x, c = states[start : start + _BATCH], constants[start : start + _BATCH]
@@ -410,8 +398,8 @@ def _optima(
     from ballbot_baselines.certification import optimum_of  # it imports CasADi
 
     task = make_task(task_name, robot)
-    robots = draw_robots(task, episodes, seed, randomization)
-    for i, x, c, drawn in zip(episodes, *draw(task, episodes, seed, robot=robot), robots, strict=True):
+    starts = draw(task, episodes, seed, robot=robot, randomization=randomization)
+    for i, x, c, drawn in zip(episodes, *starts, strict=True):
         try:
             optimum = optimum_of(task, named_robot(robot), x, c, randomization, tuple(drawn.tolist()))
             entry = {"episode": i, "cost": optimum.cost}

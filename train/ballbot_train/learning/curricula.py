@@ -378,7 +378,7 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int, re
 
     console.print(f"finding {count} optima on which training episodes begin")
     found, backoff = [], Backoff(goal=max(Backoff.goal, reserve))
-    for x, c in zip(*fresh.draw(task, range(count), 0, "training"), strict=True):
+    for x, c, _ in zip(*fresh.draw(task, range(count), 0, "training"), strict=True):
         try:
             states = find_optimum(task, params, x, c, backoff).trajectory.x
         except PlanError:

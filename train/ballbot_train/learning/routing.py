@@ -68,7 +68,7 @@ def predicted_regrets(task: Task, params: BallbotParams, seed: int, episodes: in
         repeated obstacle is passed on another side than before, there is no such choice, and the regret is 100.
     """
     assert task.routed_frame is not None
-    x, c = fresh.draw(task, range(episodes), seed, "training")
+    x, c, _ = fresh.draw(task, range(episodes), seed, "training")
     goals = np.array([task.reference(*episode, params).x[-1, :2] for episode in zip(x, c, strict=True)])
     distances = goals[:, 0] - x[:, 0]
     known = np.argsort(distances)[np.linspace(0, episodes - 1, _DISTANCES).astype(int)]

@@ -132,12 +132,11 @@ def score_and_validate(
     """
     known = certified.load(task, robot, randomization=randomization)
     count = len(known)
-    x, c = fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot)
-    sets = ((count, _CERTIFIED_SEED), (episodes, _VALIDATION_SEED))
-    draws = [fresh.draw_robots(task, range(n), seed, randomization, "validation") for n, seed in sets]
-    if known.drawn.shape[1]:  # else the track moves no optimum
-        draws[0] = known.drawn
-    drawn, states, constants = map(np.concatenate, (draws, (known.states, x), (known.constants, c)))
+    x, c, robots = fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot, randomization)
+    own = known.drawn
+    if not own.shape[1]:  # the track moves no optimum
+        own = fresh.draw(task, range(count), _CERTIFIED_SEED, "validation", robot, randomization)[2]
+    drawn, states, constants = map(np.concatenate, ((own, robots), (known.states, x), (known.constants, c)))
     history = fresh.history_of(policy, task, robot)
     batch = BallbotBatch(task, len(states), compile=False, robot=robot, randomization=randomization, history=history)
     act = fresh.as_batch_policy(policy, batch, robot)
