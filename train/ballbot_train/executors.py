@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib.util import find_spec
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
@@ -101,7 +100,7 @@ def completed(tasks: Iterable[Task[Key]], workers: int | Workers, serial: bool =
     with _local(workers) if workers.ray is None else _cluster(workers) as (submit, most):
         while True:
             for key, function, arguments in itertools.islice(tasks, max(0, most() - len(running))):
-                running[submit(function, *arguments)] = key
+                running[submit(function, arguments, *registry.registered())] = key
             if not running:
                 return
             ended = wait(running, _NODE_SECONDS, FIRST_COMPLETED).done
@@ -128,9 +127,14 @@ def _result_of(future: Future) -> Any:
     return value
 
 
-def _attempt(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None, str]:
-    """What a task returned; or what it raised, and where. An error that cannot be pickled becomes a RuntimeError."""
+def _attempt(
+    function: Callable[..., Any], arguments: tuple[Any, ...], modules: tuple[str, ...], robots: dict[str, Robot]
+) -> tuple[Any, Exception | None, str]:
+    """On a worker, what a task returned; or what it raised, and where. An error that cannot be pickled becomes a
+    RuntimeError. Tasks know what users registered where the run began, `modules` and `robots`.
+    """
     try:
+        registry.restore(modules, robots)
         return function(*arguments), None, ""
     except Exception as error:
         try:
@@ -141,29 +145,28 @@ def _attempt(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Except
 
 
 Pool = tuple[Callable[..., Future], Callable[[], int]]
-"""What submits a function with its arguments, and what says how many tasks to have in flight at most."""
+"""What submits the arguments of `_attempt`, and what says how many tasks to have in flight at most."""
 
 
 @contextmanager
 def _local(workers: Workers) -> Iterator[Pool]:
-    """Processes of this machine, with what users registered in this one. At the end of the block whatever still runs is
-    stopped. One that dies ends the others' work too.
+    """Processes of this machine. At the end of the block whatever still runs is stopped. One that dies ends the others'
+    work too.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # processes share the cores, not the threads of each
     # a forked child would share PyBullet's clients and CasADi's state
-    pool = ProcessPoolExecutor(workers.here, get_context("spawn"), _prepare, registry.registered())
+    pool = ProcessPoolExecutor(workers.here, get_context("spawn"), _prepare)
     try:
-        yield partial(pool.submit, _attempt), lambda: workers.here
+        yield (lambda *task: pool.submit(_attempt, *task)), lambda: workers.here
     finally:
         for process in list((pool._processes or {}).values()):  # Python 3.14 is the first with a public way
             process.terminate()
         pool.shutdown(cancel_futures=True)
 
 
-def _prepare(modules: tuple[str, ...], robots: dict[str, Robot]) -> None:
+def _prepare() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which then ends its workers
     Thread(target=_end_with_the_run, daemon=True).start()
-    registry.restore(modules, robots)
 
 
 def _end_with_the_run() -> None:
@@ -191,10 +194,10 @@ def _cluster(workers: Workers) -> Iterator[Pool]:
         if not connected:
             _connect(ray, workers, Path(folder))
         # a name with a module, so that nodes import the function rather than unpickle it
-        task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_on_node)
+        task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_attempt)
 
-        def submit(function: Callable[..., Any], *arguments: Any) -> Future:
-            future = task.remote(function, arguments, *registry.registered()).future()
+        def submit(*given: Any) -> Future:
+            future = task.remote(*given).future()
             running.add(future)
             future.add_done_callback(running.discard)
             return future
@@ -249,13 +252,3 @@ def _code(folder: Path) -> list[str]:
             shutil.copy(path, folder)
     shutil.copytree(URDF_FOLDER, folder / "ballbot_gym" / "urdf", dirs_exist_ok=True)
     return found
-
-
-def _on_node(
-    function: Callable[..., Any], arguments: tuple[Any, ...], modules: tuple[str, ...], robots: dict[str, Robot]
-) -> tuple[Any, Exception | None, str]:
-    def call(*given: Any) -> Any:
-        registry.restore(modules, robots)
-        return function(*given)
-
-    return _attempt(call, *arguments)
