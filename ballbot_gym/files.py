@@ -181,13 +181,13 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Path:
     return write(path, npz(arrays))
 
 
-def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> Path:
-    """Writes one line for each row under a line of column names; columns default to the keys of the first row.
+def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Writes one line for each row under a line of column names, the keys of the first row.
 
     Text that a spreadsheet would compute as a formula gets an apostrophe in front.
     """
     text = io.StringIO()
-    names = list(columns or (rows[0] if rows else ()))
+    names = list(rows[0] if rows else ())
     writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writerow({name: _csv_cell(name) for name in names})
     writer.writerows({name: _csv_cell(value) for name, value in row.items()} for row in rows)

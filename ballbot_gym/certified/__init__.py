@@ -143,7 +143,7 @@ def load(
         given = path_of(task, name, track) if path is None else Path(path)
         if not given.exists():
             raise CertificateError(f"{given}: no evaluation set of {task.id}")
-        found = _read((_version(given),), type(task), task, params, randomization)
+        found = _read((_version(given),), task, params, randomization)
         if path is None and not all(0 <= index < len(found) for index in needed):
             raise CertificateError(f"{given} has {len(found)} episodes, and not all of {shown(needed)}")
         return found
@@ -167,7 +167,7 @@ def from_cache(
         return None
     try:
         paths = [_version(cache.path(task, params, index, randomization)) for index in needed]
-        found = _read(tuple(paths), type(task), task, params, randomization)
+        found = _read(tuple(paths), task, params, randomization)
     except (FileNotFoundError, CertificateError):
         return None
     if len(found) != len(needed):
@@ -194,11 +194,7 @@ def _version(path: Path) -> tuple[Path, int, int]:
 
 @lru_cache(maxsize=16)
 def _read(
-    versions: tuple[tuple[Path, int, int], ...],
-    kind: type[Task],
-    task: Task,
-    params: BallbotParams,
-    randomization: Randomization,
+    versions: tuple[tuple[Path, int, int], ...], task: Task, params: BallbotParams, randomization: Randomization
 ) -> EvaluationSet:
     """The sets of some files in their present versions as one. Of several files each has all its trajectories.
 
