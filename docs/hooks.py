@@ -5,17 +5,19 @@ the learners' settings. Pictures are loaded when they come into view. Notebooks 
 page is written anew. The script that sorts the report's tables sorts the site's too.
 """
 
+import ast
+import inspect
 import itertools
 import json
 import re
+import textwrap
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from mkdocs.structure.files import File
 
 from ballbot_gym.tasks import TASKS
-from ballbot_train.commands.options import meanings_of
 from ballbot_train.learning.learners import LEARNERS
 from ballbot_train.report.playground import write_playground
 
@@ -84,7 +86,7 @@ def settings_tables() -> str:
         if warm and columns == {task: algorithm.settings(task) for task in TASKS}:
             continue
         rows = [f"| setting | meaning | {' | '.join(columns)} |", f"|---|---|{'---|' * len(columns)}"]
-        meanings = meanings_of(type(columns["turn"]))
+        meanings = _meanings_of(type(columns["turn"]))
         for field in fields(columns["turn"]):
             values = " | ".join(_shown(getattr(settings, field.name)) for settings in columns.values())
             name = field.name.replace("_", "\\_<wbr>")  # a narrow column breaks it there
@@ -92,6 +94,17 @@ def settings_tables() -> str:
         title = f"`{learner}`, from demonstrations or a policy" if warm else f"`{learner}`"
         parts.append(f"## {title}\n\n" + "\n".join(rows))
     return "\n\n".join(parts)
+
+
+def _meanings_of(config: type) -> dict[str, str]:
+    """What the docstrings under the fields of a dataclass and its bases say, by field."""
+    found: dict[str, str] = {}
+    for kind in reversed(config.__mro__[:-1]):
+        body = cast(ast.ClassDef, ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]).body
+        for field, after in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
+                found[cast(ast.Name, field.target).id] = " ".join(ast.literal_eval(after.value).split())
+    return found
 
 
 def _shown(value: Any) -> str:

@@ -54,6 +54,14 @@ def test_the_site_shows_a_notebook_with_its_outputs(docs, tmp_path):
     ]
 
 
+def test_the_site_says_of_every_setting_what_it_is(docs):
+    import hooks
+
+    rows = [line.split(" | ") for line in hooks.settings_tables().splitlines() if line.startswith("| ")]
+    assert len(rows) > 60
+    assert all(row[1] for row in rows)
+
+
 def test_the_task_of_the_notebook_is_that_of_the_page():
     _, _, task = (DOCS / "own.md").read_text().partition("@register_task")
     code = "".join(
