@@ -62,21 +62,24 @@ def _read_at_most(file: IO[bytes], size: int) -> bytes:
     return b"".join(pieces)
 
 
-def read_json(path: str | Path, limit: int = JSON_LIMIT, content: bytes | None = None) -> Any:
-    """What a file of JSON holds, whose content may have been read already; errors name the path.
+def read_json(path: str | Path, limit: int = JSON_LIMIT, content: bytes | None = None, kind: type = dict) -> Any:
+    """The object, or what else of JSON, that a file holds, whose content may have been read already; errors name the path.
 
     Raises:
-        FileError: as `read`, or it holds no JSON.
+        FileError: as `read`, or it holds no JSON of that kind.
     """
     content = read(path, limit) if content is None else content
     if len(content) > limit:
         raise FileError(f"{path} holds more than {limit / 2**20:.0f} MiB of JSON, the most that is read")
     try:
-        return json.loads(content)
+        held = json.loads(content)
     except RecursionError:
         raise FileError(f"{path} holds no JSON that can be read: it is nested too deeply") from None
     except ValueError as error:
         raise FileError(f"{path} holds no JSON: {error}") from error
+    if not isinstance(held, kind):
+        raise FileError(f"{path} holds no {'object' if kind is dict else kind.__name__} of JSON")
+    return held
 
 
 def read_npz(path: str | Path, limit: int = READ_LIMIT, content: bytes | None = None) -> dict[str, np.ndarray]:

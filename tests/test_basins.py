@@ -80,7 +80,7 @@ def test_a_state_from_which_a_controller_recovers_is_recoverable(bounds):
     assert basin.recovered["lqr"][3, 4]
     assert basin.recovered["lqr"][1, 0]  # the same, turned by 180°
     assert basin.recoverable.sum() == 15 + 2
-    assert basin.fraction("lqr") == pytest.approx(3 / 17)
+    assert basins.fraction([basin], "lqr") == pytest.approx(3 / 17)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

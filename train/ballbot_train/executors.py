@@ -62,11 +62,6 @@ class Workers:
         return workers
 
     @property
-    def named(self) -> int | str:
-        """What results say: a number of processes, or that a cluster did the work."""
-        return self.here or "a Ray cluster"
-
-    @property
     def here(self) -> int:
         """Processes that work on this machine; 0 where a cluster does the work."""
         return (self.workers or os.cpu_count() or 1) if self.ray is None else 0

@@ -99,7 +99,11 @@ def claim(out: Path, config: Mapping[str, Any], marker: str = MARKER, facts: Map
     _lock(out)
     try:
         if path.exists() and (marker != MARKER or any(unfinished(out).glob("*.json"))):
-            held = {key: value for key, value in _read_marker(path).items() if key not in facts}
+            try:
+                held = files.read_json(path)
+            except files.FileError as error:
+                raise ValueError(f"{path} is damaged ({error}); delete it or give another --out") from error
+            held = {key: value for key, value in held.items() if key not in facts}
             check_same(held, wanted, out, "an unfinished run" if marker == MARKER else "a run")
         files.write(path, json.dumps({**wanted, **facts}, indent=1) + "\n")
     except BaseException:
@@ -122,16 +126,6 @@ def check_same(held: Mapping[str, Any], wanted: Mapping[str, Any], out: Path, wh
     if changed:
         said = "; ".join(f"{key} {held.get(key)!r}, not {wanted.get(key)!r}" for key in changed)
         raise ValueError(f"{out} holds {what} of {said}; give another --out or delete the folder")
-
-
-def _read_marker(path: Path) -> dict[str, Any]:
-    try:
-        held = files.read_json(path)
-        if not isinstance(held, dict):
-            raise ValueError(f"{path} holds no object")
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}); delete it or give another --out") from error
-    return held
 
 
 def release(out: Path, marker: str = MARKER) -> None:
@@ -219,10 +213,8 @@ def _result(job: Job) -> str:
 
 def _read(path: Path, items: int) -> list[Entry] | None:
     """The entries of a finished job; None where it has none, or a damaged file."""
-    if not path.exists():
-        return None
     try:
-        entries = files.read_json(path, _LIMIT)
-    except files.FileError:
+        entries = files.read_json(path, _LIMIT, kind=list)
+    except files.FileError:  # or there is none
         return None
-    return entries if isinstance(entries, list) and len(entries) == items else None
+    return entries if len(entries) == items else None

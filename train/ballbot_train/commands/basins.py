@@ -41,7 +41,7 @@ def basins(
     picture = figures.save(figures.basin_figure(made), out / "basins.png")
     jobs.release(out)
     header = ["controller", "recovered", *(f"by lean and {basin.axis}" for basin in made)]
-    shares = [[maps.fraction(made, name), *(basin.fraction(name) for basin in made)] for name in names]
+    shares = [[maps.fraction(made, name), *(maps.fraction([basin], name) for basin in made)] for name in names]
     rows = [[name, *(f"{share:.1%}" for share in group)] for name, group in zip(names, shares, strict=True)]
     print_table(f"Share of the recoverable states, {points} × {points} a map, physics={physics}", header, rows)
     console.print(f"map: {picture}")

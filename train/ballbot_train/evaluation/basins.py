@@ -56,10 +56,6 @@ class BasinMap:
     recovered: dict[str, np.ndarray]
     """By controller."""
 
-    def fraction(self, controller: str) -> float:
-        """The share of the recoverable states from which a controller recovers."""
-        return float(np.sum(self.recovered[controller]) / np.sum(self.recoverable))
-
 
 def run(
     controllers: Sequence[str], points: int, physics: str, out: Path, workers: int | Workers, robot: str = PAPER
@@ -164,7 +160,7 @@ def maps_of(
 
 
 def fraction(maps: Sequence[BasinMap], controller: str) -> float:
-    """The share of the recoverable states of all maps from which a controller recovers."""
+    """The share of the recoverable states of maps from which a controller recovers."""
     recovered = sum(int(np.sum(basin.recovered[controller])) for basin in maps)
     return recovered / sum(int(np.sum(basin.recoverable)) for basin in maps)
 
@@ -173,7 +169,7 @@ def write(maps: Sequence[BasinMap], facts: Mapping[str, Any], out: Path) -> None
     """Writes basins.json, which holds the facts as "about", rows and maps, and basins.csv with a line for each state."""
     rows = [
         {"task": TASK, "controller": c, "recovered": fraction(maps, c)}
-        | {basin.axis: basin.fraction(c) for basin in maps}
+        | {basin.axis: fraction([basin], c) for basin in maps}
         for c in maps[0].recovered
     ]
     document = {

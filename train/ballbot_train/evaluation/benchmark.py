@@ -105,7 +105,7 @@ def open_run(
     """
     check_least(0, seed=settings.get("seed", 0))
     settings |= robot_setting(robot) | {"policies": policies}
-    facts = provenance() | settings | {"workers": Workers.of(workers).named}
+    facts = provenance() | settings | {"workers": Workers.of(workers).here or "a Ray cluster"}
     jobs.claim(out, {key: facts[key] for key in ("version", "commit", *settings)})
     return facts
 

@@ -59,7 +59,6 @@ def compare(
     b: Run,
     match: tuple[str, str] | None = None,
     training_margin: float = TRAINING_MARGIN,
-    seed: int = 0,
 ) -> list[Comparison]:
     """Compares controllers of the same name on every task that both runs have.
 
@@ -68,7 +67,6 @@ def compare(
         b: another.
         match: a controller of A and one of B to compare instead; where each has but one, they are compared anyway.
         training_margin: of success and regret, between policies with different weights; else it is `MARGIN`.
-        seed: of the bootstrap.
 
     Raises:
         ValueError: there is nothing to compare, the margin is no number from 0, or a run holds an episode twice.
@@ -86,7 +84,6 @@ def compare(
             groups_a[task, name_a],
             groups_b[task, name_b],
             training_margin if _trained_apart(f"{task}/{name_a}", f"{task}/{name_b}", a[0], b[0]) else MARGIN,
-            seed,
         )
         for task, name_a, name_b in pairs
     ]
@@ -129,9 +126,7 @@ def _trained_apart(a: str, b: str, about_a: Mapping[str, Any], about_b: Mapping[
     return weights is None or weights != about_b.get("policies", {}).get(b)
 
 
-def _compare_one(
-    task: str, name: str, a: Mapping[int, Result], b: Mapping[int, Result], margin: float, seed: int
-) -> Comparison:
+def _compare_one(task: str, name: str, a: Mapping[int, Result], b: Mapping[int, Result], margin: float) -> Comparison:
     shared = sorted(a.keys() & b.keys())
     pairs = [(a[i], b[i]) for i in shared]
     hindrance = _hindrance(pairs)
@@ -142,8 +137,8 @@ def _compare_one(
     else:
         wins = np.array([float(second.success) - float(first.success) for first, second in pairs])
         regrets = np.array([s.regret - f.regret for f, s in pairs if not (f.failure or s.failure)])
-        success = float(wins.mean()), interval(wins, seed)
-        regret = (float(regrets.mean()), interval(regrets, seed)) if len(regrets) else nothing
+        success = float(wins.mean()), interval(wins)
+        regret = (float(regrets.mean()), interval(regrets)) if len(regrets) else nothing
         outcome, why = _judge(wins, success[1], regret[1], len(regrets), margin)
     return Comparison(task, name, len(shared), success[0], *success[1], regret[0], *regret[1], outcome, why)
 

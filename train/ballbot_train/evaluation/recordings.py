@@ -134,8 +134,6 @@ def read(path: str | Path, content: bytes | None = None) -> Recording:
         if arrays[name].shape != shape or arrays[name].dtype != np.uint8:
             raise files.FileError(f"{path}: {name} has the shape {arrays[name].shape}, and not {shape} of uint8")
     facts = files.read_json(path, _ABOUT_LIMIT, text.tobytes())
-    if not isinstance(facts, dict):
-        raise files.FileError(f"{path} is no recording: about holds no object")
     return Recording(
         facts, lengths.astype(np.int64), GRID * _unpacked(arrays["states"]), ACTION_GRID * _unpacked(arrays["actions"])
     )

@@ -218,7 +218,7 @@ def metadata_of(path: Path) -> dict[str, Any]:
     """Metadata of a dataset of `ballbot demos`; raises a ValueError for anything else."""
     try:
         metadata = files.read_json(path / "data" / "metadata.json")
-        if not isinstance(metadata, dict) or not isinstance(metadata.get("demos"), dict):
+        if not isinstance(metadata.get("demos"), dict):
             raise ValueError("not made by ballbot demos")
     except ValueError as error:
         raise ValueError(f'{path} is no dataset of "ballbot demos": {error}') from error

@@ -134,15 +134,12 @@ class Expert:
 
     def label(self, t: float, x: np.ndarray) -> np.ndarray:
         """(2,) float32 action in [−1, 1] that the expert would take in state x (8,)."""
-        if self._over(t) and not self.plans_failed:
+        plan = getattr(self._controller, "plan", None)
+        ended = self._task.first_exit and plan is not None and t - self._start > plan.trajectory.duration - 1e-9
+        if ended and not self.plans_failed:  # and the goal is not reached
             self.replan(t, x)
         force = self._controller.act(t, x)
         return np.clip(force / self._params.force_limit, -1, 1).astype(np.float32)
-
-    def _over(self, t: float) -> bool:
-        """Whether the plan has ended without reaching a first-exit goal."""
-        plan = getattr(self._controller, "plan", None)
-        return self._task.first_exit and plan is not None and t - self._start > plan.trajectory.duration - 1e-9
 
 
 def record(

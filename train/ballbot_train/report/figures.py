@@ -17,7 +17,7 @@ from matplotlib.ticker import LogFormatter
 
 from ballbot_gym import files
 from ballbot_gym.tasks.marker import Marker
-from ballbot_train.evaluation.basins import AXES, BasinMap
+from ballbot_train.evaluation.basins import AXES, BasinMap, fraction
 from ballbot_train.evaluation.results import Result, Row
 from ballbot_train.evaluation.robustness import NONE, REGRET, STRESSES, curve_of
 from ballbot_train.report.labels import ORDER, color, label
@@ -130,7 +130,7 @@ def basin_figure(maps: Sequence[BasinMap]) -> Figure:
                 basin.leans, basin.values, cells, cmap=colors, vmin=0, vmax=2, shading="nearest", alpha=0.85
             )
             axis.fill(*basin.boundary.T, fill=False, ec="k", lw=1.6)
-            axis.set_title(f"{label(controller)}: {basin.fraction(controller):.0%}", fontsize=10)
+            axis.set_title(f"{label(controller)}: {fraction([basin], controller):.0%}", fontsize=10)
             axis.axhline(0, color="0.5", lw=0.5)
             axis.axvline(0, color="0.5", lw=0.5)
             axis.set_xlim(-81, 81)
