@@ -5,14 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 
-try:
+with imports_of(__name__):
     import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
-from ballbot_gym.batch import BallbotBatch
+    from ballbot_gym.batch import BallbotBatch
 
 
 class BatchEpisodes(NamedTuple):

@@ -3,7 +3,8 @@
 Where a library is missing, the error names the extra that brings it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -33,6 +34,15 @@ def need(package: str, *libraries: str, extra: str | None = None) -> None:
     for name in libraries:
         if find_spec(name) is None:
             raise missing(package, name, extra)
+
+
+@contextmanager
+def imports_of(package: str, extra: str | None = None) -> Iterator[None]:
+    """Where a library that the block imports is not installed, the error is that of `missing`."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise missing(package, error.name, extra) from error
 
 
 def missing(package: str, library: str | None, extra: str | None = None) -> ModuleNotFoundError:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrows, pose, ring
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import rgb
 from ballbot_gym.tasks.marker import Marker
@@ -47,10 +47,8 @@ def has_viser() -> bool:
 
 def import_viser() -> Any:
     """viser, or an ImportError that says what to do."""
-    try:
+    with imports_of('the page of render_mode="human" and of `ballbot play`', "play"):
         import viser
-    except ModuleNotFoundError as error:
-        raise missing('the page of render_mode="human" and of `ballbot play`', error.name, "play") from error
     return viser
 
 

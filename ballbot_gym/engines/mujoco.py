@@ -9,7 +9,7 @@ import numpy as np
 
 from ballbot_gym import omni
 from ballbot_gym.engines.simulator import MOST_FRICTION, Simulator, State, check_kind, whole_substeps
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 
 _PRESSED = -1e-9  # m: height of the ball at reset; at 0 the first step would find no contact
@@ -284,10 +284,8 @@ def has_mujoco() -> bool:
 
 def import_mujoco() -> ModuleType:
     """MuJoCo, or an ImportError that says how to get it."""
-    try:
+    with imports_of('physics="mujoco"', "mujoco"):
         import mujoco
-    except ModuleNotFoundError as error:
-        raise missing('physics="mujoco"', error.name, "mujoco") from error
     return mujoco
 
 

@@ -23,7 +23,7 @@ from threading import Thread
 from typing import Any, TypeVar
 
 from ballbot_gym import registry
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.robots import Robot
 
 _NODE_SECONDS = 5.0  # between two looks whether a cluster has more cores
@@ -180,10 +180,8 @@ def _cluster(workers: Workers) -> Iterator[Pool]:
         ModuleNotFoundError: Ray is not installed.
         WorkerError: there is no cluster at the address.
     """
-    try:
+    with imports_of("--ray", "ray"):
         import ray  # pyright: ignore[reportMissingImports]
-    except ModuleNotFoundError as error:
-        raise missing("--ray", error.name, "ray") from error
     connected, running = ray.is_initialized(), set[Future]()
     with TemporaryDirectory() as folder:
         if not connected:

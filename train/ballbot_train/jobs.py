@@ -17,14 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym import files
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_train.console import progress_bars
 from ballbot_train.executors import Workers, completed
 
-try:
+with imports_of(__name__):
     import filelock
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 Entry = dict[str, Any]
 """What is kept of one finished item: anything that JSON holds, NaN included."""

@@ -16,17 +16,15 @@ import numpy as np
 
 import ballbot_gym
 from ballbot_gym import files
-from ballbot_gym.lazy import missing, need
+from ballbot_gym.lazy import imports_of, need
 from ballbot_gym.robots import PAPER, named_robot
 from ballbot_gym.tasks import Task
 from ballbot_train.policy import PolicyNetwork, load_network
 from ballbot_train.policy_files import OBSERVATION_VERSION, PolicyError, read_description, weights_digest
 from ballbot_train.weights import own_defaults
 
-try:
+with imports_of(__name__):
     import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 _OPSET, _IR = 14, 7  # the lowest that onnx converts to; onnxruntime reads them since 1.8
 _LARGEST_ERROR = 1e-5  # of an action: float32 sums in another order differ by less than 1e-6

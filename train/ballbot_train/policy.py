@@ -14,7 +14,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import ROBOT_FACTORS, Randomization
 from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
@@ -31,12 +31,10 @@ from ballbot_train.policy_files import (
 from ballbot_train.routes import Routes, stacked
 from ballbot_train.weights import checked, linear_layers, own_precision
 
-try:
+with imports_of(__name__):
     import safetensors
     import safetensors.torch
     import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 if TYPE_CHECKING:
     from ballbot_gym.batch import BatchState

@@ -10,14 +10,12 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.tasks.symmetry import Route
 from ballbot_train.weights import linear_layers
 
-try:
+with imports_of(__name__):
     import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 
 class Routes(torch.nn.Module):

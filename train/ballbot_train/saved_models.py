@@ -20,17 +20,15 @@ import numpy as np
 from gymnasium import spaces
 
 from ballbot_gym import files
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.sensors import observation_space
 from ballbot_gym.tasks import Task
 from ballbot_train.policy_files import PolicyError
 from ballbot_train.weights import checked, linear_layers, saved_by_torch
 
-try:
+with imports_of(__name__):
     import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 _ACTIVATIONS = {name.lower(): name for name in ("ELU", "GELU", "LeakyReLU", "ReLU", "SELU", "SiLU", "Tanh")}
 _MODULES = ("stable_baselines3.", "sb3_contrib.tqc.", "sb3_contrib.trpo.")  # whose policies act as it is written here

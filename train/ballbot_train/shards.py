@@ -20,16 +20,14 @@ from typing import Any
 import numpy as np
 
 from ballbot_gym import files
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_train import jobs
 from ballbot_train.console import progress_bars
 from ballbot_train.executors import Workers, completed
 
-try:
+with imports_of(__name__):
     import fsspec
     from fsspec.implementations.local import LocalFileSystem
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 EPISODES = 500
 """Episodes of a shard."""

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from ballbot_gym import files
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_train.policy_files import PolicyError
 
-try:
+with imports_of(__name__):
     import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 _LARGEST = 1e6  # far above any trained weight, and low enough for sums of their products in float32
 

@@ -2,13 +2,11 @@
 
 from typing import Annotated
 
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_train.executors import Workers
 
-try:
+with imports_of(__name__):
     import tyro
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 UNNAMED = tyro.conf.arg(name="")
 """Of a dataclass whose fields are options of their own names."""

@@ -22,7 +22,7 @@ from ballbot_gym import files
 from ballbot_gym.batch import BallbotBatch, BatchState
 from ballbot_gym.batch_episodes import run_episodes
 from ballbot_gym.env import make_task
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.randomization import Randomization, checked_randomization
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.rollout import Controller, PlanError
@@ -36,10 +36,8 @@ from ballbot_train.evaluation.statistics import share_interval
 from ballbot_train.executors import Workers
 from ballbot_train.policy import PolicyController, PolicyNetwork
 
-try:
+with imports_of(__name__):
     import torch
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 EPISODES = 10_000
 """Fresh episodes by default."""

@@ -14,7 +14,7 @@ import numpy as np
 from ballbot_gym import certified
 from ballbot_gym.certified import cache
 from ballbot_gym.env import make_task
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import name_of
@@ -25,10 +25,8 @@ from ballbot_train import jobs
 from ballbot_train.console import console, progress_bars
 from ballbot_train.executors import Workers, completed
 
-try:
+with imports_of(__name__):
     import filelock
-except ModuleNotFoundError as error:
-    raise missing(__name__, error.name) from error
 
 
 _TASKS = 32  # at least, so that many workers have something to do

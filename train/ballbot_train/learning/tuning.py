@@ -35,7 +35,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.env import make_task
-from ballbot_gym.lazy import missing
+from ballbot_gym.lazy import imports_of
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import executors, jobs
@@ -43,12 +43,10 @@ from ballbot_train.executors import Workers
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
 
-try:
+with imports_of("ballbot tune", "tune"):
     import optuna
     import sqlalchemy.exc  # Optuna's, as is yaml
     import yaml
-except ModuleNotFoundError as error:
-    raise missing("ballbot tune", error.name, "tune") from error
 
 _STARTUP_TRIALS = 8  # drawn at random before the estimator proposes, and before any trial is pruned
 _STUDY = "study.db"
