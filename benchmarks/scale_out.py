@@ -35,7 +35,7 @@ from ballbot_gym.env import make_task
 from ballbot_train import jobs, shards
 from ballbot_train.commands.certify import certify
 from ballbot_train.evaluation import optima
-from ballbot_train.evaluation.benchmark import benchmark
+from ballbot_train.evaluation.benchmark import Group, run_groups
 from ballbot_train.executors import Workers, completed
 from ballbot_train.learning.datasets import load_demos
 from ballbot_train.learning.demonstrations import DemoConfig, write_demos
@@ -185,8 +185,8 @@ def certified_set(out: Path, workers: Workers, episodes: int) -> dict[str, np.nd
 
 
 def leaderboard(out: Path, workers: Workers, episodes: int) -> dict[str, np.ndarray]:
-    controllers = {task: ["lqr"] for task in ("stabilize", "turn")}
-    done = benchmark(controllers, episodes // 2, "rk4", out, workers)
+    groups = [Group(task, "lqr", "rk4") for task in ("stabilize", "turn")]
+    done = run_groups(groups, episodes // 2, out, workers, record=True)
     return {
         name: np.array([getattr(row, name) for row in done])
         for name in ("cost", "optimum", "success", "failure", "settle_time")

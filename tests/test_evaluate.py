@@ -40,7 +40,7 @@ def test_a_row_counts_falls_and_takes_regret_over_standing_episodes():
 
 def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_path):
     def run():
-        return benchmark.benchmark({"stabilize": ["lqr"]}, 7, "rk4", tmp_path, 1)
+        return benchmark.run_groups([benchmark.Group("stabilize", "lqr", "rk4")], 7, tmp_path, 1, record=True)
 
     first = run()
     path, last = sorted(tmp_path.rglob("unfinished/*.json"))
@@ -56,7 +56,7 @@ def test_an_interrupted_benchmark_continues_without_running_anything_again(tmp_p
 
 def test_a_rerun_in_other_processes_gives_the_same_but_for_times(tmp_path):
     def rows(out, workers):
-        results = benchmark.benchmark({"stabilize": ["lqr"]}, 7, "rk4", out, workers)
+        results = benchmark.run_groups([benchmark.Group("stabilize", "lqr", "rk4")], 7, out, workers, record=True)
         return [replace(row, plan_ms_median=0, step_us_median=0) for row in leaderboard(results)]
 
     assert rows(tmp_path / "a", 1) == rows(tmp_path / "b", 2)

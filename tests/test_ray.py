@@ -10,7 +10,7 @@ import pytest
 from ballbot_gym.env import make_task
 from ballbot_train import jobs, shards
 from ballbot_train.commands.certify import certify
-from ballbot_train.evaluation.benchmark import benchmark
+from ballbot_train.evaluation.benchmark import Group, run_groups
 from ballbot_train.executors import Workers, completed
 from ballbot_train.learning import tuning
 from ballbot_train.learning.datasets import load_demos
@@ -49,7 +49,7 @@ def certified_shards(out, workers):
 
 
 def results(out, workers):
-    done = benchmark({"stabilize": ["lqr"], "turn": ["lqr"]}, 12, "rk4", out, workers)
+    done = run_groups([Group(task, "lqr", "rk4") for task in ("stabilize", "turn")], 12, out, workers, record=True)
     times = {"plan_seconds", "step_seconds"}
     return {
         f"{row.task}-{row.episode}": np.array([str(value) for name, value in vars(row).items() if name not in times])

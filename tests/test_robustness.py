@@ -29,7 +29,7 @@ def run(stress, episodes, out, seed=0):
 
 def test_the_undisturbed_rows_are_those_of_the_leaderboard(tmp_path):
     results = run("delay", 3, tmp_path)
-    plain = benchmark.benchmark({"stabilize": ["lqr"]}, 3, "rk4", tmp_path / "plain", 1)
+    plain = benchmark.run_groups([benchmark.Group("stabilize", "lqr", "rk4")], 3, tmp_path / "plain", 1)
     rows = leaderboard(results)
     assert [tuple(row.told.values()) for row in rows] == [(NONE, 0), ("delay", 20), ("delay", 40), ("delay", 60)]
     assert rows[0].cost_mean == summarize(plain).cost_mean

@@ -10,8 +10,8 @@ from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.console import Physics, RobotName, console, physics_or_default
 from ballbot_train.evaluation import robustness
-from ballbot_train.evaluation.benchmark import benchmark as run_benchmark
 from ballbot_train.evaluation.benchmark import (
+    Group,
     controllers_of,
     open_run,
     policy_digests,
@@ -70,7 +70,8 @@ def benchmark(
         title = f"{episodes} certified episodes per task and track, physics={physics}"
         publish(out, "tracks", title, robustness.TRACK_TABLE, rows)
         return
-    done = run_benchmark(chosen, episodes, physics, out, workers, seed, robot)
+    groups = [Group(task, name, physics, robot) for task, names in chosen.items() for name in names]
+    done = run_groups(groups, episodes, out, workers, seed, record=True)
     rows = leaderboard(done, seed)
     write_leaderboard(rows, done, facts, out)
     regrets = figures.save(figures.regret_figure(done), out / "figures" / "regret.png")

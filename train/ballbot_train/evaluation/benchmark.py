@@ -177,8 +177,9 @@ def run_groups(
         out: folder of the results.
         workers: a number of processes, or `Workers`.
         seed: of whatever is drawn: episode i draws the same in every group.
-        record: whether to write what the controllers do, for `ballbot submit`.
+        record: whether to write what the controllers do, for `ballbot submit`, which knows no robot with wheels.
     """
+    recorded = {group.robot: record and named_robot(group.robot).wheels is None for group in groups}
     parts = [range(start, min(start + CHUNK, episodes)) for start in range(0, episodes, CHUNK)]
     # the optima go along, because workers on other machines do not have this user's cache
     known = {
@@ -193,7 +194,7 @@ def run_groups(
                 [*map(str, (group.task, group.controller, group.physics, *group.told.values())), f"{part.start:03d}"]
             ),
             function=_episode_entries,
-            arguments=(group, registry.packed(group.controller), seed, known[group.problem], record),
+            arguments=(group, registry.packed(group.controller), seed, known[group.problem], recorded[group.robot]),
             items=tuple(part),
             group=group.counts_for or group.task,
         )
@@ -203,30 +204,13 @@ def run_groups(
     done, results = iter(jobs.run(work, out, workers)), []
     for group in groups:
         entries = [entry for _ in parts for entry in next(done)]
-        if record:
+        if recorded[group.robot]:
             motions = [recordings.read("a job", base64.b64decode(entry.pop("motion"))) for entry in entries]
             task, params = make_task(group.task, group.robot), named_robot(group.robot)
             who = group.physics, group.controller, registry.policy_digest(group.controller, task, group.robot)
             recordings.write_in(out, motions, task, group.task, params, *who)
         results += [Result(**entry, told=group.told) for entry in entries]
     return results
-
-
-def benchmark(
-    controllers: Mapping[str, Sequence[str]],
-    episodes: int,
-    physics: str,
-    out: Path,
-    workers: int | Workers,
-    seed: int = 0,
-    robot: str = PAPER,
-) -> list[Result]:
-    """Runs controllers by task, as `controllers_of` gives, and records what they do; the others as of `run_groups`.
-
-    Nothing is recorded of a robot with wheels, because `ballbot submit` knows none.
-    """
-    groups = [Group(task, name, physics, robot) for task, names in controllers.items() for name in names]
-    return run_groups(groups, episodes, out, workers, seed, record=named_robot(robot).wheels is None)
 
 
 def _episode_entries(
