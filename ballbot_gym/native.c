@@ -93,9 +93,12 @@ enum { CHUNK = 32 * LANES };
 /* Rows of what is told of a robot: state, tilt, force, the floor's grip. */
 enum { TILT = STATES, FORCE = STATES + 1, GRIPPED = FORCE + ACTIONS, TOLD = GRIPPED + GRIP };
 
-/* Rows of flags, after those of codegen.FLAGS; and of pay. */
+/* Rows of flags, which are those of codegen.FLAGS and one more; and of pay. */
 enum { TERMINATED, TRUNCATED, SUCCESS, FAILURE, CLIPPED, DONE };
 enum { REWARD, COST, SURVIVE, RUNNING, GOAL };
+
+/* Rows of counts: the violated limit, and the steps and the episode of the robot now. */
+enum { VIOLATED, STEPS, EPISODE };
 
 /* What a step reads and writes, in the order of native._Memory. The memory is that of rows of B numbers. */
 typedef struct {
@@ -106,17 +109,16 @@ typedef struct {
     int64_t env, component; /* how far apart the actions of robots are, and the components of one, in numbers */
     const real *x, *c, *action;
     const int64_t *steps, *episode, *seed;
-    const uint8_t *idle;  /* whose action is ignored, and whose next episode begins; null where there are none */
-    real *told, *seen;    /* TOLD and SEEN rows */
-    double *pay;          /* 5 rows */
-    uint8_t *flags;       /* 6 rows */
-    int64_t *violated, *new_steps;
-    int64_t *new_episode; /* these two are null where no episodes begin, */
-    real *new_c;
-    real *end_told;       /* and these four where ended episodes stay as they are. TOLD rows, */
-    double *end_pay;      /* COST to GOAL, */
-    uint8_t *end_flags;   /* SUCCESS to CLIPPED, */
-    float *end_seen;      /* and a row for each robot, of which those that end are written. */
+    const uint8_t *idle;     /* whose action is ignored, and whose next episode begins; null where there are none */
+    int64_t begins, restarts; /* whether episodes begin; and whether they do where others end */
+    real *told, *seen;       /* TOLD and SEEN rows */
+    double *pay;             /* 5 rows */
+    uint8_t *flags;          /* 6 rows */
+    int64_t *counts;         /* 3 rows; the last is written where episodes begin, */
+    real *new_c;             /* and so is this */
+    float *end_seen;         /* a row for each robot, of which those that end are written; null unless restarts. Else what
+                                ended episodes told is kept too: told has TOLD more rows, pay COST to GOAL again, and flags
+                                SUCCESS to CLIPPED. */
 } Memory;
 
 /* Tells the rewards, costs and flags of robots n to n + count - 1. Where count is known, the compiler makes SIMD of it. */
@@ -125,6 +127,7 @@ static inline __attribute__((always_inline)) void tell(const Memory *m, int64_t 
     const int64_t B = m->B;
     double *const pay = m->pay + n;
     uint8_t *const flags = m->flags + n;
+    int64_t *const counts = m->counts + n;
     for (int64_t k = 0; k < count; ++k) {
         const double reward = paid[k], cost = paid[LANES + k];
         /* the cost has a failure's price too, and the reward has not */
@@ -136,14 +139,14 @@ static inline __attribute__((always_inline)) void tell(const Memory *m, int64_t 
         pay[GOAL * B + k] = FIRST_EXIT && marks[SUCCESS * LANES + k] != 0 ? reward - SURVIVAL_REWARD - running : 0;
     }
     for (int64_t k = 0; k < count; ++k) {
-        m->violated[n + k] = (int64_t)limit[k];
-        m->new_steps[n + k] = m->steps[n + k] + 1;
+        counts[VIOLATED * B + k] = (int64_t)limit[k];
+        counts[STEPS * B + k] = m->steps[n + k] + 1;
     }
     for (int i = 0; i < FLAGS; ++i)
         for (int64_t k = 0; k < count; ++k)
             flags[i * B + k] = (uint8_t)(marks[i * LANES + k] != 0);
     for (int64_t k = 0; k < count; ++k)
-        flags[TRUNCATED * B + k] |= (uint8_t)(!flags[TERMINATED * B + k] & (m->new_steps[n + k] >= m->most));
+        flags[TRUNCATED * B + k] |= (uint8_t)(!flags[TERMINATED * B + k] & (counts[STEPS * B + k] >= m->most));
     for (int64_t k = 0; k < count; ++k)
         flags[DONE * B + k] = flags[TERMINATED * B + k] | flags[TRUNCATED * B + k];
 }
@@ -190,25 +193,26 @@ static void step_block(Memory *m, int64_t n, int64_t count) {
 static void step_chunk(Memory *m, int64_t first, int64_t last) {
     const int64_t B = m->B, size = last - first;
     int64_t begun[CHUNK], count = 0;
+    int64_t *const steps = m->counts + STEPS * B, *const episode = m->counts + EPISODE * B;
     for (int64_t n = first; n < last; n += LANES)
         step_block(m, n, last - n < LANES ? last - n : LANES);
-    if (!m->new_episode)
+    if (!m->begins)
         return;
     rows_copy(CONSTANTS, size, m->c + first, B, m->new_c + first, B);
-    memcpy(m->new_episode + first, m->episode + first, size * sizeof *m->episode);
-    if (m->end_told) {
-        rows_copy(TOLD, size, m->told + first, B, m->end_told + first, B);
+    memcpy(episode + first, m->episode + first, size * sizeof *episode);
+    if (m->restarts) {
+        rows_copy(TOLD, size, m->told + first, B, m->told + TOLD * B + first, B);
         for (int i = COST; i <= GOAL; ++i)
-            memcpy(m->end_pay + (i - COST) * B + first, m->pay + i * B + first, size * sizeof *m->pay);
+            memcpy(m->pay + (i + GOAL) * B + first, m->pay + i * B + first, size * sizeof *m->pay);
         for (int i = SUCCESS; i <= CLIPPED; ++i)
-            memcpy(m->end_flags + (i - SUCCESS) * B + first, m->flags + i * B + first, size);
+            memcpy(m->flags + (i + DONE + 1 - SUCCESS) * B + first, m->flags + i * B + first, size);
     }
     for (int64_t n = first; n < last; ++n) {
         if (m->idle && m->idle[n]) {
             CLEAR(GOAL + 1, m->pay);
             CLEAR(DONE + 1, m->flags);
-            m->violated[n] = -1;
-        } else if (m->end_told && m->flags[DONE * B + n]) {
+            m->counts[VIOLATED * B + n] = -1;
+        } else if (m->restarts && m->flags[DONE * B + n]) {
             for (int i = 0; i < SEEN; ++i)
                 m->end_seen[n * SEEN + i] = (float)m->seen[i * B + n];
             CLEAR(4, m->pay + COST * B);
@@ -217,12 +221,12 @@ static void step_chunk(Memory *m, int64_t first, int64_t last) {
             continue;
         }
         CLEAR(TOLD - FORCE, m->told + FORCE * B);
-        m->new_steps[n] = 0;
-        m->new_episode[n] += 1;
+        steps[n] = 0;
+        episode[n] += 1;
         begun[count++] = n;
     }
-    begin(B, count, begun, m->seed, m->new_episode, 0, m->told, m->new_c);
-    look_at(B, count, begun, m->new_steps, m->told, m->new_c, m->seen, m->told + TILT * B);
+    begin(B, count, begun, m->seed, episode, 0, m->told, m->new_c);
+    look_at(B, count, begun, steps, m->told, m->new_c, m->seen, m->told + TILT * B);
 }
 
 /* Takes chunks of the batch and does their steps, until none is left. */

@@ -8,7 +8,7 @@ bit-identical wherever an env stands in whatever batch.
 import ctypes
 import os
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import cache
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
@@ -23,7 +23,6 @@ from ballbot_gym.checks import check_finite, check_num_envs, fixed
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.randomization import Randomization
 from ballbot_gym.seeding import seeds_of
-from ballbot_gym.spares import Spares
 from ballbot_gym.tasks import Task
 
 # isort: split
@@ -81,7 +80,8 @@ class BallbotNative:
         self._entropy = int(np.random.SeedSequence().generate_state(1)[0])
         self._all = np.arange(self.num_envs)
         self._seen_rows = task.observation_size(params)
-        self._spares = self._written()
+        self._told_rows = params.state_size + 1 + params.action_size + (4 if params.grips else 0)
+        self._kinds = [self._written(restarts) for restarts in (False, True)]
 
     @property
     def state(self) -> State:
@@ -109,12 +109,11 @@ class BallbotNative:
         self._state = state
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_code": None, "_spares": None}
+        return {**self.__dict__, "_code": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._code = _checked_code(self.task, self.params, self.dtype is np.float64)
-        self._spares = self._written()
 
     def initial_state(
         self,
@@ -151,13 +150,9 @@ class BallbotNative:
         old = self.state
         if old is None:
             raise gymnasium.error.ResetNeeded("step() before reset()")
-        restart = self.restarts
-        begins = restart or waiting is not None
-        spares = self._spares[: 12 if restart else 8 if begins else 6]
-        made, addresses = zip(*(spare.take() for spare in spares), strict=True)
-        told, seen, pay, flags, violated, steps = made[:6]
-        episode, c = made[6:8] if begins else (old.episode, old.c)
-        end_told, end_pay, end_flags, end_seen = made[8:] if restart else (told, pay[1:], flags[2:5], None)
+        begins, restarts = self.restarts or waiting is not None, self.restarts
+        empty = np.empty
+        made = told, seen, pay, flags, counts, c, last = [empty(*kind) for kind in self._kinds[restarts]]
         given = actions
         if any(stride % actions.itemsize for stride in actions.strides):
             actions = actions.copy()
@@ -166,29 +161,46 @@ class BallbotNative:
             actions = actions.T  # the same memory, in the order that `_pointer` likes
         read = _pointers(old.x, old.c, actions, old.steps, old.episode, old.seed)
         idle = 0 if waiting is None else _pointer(waiting)
-        memory = _Memory(0, 0, self.num_envs, self.most_steps, 0, *apart, *read, idle, *addresses)
+        written = begins, restarts, *_pointers(*made)
+        memory = _Memory(0, 0, self.num_envs, self.most_steps, 0, *apart, *read, idle, *written)
         self._run(memory)
         if memory.bad:  # what was written is forgotten
             check_finite(given)
+        violated, steps, episode = counts[0], counts[1], counts[2]  # to unpack it takes three times as long
+        if not begins:
+            episode, c = old.episode, old.c
         self._state = old._replace(x=told[: self.params.state_size], c=c, steps=steps, episode=episode)
         observation = seen.astype(np.float32, copy=False).T
-        terminated, truncated, _, _, _, done = flags
-        ended = done.nonzero()[0]
-        now = self._info(told, pay[1:], flags[2:5], violated, c)
-        end = self._info(end_told, end_pay, end_flags, violated, old.c) if restart else now
-        last = (observation if end_seen is None else end_seen).take(ended, 0)
-        return VectorStep(observation, pay[0], terminated, truncated, ended, last, now, end)
+        ended = flags[5].nonzero()[0]
+        now = end = self._info(told, pay[1:5], flags[2:5], violated, c)
+        if restarts:
+            end = self._info(told[self._told_rows :], pay[5:], flags[6:], violated, old.c)
+        last = (last if restarts else observation).take(ended, 0)
+        return VectorStep(observation, pay[0], flags[0], flags[1], ended, last, now, end)
+
+    def _written(self, restarts: bool) -> list[tuple[tuple[int, int], np.dtype]]:
+        """Shapes and kinds of what a step writes, in the order of `_Memory`."""
+        size, kept, kinds = self.num_envs, int(restarts), (self.dtype, np.float64, np.bool_, np.int64, np.float32)
+        real, double, truth, whole, single = map(np.dtype, kinds)
+        return [
+            ((self._told_rows * (1 + kept), size), real),
+            ((self._seen_rows, size), real),
+            ((5 + 4 * kept, size), double),
+            ((len(codegen.FLAGS) + 1 + 3 * kept, size), truth),
+            ((3, size), whole),
+            ((len(self.task.constant_names), size), real),
+            ((size * kept, self._seen_rows), single),
+        ]
 
     def _info(
         self, told: np.ndarray, pay: np.ndarray, flags: np.ndarray, violated: np.ndarray, c: np.ndarray
     ) -> StepInfo:
         """Rows that native.c has written, as an info names them."""
-        success, failure, clipped = flags
         tilt = self.params.state_size
         grip = tilt + 1 + self.params.action_size
         force = told[tilt + 1 : grip]
-        marks, drawn = (success, failure, violated, clipped), self._state.drawn
-        return StepInfo(told[:tilt], pay[0], pay[1:], told[tilt], force, *marks, c, told[grip:], drawn)
+        marks, drawn = (flags[0], flags[1], violated, flags[2]), self._state.drawn
+        return StepInfo(told[:tilt], pay[0], pay[1:], told[tilt], force, *marks, c, told[grip : self._told_rows], drawn)
 
     def robot(self, i: int) -> BallbotParams:
         """The robot of env i in its running episode."""
@@ -214,31 +226,6 @@ class BallbotNative:
         self._code.observe(self.num_envs, self.num_envs, *_pointers(*arrays))
         return seen, tilt
 
-    def _written(self) -> list[Spares]:
-        """What a step writes, in the order of `_Memory`: 6 arrays always, 2 where episodes begin, 4 where they ended."""
-        size, real, robot = self.num_envs, self.dtype, self.params
-        rows = robot.state_size + 1 + robot.action_size + (4 if robot.grips else 0)
-        kinds: list[tuple[tuple[int, ...], Any]] = [
-            ((rows, size), real),
-            ((self._seen_rows, size), real),
-            ((5, size), np.float64),
-            ((len(codegen.FLAGS) + 1, size), np.bool_),
-            ((size,), np.int64),
-            ((size,), np.int64),
-            ((size,), np.int64),
-            ((len(self.task.constant_names), size), real),
-            ((rows, size), real),
-            ((4, size), np.float64),
-            ((3, size), np.bool_),
-            ((size, self._seen_rows), np.float32),
-        ]
-
-        def empty(shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
-            array = np.empty(shape, dtype)
-            return array, _pointer(array)
-
-        return [Spares(partial(empty, *kind)) for kind in kinds]
-
     def _run(self, memory: "_Memory") -> None:
         """A step, by several threads where that is faster."""
         if self.num_envs >= _PARALLEL_FROM:
@@ -253,15 +240,10 @@ class _Memory(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("taken", "done", "size", "most", "bad", "env", "component")),
-        *(
-            (name, ctypes.c_void_p)
-            for name in (
-                "x", "c", "action", "steps", "episode", "seed", "idle",
-                "told", "seen", "pay", "flags", "violated", "new_steps",
-                "new_episode", "new_c", "end_told", "end_pay", "end_flags", "end_seen",
-            )
-        ),
-    )  # fmt: skip
+        *((name, ctypes.c_void_p) for name in ("x", "c", "action", "steps", "episode", "seed", "idle")),
+        *((name, ctypes.c_int64) for name in ("begins", "restarts")),
+        *((name, ctypes.c_void_p) for name in ("told", "seen", "pay", "flags", "counts", "new_c", "end_seen")),
+    )
 
 
 def _pointers(*arrays: np.ndarray) -> list[int]:

@@ -29,7 +29,6 @@ from ballbot_gym.randomization import Randomization
 from ballbot_gym.registry import spec_of
 from ballbot_gym.robots import PAPER, checked_robot
 from ballbot_gym.sensors import observation_space
-from ballbot_gym.spares import fill, sparse_rows
 from ballbot_gym.tasks import Task
 from ballbot_gym.tasks.transition import limit_names
 
@@ -171,7 +170,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
         self.batch.restarts = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._none, self._nothing = np.full(self.num_envs, -1), np.zeros(self.num_envs)
         self._everywhere = np.ones(self.num_envs, np.bool_)
-        self._ends = sparse_rows(self.num_envs, self.single_observation_space.shape[0])
         for array in (self._none, self._nothing, self._everywhere):
             array.flags.writeable = False
 
@@ -263,7 +261,8 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             self._ended = done
         elif result.ended.size:
             infos["final_info"] = self._info(result.end, done)
-            infos["final_obs"] = fill(self._ends, result.ended, result.final_observation)
+            infos["final_obs"] = np.full(result.observation.shape, np.nan, np.float32)
+            infos["final_obs"][result.ended] = result.final_observation
             infos["_final_info"] = infos["_final_obs"] = done
             # Where an episode ended, the info below is that of the next episode's start, as after `reset`.
         infos |= self._info(result.now, self._everywhere)
