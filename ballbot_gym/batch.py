@@ -82,18 +82,8 @@ class BatchState(NamedTuple):
     """(17, B) what sensors remember; (0, B) where the state is observed."""
 
 
-class _Rows(NamedTuple):
-    """A `BatchState` in which each matrix is a tuple of its rows (B,). Everything is computed in this form."""
-
-    x: tuple[torch.Tensor, ...]
-    c: tuple[torch.Tensor, ...]
-    steps: torch.Tensor
-    episode: torch.Tensor
-    seed: torch.Tensor
-    drawn: tuple[torch.Tensor, ...]
-    actuator: tuple[torch.Tensor, ...]
-    past: tuple[torch.Tensor, ...]
-    sensors: tuple[torch.Tensor, ...]
+_Rows = Any
+"""A `BatchState` in which each matrix is a tuple of its rows (B,). Everything is computed in this form."""
 
 
 class BatchStep(NamedTuple):
@@ -489,7 +479,8 @@ class BallbotBatch:
         forces = self.params.action_size
         actuator = noise.resting((still,) * forces, task.control_dt)
         read = sensors.first(self.model(rows), state, z[-sensors.FIRST_DRAWS :], task.control_dt) if senses else ()
-        begun = _Rows(state, constants, zero, episode, seed, rows, actuator, (), read)
+        fields: Any = state, constants, zero, episode, seed, rows, actuator, (), read
+        begun: _Rows = BatchState(*fields)
         return begun._replace(past=self.history * (*self._seen(begun), *(still,) * forces)) if self.history else begun
 
     def _observe(self, now: _Rows) -> torch.Tensor:
@@ -539,7 +530,7 @@ def _compiled(transition: Any) -> Any:
 
 def _rows(state: BatchState) -> _Rows:
     parts: Any = (part.unbind(0) if part.ndim == 2 else part for part in state)
-    return _Rows(*parts)
+    return BatchState(*parts)
 
 
 def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
@@ -550,7 +541,7 @@ def _select(mask: torch.Tensor, new: _Rows, old: _Rows) -> _Rows:
             return tuple(map(chosen, a, b))
         return a if a is b else torch.where(mask, a, b)
 
-    return _Rows(*map(chosen, new, old))
+    return BatchState(*map(chosen, new, old))
 
 
 def any_of(conditions: Any) -> torch.Tensor:

@@ -154,8 +154,17 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"engine={engine!r} runs on the CPU, not on {device}")
         real: torch.dtype = dtype_named(dtype)
         self._dtype = np.float32 if real == torch.float32 else np.float64
-        seen = {"randomization": randomization, "history": history, "observation": observation}
-        self.batch = _batch(task, num_envs, device, real, compile, params, engine, seen)
+
+        def batch(compile: bool | str) -> BallbotBatch:
+            return BallbotBatch(
+                task, num_envs, device, real, compile, params, randomization, history=history, observation=observation
+            )
+
+        native = None
+        if engine == "native" or (engine == "auto" and torch.device(device).type == "cpu" and compile == "auto"):
+            # the batch is made in any case, because it checks the arguments; it allocates nothing
+            native = _native(batch(compile=False), self._dtype, must=engine == "native")
+        self.batch: BallbotBatch | BallbotNative = native or batch(compile)
         self.task, self.params, self.randomization = self.batch.task, self.batch.params, self.batch.randomization
         self.history, self.observation = self.batch.history, self.batch.observation
         self.num_envs, self.render_mode = self.batch.num_envs, render_mode
@@ -391,27 +400,6 @@ class BallbotVectorEnv(gymnasium.vector.VectorEnv):
             bad = np.flatnonzero(mask & ~safe)
             raise ValueError(f"start states of envs {bad[:8].tolist()} violate a limit of {self.task.id}")
         return state._replace(x=self._to_batch(x))
-
-
-def _batch(
-    task: Task,
-    num_envs: int,
-    device: str | torch.device,
-    dtype: torch.dtype,
-    compile: bool | str,
-    params: BallbotParams,
-    engine: str,
-    seen: dict[str, Any],
-) -> "BallbotBatch | BallbotNative":
-    """The envs of an engine; see `BallbotVectorEnv`."""
-    numbers = np.float32 if dtype == torch.float32 else np.float64
-    if engine == "native" or (engine == "auto" and torch.device(device).type == "cpu" and compile == "auto"):
-        # made in any case, because it checks the arguments; it allocates nothing
-        checked = BallbotBatch(task, num_envs, device, dtype, False, params, **seen)
-        native = _native(checked, numbers, must=engine == "native")
-        if native is not None:
-            return native
-    return BallbotBatch(task, num_envs, device, dtype, compile, params, **seen)
 
 
 def _native(batch: BallbotBatch, dtype: type[np.floating], must: bool) -> "BallbotNative | None":
