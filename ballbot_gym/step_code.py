@@ -27,7 +27,7 @@ from ballbot_gym.tasks.transition import outcome
 
 _log = logging.getLogger(__name__)
 
-_ROBOT = (
+ROBOT = (
     "moving_mass",
     "first_moment",
     "pivot_inertia",
@@ -54,7 +54,7 @@ class Code(NamedTuple):
     arguments: int
 
 
-class _Work:
+class Work:
     """A function's numbers in memory: of one simulator or one env.
 
     `pack` writes the first arguments, `call` calls it, `unpack` reads the first results, and check[0] is 0 if all are finite.
@@ -69,41 +69,19 @@ class _Work:
         self.call = partial(code.call, ctypes.c_void_p(self.numbers.ctypes.data))
 
 
-class Motion:
-    """RK4 steps of the closed form."""
+def motion(params: BallbotParams, start: bool) -> Code | None:
+    """The code of an RK4 step for robots of the same kind, with the same wheels; see `_code`.
 
-    def __init__(self, code: Code, params: BallbotParams, dt: float, substeps: int):
-        states, held = params.state_size, params.state_size + params.action_size  # numbers of a state; with a force
-        work = _Work(code, held, states, in_place=True)
-        self._pack, self._call, self._check, self._unpack = work.pack, work.call, work.check, work.unpack
-        self._numbers = work.numbers
-        self._substeps = range(substeps)
-        self._numbers[1 + held] = dt / substeps
-        self._robot = self._numbers[2 + held :]
-        self.set_params(params)
+    It computes in place, from a state and a force, then the step, s, and what `ROBOT` names.
+    """
+    kind = {"rolls": params.rolls, "wheels": params.wheels}
 
-    @staticmethod
-    def made(params: BallbotParams, start: bool) -> Code | None:
-        """The code for robots of the same kind, with the same wheels; see `_code`."""
-        kind = {"rolls": params.rolls, "wheels": params.wheels}
+    def compute(x: tuple, u: tuple, dt: tuple, robot: tuple) -> tuple:
+        model: Any = SimpleNamespace(**kind, **dict(zip(ROBOT, robot, strict=True)))
+        return dynamics.step(model, x, u, dt[0], 1)
 
-        def compute(x: tuple, u: tuple, dt: tuple, robot: tuple) -> tuple:
-            model: Any = SimpleNamespace(**kind, **dict(zip(_ROBOT, robot, strict=True)))
-            return dynamics.step(model, x, u, dt[0], 1)
-
-        sizes = params.state_size, params.action_size, 1, len(_ROBOT)
-        return _code(("motion", *kind.values()), compute, sizes, True, start)
-
-    def set_params(self, params: BallbotParams) -> None:
-        """Replaces the robot by one of the same kind."""
-        self._robot[:] = [getattr(params, name) for name in _ROBOT]
-
-    def step(self, x: State, u: tuple[float, ...]) -> State | None:
-        """The state after the force u, N, was held; None where Python must compute it."""
-        self._pack(*x, *u)
-        for _ in self._substeps:
-            self._call()
-        return self._unpack() if self._check[0] == 0 else None
+    sizes = params.state_size, params.action_size, 1, len(ROBOT)
+    return _code(("motion", *kind.values()), compute, sizes, True, start)
 
 
 class Judge:
@@ -117,7 +95,7 @@ class Judge:
         states, held = params.state_size, params.state_size + params.action_size
         # states before and after, between them the force; the number of steps, and whether grip is kept
         given = held + states + 2
-        work = _Work(code, given, _JUDGED)
+        work = Work(code, given, _JUDGED)
         self._pack, self._call, self._check, self._unpack = work.pack, work.call, work.check, work.unpack
         self.seen = work.numbers[10 : 10 + task.observation_size(params)]
         ends = (states, held, held + states, given)
@@ -208,7 +186,7 @@ def _checked(compute: Callable[..., Sequence[Any]], counts: Sequence[int], in_pl
         given = rng.uniform(-1.5, 1.5, sum(counts))
         expected = compute(*(tuple(part.tolist()) for part in np.split(given, ends)))
         code = code._replace(results=len(expected))
-        work = _Work(code, 1, 1, in_place)
+        work = Work(code, 1, 1, in_place)
         work.numbers[work.first : work.first + len(given)] = given
         work.call()
         if work.check[0] == 0 and work.numbers[1 : 1 + len(expected)].tobytes() != np.array(expected, float).tobytes():

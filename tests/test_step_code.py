@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ballbot_gym import TASKS, BallbotEnv, Randomization, dynamics, machine_code, ops, step_code, traced
-from ballbot_gym.step_code import Judge, Motion
+from ballbot_gym.engines.closed_form import Rk4Simulator
+from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import Stabilize
 from ballbot_gym.tasks.transition import outcome
 
@@ -92,7 +93,7 @@ def test_machine_code_gives_the_bits_of_python(task, physics, robot, randomizati
     step_code._begun.clear()
     reset_until_made(env)
     assert env._judge is not None
-    assert physics == "bullet" or env._simulator._motion is not None
+    assert physics == "bullet" or env._simulator._code is not None
     assert bits(play(env)) == python
 
 
@@ -120,14 +121,18 @@ def test_goals_limits_and_ends_are_those_of_python(task):
 
 @needs_compiler
 def test_numbers_that_are_not_finite_are_left_to_python(params):
-    Motion.made(params, start=True)
+    simulator: Any = Rk4Simulator(params, 0.02)
+    simulator.use_code(start=True)
     Judge.made(Stabilize(), params, start=True)
     wait()
-    codes: Any = Motion.made(params, start=False), Judge.made(Stabilize(), params, start=False)
-    motion, judge = Motion(codes[0], params, 0.02, 2), Judge(codes[1], Stabilize(), params)
+    simulator.use_code(start=False)
+    code: Any = Judge.made(Stabilize(), params, start=False)
+    judge = Judge(code, Stabilize(), params)
     good, bad = (0.1,) * 8, (0.1,) * 4 + (math.inf,) + (0.1,) * 3
-    assert motion.step(good, (1.0, 2.0)) == dynamics.step(params, good, (1.0, 2.0), 0.02, 2)
-    assert motion.step(bad, (1.0, 2.0)) is None
+    for x, finite in ((good, True), (bad, False)):
+        simulator.reset(x)
+        np.testing.assert_array_equal(simulator.step((1.0, 2.0)), dynamics.step(params, x, (1.0, 2.0), 0.02, 2))
+        assert (simulator._code.check[0] == 0) == finite
     assert judge.judge(good, (1.0, 2.0), bad, 1, 0.0) is None
     assert judge.judge(good, (1.0, 2.0), good, 1, 0.0) is not None
 

@@ -1,9 +1,8 @@
 """The closed form as a simulator. It needs NumPy alone."""
 
-from ballbot_gym import dynamics
+from ballbot_gym import dynamics, step_code
 from ballbot_gym.engines.simulator import Simulator, State, check_kind, whole_substeps
 from ballbot_gym.params import BallbotParams
-from ballbot_gym.step_code import Motion
 
 
 class Rk4Simulator(Simulator):
@@ -17,7 +16,7 @@ class Rk4Simulator(Simulator):
             dynamics.substeps_for(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
         )
         self._x: State = (0.0,) * params.state_size
-        self._motion: Motion | None = None  # in machine code
+        self._code: step_code.Work | None = None
 
     def reset(self, x: State, memory: tuple[float, ...] = ()) -> None:
         self._x = x
@@ -25,15 +24,25 @@ class Rk4Simulator(Simulator):
     def set_params(self, params: BallbotParams) -> None:
         check_kind(params, self._params)
         self._params = params
-        if self._motion is not None:
-            self._motion.set_params(params)
+        if self._code is not None:
+            self._code.numbers[-len(step_code.ROBOT) :] = [getattr(params, name) for name in step_code.ROBOT]
 
     def use_code(self, start: bool) -> None:
         """Takes machine code if there is some; if start, it is made in the background."""
-        if self._motion is None and (code := Motion.made(self._params, start)) is not None:
-            self._motion = Motion(code, self._params, self._dt, self._substeps)
+        if self._code is None and (code := step_code.motion(self._params, start)) is not None:
+            states, held = self._params.state_size, self._params.state_size + self._params.action_size
+            self._code = step_code.Work(code, held, states, in_place=True)
+            self._code.numbers[1 + held] = self._dt / self._substeps
+            self.set_params(self._params)
 
     def step(self, u: tuple[float, ...]) -> State:
-        x = None if self._motion is None else self._motion.step(self._x, u)
-        self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps) if x is None else x
+        code = self._code
+        if code is not None:
+            code.pack(*self._x, *u)
+            for _ in range(self._substeps):
+                code.call()
+            if code.check[0] == 0:
+                self._x = code.unpack()
+                return self._x
+        self._x = dynamics.step(self._params, self._x, u, self._dt, self._substeps)
         return self._x
