@@ -147,7 +147,7 @@ class BallbotEnv(gymnasium.Env):
         self._page: PageScene | None = None
         self._state: State = ()  # until the first reset
         self.params = checked_robot(robot, params)
-        physics = default_physics(self.params) if physics is None else physics
+        physics = default_physics() if physics is None else physics
         if not isinstance(physics, str) or physics not in PHYSICS:
             raise ValueError(f"unknown physics {physics!r}; known: {', '.join(map(repr, PHYSICS))}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:

@@ -188,7 +188,7 @@ def simulate(
 
     `physics` is "bullet", "mujoco" or "rk4"; default, the first that is installed, as for environments.
     """
-    simulator = make_simulator(default_physics(params) if physics is None else physics, params, control_dt)
+    simulator = make_simulator(default_physics() if physics is None else physics, params, control_dt)
     x = np.asarray(x0, np.float64)
     simulator.reset(tuple(x.tolist()))
     controller.reset(0.0, x, np.zeros(0))

@@ -48,7 +48,7 @@ def test_onnxruntime_acts_as_every_shipped_policy_over_an_episode(name, tmp_path
     history = read_description(SHIPPED / f"{name}.json")["spec"].get("history", 0)
     world = {"randomization": track_in(name) or None, "history": history}
     # in the closed form a ball that would slip ends the episode
-    physics = default_physics(named_robot(robot)) if named_robot(robot).grips else "rk4"
+    physics = default_physics() if named_robot(robot).grips else "rk4"
     seen = observations_of_an_episode(BallbotEnv(task, physics=physics, robot=robot, **world), policy)
     assert len(seen) > 50
     one_by_one = [runtime.run(None, {"observation": row[None]})[0][0] for row in seen]

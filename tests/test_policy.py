@@ -127,7 +127,7 @@ def test_shipped_policies_say_how_they_were_made_and_do_what_they_say(name, robo
     described = read_description(shipped_policies(make_task(name, robot), robot)[learner])
     assert described["training"]["command"].startswith("ballbot ")
     measured = described["measured"]
-    assert measured["physics"] == default_physics(named_robot(robot))
+    assert measured["physics"] == default_physics()
     assert measured["episodes"] == 200
     episodes = 1 if named_robot(robot).wheels else 2  # with wheels an episode takes a second
     row = evaluate(learner, name, episodes, robot=robot)

@@ -59,13 +59,9 @@ def check_installed(physics: str) -> None:
         import_mujoco()
 
 
-def default_physics(params: BallbotParams | None = None) -> str:
-    """What `physics` is by default: the first that is installed, and that can simulate the robot, if one is given.
-
-    "rk4" comes with one warning per process.
-    """
-    kind = 0 if params is None else _kind(params)
-    best = next(name for name in installed_physics() if PHYSICS[name][kind] is not None)
+def default_physics() -> str:
+    """What `physics` is by default: the first that is installed. "rk4" comes with one warning per process."""
+    best = installed_physics()[0]
     if best == "rk4" and not _noticed:
         _noticed.append(True)
         warnings.warn(
@@ -80,9 +76,5 @@ def make_simulator(
     physics: str, params: BallbotParams, control_dt: float, physics_dt: float | None = None
 ) -> Simulator:
     """The simulator of a robot, with contact where its ball rolls, except in "rk4". Args: as for `BulletSimulator`."""
-    return PHYSICS[physics][_kind(params)](params, control_dt, physics_dt)
-
-
-def _kind(params: BallbotParams) -> int:
-    """Which of the simulators of `PHYSICS` a robot needs."""
-    return params.rolls if params.wheels is None else 2
+    kind = params.rolls if params.wheels is None else 2
+    return PHYSICS[physics][kind](params, control_dt, physics_dt)

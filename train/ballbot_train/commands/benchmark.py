@@ -54,7 +54,7 @@ def benchmark(
             with the experts that are made for each track.
     """
     chosen = controllers_of(tasks, controllers, robot, tracks=bool(randomization))
-    physics = physics_or_default(physics, robot)
+    physics = physics_or_default(physics)
     settings: dict[str, Any] = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     if randomization:
         for track in randomization:

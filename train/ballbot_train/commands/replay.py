@@ -52,7 +52,7 @@ def replay(
     _check(0 < speed < math.inf, f"speed must be positive, not {speed}")
     _check(seconds is None or 0 < seconds < math.inf, f"seconds must be positive, not {seconds}")
     _check(width is None or 64 <= width <= 7680, f"width must be 64 to 7680 px, not {width}")
-    physics = physics_or_default(physics, robot)
+    physics = physics_or_default(physics)
     shown, name = _read(source, controllers, episode, physics, robot, frictions)
     end = min(shown.duration if seconds is None else seconds, shown.duration)
     path = out / f"{name}.{format}"

@@ -48,7 +48,7 @@ def robustness(
     chosen = controllers_of(tasks, controllers, robot)
     if not controllers:
         chosen = {task: [*group, "nmpc-offset-free"] for task, group in chosen.items()}
-    physics = physics_or_default(physics, robot)
+    physics = physics_or_default(physics)
     check_some("stress", stresses, stressed.STRESSES)
     settings = {"physics": physics, "episodes": checked_episodes(episodes), "seed": seed}
     facts = open_run(out, workers, policy_digests(chosen, robot), robot, **settings)

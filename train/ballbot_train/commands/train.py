@@ -109,7 +109,7 @@ def _train(learner: str, run: Run, settings: Any, command: str) -> None:
     world = None if run.randomization is None else varied
     given = settings, run.seed, run.demos, start, world, run.history, run.informed
     made = LEARNERS[learner].make(problem, named_robot(run.robot), *given)
-    physics = physics_or_default(None, run.robot)
+    physics = physics_or_default(None)
     row = training.train(made, problem, config, out, run.resume, run.test_episodes)
     console.print(
         f"in {PHYSICS_NAMES[physics]}: {100 * row.success:.1f} % success, {row.falls} falls of {row.episodes}, regret "
