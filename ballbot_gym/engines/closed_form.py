@@ -15,6 +15,7 @@ class Rk4Simulator(Simulator):
         self._substeps = (
             dynamics.substeps_for(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
         )
+        self._each = range(self._substeps)
         self._x: State = (0.0,) * params.state_size
         self._code: step_code.Work | None = None
 
@@ -39,7 +40,7 @@ class Rk4Simulator(Simulator):
         code = self._code
         if code is not None:
             code.pack(*self._x, *u)
-            for _ in range(self._substeps):
+            for _ in self._each:
                 code.call()
             if code.check[0] == 0:
                 self._x = code.unpack()
