@@ -30,10 +30,10 @@ def backwards(starts=None, **options):
 
 
 def some_starts(task, count=20):
-    x = torch.zeros(8, count, dtype=torch.float64)
+    x, passed = torch.zeros(8, count, dtype=torch.float64), torch.arange(count)[None] % 5
     x[0], x[1], x[5] = -torch.rand(count) - 1, -0.5, 3.0
     c = torch.full((len(task.constant_names), count), 3.0, dtype=torch.float64)
-    return curricula.Starts(x, c, torch.arange(count) % 5, 5 - torch.arange(count) % 5)
+    return torch.cat([x, c, passed, 5 - passed])
 
 
 @pytest.fixture
@@ -131,10 +131,10 @@ def test_without_pay_the_reward_is_minus_the_cost_and_a_failure_has_its_price(na
 def test_optimal_starts_lie_on_optima_of_episodes_that_are_no_certified_ones():
     task = make_task("turn", duration=8.0)
     starts = curricula.optimal_starts(task, default_params(), 1, 100)
-    assert torch.equal(starts.steps, torch.arange(len(starts.steps)))
-    assert starts.x[:2, 0].tolist() == [0.0, -1.0]
-    assert float(starts.x[5, 0]) == pytest.approx(float(starts.c[0, 0]))
-    assert not task.is_goal(starts.x[:, -1].numpy(), starts.c[:, -1].numpy())
+    assert starts[-2].tolist() == list(range(starts.shape[1]))
+    assert starts[:2, 0].tolist() == [0.0, -1.0]
+    assert float(starts[5, 0]) == pytest.approx(float(starts[8, 0]))
+    assert not task.is_goal(starts[:8, -1].numpy(), starts[8:-2, -1].numpy())
 
 
 def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
@@ -155,7 +155,7 @@ def test_short_episodes_end_after_their_seconds_and_the_others_do_not():
 
 
 def test_training_backwards_goes_on_from_its_state_as_if_never_stopped(monkeypatch, constants):
-    monkeypatch.setattr(curricula, "optimal_starts", lambda task, params, count, steps, reserve: some_starts(task))
+    monkeypatch.setattr(curricula, "optimal_starts", lambda task, params, count, steps: some_starts(task))
     constants(EPISODES=2, SUCCESS=0.0, OPTIMA_SUCCESS=0.0, REACH=0.04)
     tiny = {"iterations": 3, "num_envs": 4, "num_steps": 24, "episode_seconds": 0.2, "batch_size": 16, "hidden": (8,)}
     settings = replace(LEARNERS["ppo"].settings("turn"), **tiny)

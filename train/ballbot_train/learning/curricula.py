@@ -19,7 +19,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,21 +53,8 @@ _KEPT_STARTS = 1024  # of the last episodes that went wrong
 _OWN, _ON_OPTIMUM = 0, 1  # how an episode began
 _STATE = (
     *("_goal_factor", "_ramp", "_reach", "_has_settled", "_own_episodes", "_on_optima"),
-    *("_kind", "_again", "_begun", "_hard"),
+    *("_kind", "_again", "_begun", "_hard", "_starts"),
 )
-
-
-class Starts(NamedTuple):
-    """n states along optima, as tensors."""
-
-    x: torch.Tensor
-    """(8, n) states."""
-    c: torch.Tensor
-    """(nc, n) constants of their episodes."""
-    steps: torch.Tensor
-    """(n,) int64, control steps that have passed of their episodes."""
-    left: torch.Tensor
-    """(n,) int64, control steps to the end of the optimum."""
 
 
 @dataclass
@@ -150,11 +137,11 @@ class CurriculumBatch(BallbotBatch):
         self._has_settled = not backwards  # whether enough episodes of the task itself have succeeded
         self._kind = torch.full((num_envs,), _OWN, dtype=torch.int8)
         self._again = torch.zeros(num_envs, dtype=torch.bool)  # whose start is repeated
-        # states, constants and passed steps at the starts of the running episodes, and of the last ones of each kind that
-        # went wrong
+        # states, constants and passed steps: at the starts of the running episodes, at those of the last ones of each kind
+        # that went wrong, and, with the steps that are left, along optima
         rows = 8 + len(task.constant_names) + 1
         self._begun, self._hard = torch.zeros(rows, num_envs), [torch.zeros(rows, 0)] * 2
-        self._starts: Starts | None = None
+        self._starts: torch.Tensor | None = None
         self._set_difficulty()
 
     @property
@@ -206,12 +193,11 @@ class CurriculumBatch(BallbotBatch):
 
     def curriculum_state(self) -> dict[str, Any]:
         """What the batch remembers besides `state`: tensors and plain values."""
-        return state_of(self, _STATE) | {"starts": None if self._starts is None else list(self._starts)}
+        return state_of(self, _STATE)
 
     def load_curriculum_state(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
         load_state(self, _STATE, state)
-        self._starts = None if state["starts"] is None else Starts(*state["starts"])
         self._set_difficulty()
 
     def _potential(self, x: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
@@ -254,7 +240,7 @@ class CurriculumBatch(BallbotBatch):
     @property
     def _optima_succeed(self) -> bool:
         """Whether episodes begin anywhere on optima, and enough of them succeed for a narrower goal."""
-        longest = math.inf if self._starts is None else float(self._starts.left.max()) * self.task.control_dt
+        longest = math.inf if self._starts is None else float(self._starts[-1].max()) * self.task.control_dt
         return self._reach >= min(longest, self.own_task.duration) and self._on_optima.share >= _OPTIMA_SUCCESS
 
     @property
@@ -282,23 +268,22 @@ class CurriculumBatch(BallbotBatch):
     def _start_on_optima(self, ended: torch.Tensor) -> None:
         """Moves a share of the episodes that have just begun into states along optima."""
         if self._starts is None:
-            self._starts = optimal_starts(self._full, self.params, _OPTIMA, self.own_task.steps, _RESERVE)
+            self._starts = optimal_starts(self._full, self.params, _OPTIMA, self.own_task.steps)
         if self._eligible is None:  # states outside of the goal, which may be wide
-            inside = self.task.goal(
-                self._starts.x.unbind(0), self.task.at(self._starts.c.unbind(0), self.task.duration)
-            )
+            x, c = self._starts[:8].unbind(0), self._starts[8:-2].unbind(0)
+            inside = self.task.goal(x, self.task.at(c, self.task.duration))
             reached = torch.stack([excess <= 0 for excess in inside]).all(0)
-            near = self._starts.left <= max(1, round(self._reach / self.task.control_dt))
+            near = self._starts[-1] <= max(1, round(self._reach / self.task.control_dt))
             outside = (near & ~reached).nonzero()[:, 0]
             self._eligible = outside if len(outside) else near.nonzero()[:, 0]
         moved = ended & (torch.rand(self.num_envs) < _ON_OPTIMA)
         self._kind = torch.where(moved, _ON_OPTIMUM, self._kind)
-        starts, count = self._starts, int(moved.sum())
+        count = int(moved.sum())
         if not count:
             return
-        lengths = (starts.steps + starts.left)[self._eligible]  # so that every optimum is met as often as any other
+        lengths = self._starts[-2:, self._eligible].sum(0).float()  # so that every optimum is met as often as any other
         chosen = self._eligible[torch.multinomial(1.0 / lengths, count, replacement=True)]
-        self._move(moved, starts.x[:, chosen], starts.c[:, chosen], starts.steps[chosen])
+        self._move(moved, self._starts[:-1, chosen])
 
     def _keep_hard(self, result: BatchStep) -> None:
         """Remembers the starts of the episodes that have just failed or missed the goal."""
@@ -315,8 +300,7 @@ class CurriculumBatch(BallbotBatch):
             if not hard.shape[1]:
                 continue
             self._again = self._again | again
-            chosen = hard[:, torch.randint(hard.shape[1], (int(again.sum()),))]
-            self._move(again, chosen[:8], chosen[8:-1], chosen[-1].long())
+            self._move(again, hard[:, torch.randint(hard.shape[1], (int(again.sum()),))])
 
     @property
     def _retried_share(self) -> float:
@@ -332,13 +316,14 @@ class CurriculumBatch(BallbotBatch):
         starts = torch.cat([self.state.x, self.state.c, self.state.steps[None]]).float()
         self._begun = torch.where(begun, starts, self._begun)
 
-    def _move(self, moved: torch.Tensor, x: torch.Tensor, c: torch.Tensor, passed: torch.Tensor) -> None:
-        """Moves n of the B episodes to states (8, n), constants (nc, n) and counts (n,) of control steps that have passed."""
+    def _move(self, moved: torch.Tensor, starts: torch.Tensor) -> None:
+        """Moves n of the B episodes to starts (8+nc+1, n): states, constants and control steps that have passed."""
         if not moved.any():
             return
         assert self.state is not None
         states, constants, steps = self.state.x.clone(), self.state.c.clone(), self.state.steps.clone()
-        states[:, moved], constants[:, moved], steps[moved] = x.to(states.dtype), c.to(constants.dtype), passed
+        states[:, moved], constants[:, moved] = starts[:8].to(states.dtype), starts[8:-1].to(constants.dtype)
+        steps[moved] = starts[-1].long()
         self.state = self.state._replace(x=states, c=constants, steps=steps)
 
     def _shorten(self, ended: torch.Tensor) -> None:
@@ -366,10 +351,14 @@ def widened(task: Task, factor: float) -> Task:
     return wide(**{field.name: getattr(task, field.name) for field in fields(task)})
 
 
-def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int, reserve: float = 0.0) -> Starts:
+def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int) -> torch.Tensor:
     """The states along the optima of `count` episodes drawn for training, before their ends and before control step `steps`.
 
-    The optima leave the share `reserve` of the goal's tolerances unused.
+    The optima leave the share `_RESERVE` of the goal's tolerances unused.
+
+    Returns:
+        (8+nc+2, n) float64: states, constants of their episodes, and control steps that have passed of these and that are
+        left to the end of the optimum.
 
     Raises:
         ValueError: no optimum was found.
@@ -377,16 +366,15 @@ def optimal_starts(task: Task, params: BallbotParams, count: int, steps: int, re
     from ballbot_baselines.optimum import Backoff, find_optimum  # it imports CasADi
 
     console.print(f"finding {count} optima on which training episodes begin")
-    found, backoff = [], Backoff(goal=max(Backoff.goal, reserve))
+    found, backoff = [], Backoff(goal=_RESERVE)
     for x, c, _ in zip(*fresh.draw(task, range(count), 0, "training"), strict=True):
         try:
             states = find_optimum(task, params, x, c, backoff).trajectory.x
         except PlanError:
             continue
         n = min(len(states) - 1, steps)
-        found.append((states[:n], np.tile(c, (n, 1)), np.arange(n), len(states) - 1 - np.arange(n)))
+        passed = np.arange(n)
+        found.append(np.column_stack([states[:n], np.tile(c, (n, 1)), passed, len(states) - 1 - passed]))
     if not found:
         raise ValueError(f"{task.id}: no optimum was found on which episodes could begin")
-    joined = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    x, c, passed, left = (torch.from_numpy(part.T.copy()) for part in joined)
-    return Starts(x, c, passed, left)
+    return torch.from_numpy(np.concatenate(found).T.copy())
