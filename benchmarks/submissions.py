@@ -83,7 +83,8 @@ class Forger:
         self.step = int(rng.integers(1, self.steps + 1))
 
     def write(self, about: dict[str, Any] | None = None, **changes: Any) -> None:
-        recordings.write(self.target, self.honest.about | (about or {}), replace(self.honest, **changes))
+        changed = replace(self.honest, about=self.honest.about | (about or {}), **changes)
+        files.write(self.target, recordings.to_bytes(changed))
 
     def size(self, low: float, high: float) -> float:
         return float(self.rng.choice([-1, 1]) * np.exp(self.rng.uniform(np.log(low), np.log(high))))

@@ -38,9 +38,8 @@ def forge(submitted, tmp_path):
 
     def of(about=None, **changes):
         honest = recordings.read(submitted()[1])
-        path = tmp_path / "forged.npz"
-        recordings.write(path, honest.about | (about or {}), replace(honest, **changes))
-        return verify(path, EPISODES)
+        forged = replace(honest, about=honest.about | (about or {}), **changes)
+        return verify(files.write(tmp_path / "forged.npz", recordings.to_bytes(forged)), EPISODES)
 
     return of
 
@@ -69,7 +68,7 @@ def test_an_episode_without_a_plan_has_failed_at_the_full_price(submitted, tmp_p
     gave_up = replace(
         honest, lengths=changed(honest.lengths, 0, 0), states=honest.states[first + 1 :], actions=honest.actions[first:]
     )
-    entry = verify(recordings.write(tmp_path / "gave-up.npz", honest.about, gave_up), EPISODES)
+    entry = verify(files.write(tmp_path / "gave-up.npz", recordings.to_bytes(gave_up)), EPISODES)
     assert (entry.falls, entry.ends, entry.costs[0]) == (1, ["no plan", "success"], 800.0)
 
 
@@ -151,7 +150,8 @@ def test_what_a_file_says_about_itself_is_checked(about, why, forge):
 
 def test_a_motion_of_another_engine_is_refused(submitted, tmp_path):
     honest = recordings.read(submitted("bullet")[1])
-    path = recordings.write(tmp_path / "renamed.npz", honest.about | {"physics": "rk4"}, honest)
+    renamed = replace(honest, about=honest.about | {"physics": "rk4"})
+    path = files.write(tmp_path / "renamed.npz", recordings.to_bytes(renamed))
     with pytest.raises(SubmissionError, match="episode 0, step 1: the next state does not follow"):
         verify(path, EPISODES)
 
@@ -164,7 +164,8 @@ def test_too_few_episodes_are_refused(submitted):
 def test_a_folder_of_several_controllers_must_be_told_which(submitted, tmp_path):
     honest = recordings.read(submitted()[1])
     for name in ("a", "b"):
-        recordings.write(tmp_path / recordings.FOLDER / f"{name}.npz", honest.about | {"controller": name}, honest)
+        told = replace(honest, about=honest.about | {"controller": name})
+        files.write(tmp_path / recordings.FOLDER / f"{name}.npz", recordings.to_bytes(told))
     with pytest.raises(ValueError, match="holds recordings of a, b; say which with --controller"):
         submit(tmp_path, "mine", "", tmp_path)
     assert [path.name for path in submit(tmp_path, "mine", "", tmp_path, "b")] == ["turn-mine.npz"]

@@ -15,7 +15,7 @@ An .npz file holds
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ def write_in(
     }
     joined = (np.concatenate([getattr(each, part) for each in episodes]) for part in ("lengths", "states", "actions"))
     path = out / FOLDER / file_of(name, about["robot"], Path(controller).stem)
-    return write(path, about, Recording(about, *joined))
+    return files.write(path, to_bytes(Recording(about, *joined)))
 
 
 def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
@@ -96,15 +96,10 @@ def file_of(task: str, robot: str, name: str, ending: str = ".npz") -> str:
     return f"{file_name(task, robot)}-{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-')}{ending}"
 
 
-def write(path: Path, about: Mapping[str, Any], recording: Recording) -> Path:
-    """Writes a recording, with other words about it."""
-    return files.write(path, to_bytes(recording, about))
-
-
-def to_bytes(recording: Recording, about: Mapping[str, Any] = {}) -> bytes:
-    """The content of a recording's file, with other words about it."""
+def to_bytes(recording: Recording) -> bytes:
+    """The content of a recording's file."""
     arrays = {
-        "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
+        "about": np.frombuffer(json.dumps(recording.about).encode(), np.uint8),
         "lengths": recording.lengths.astype(np.uint32),
         "states": _packed(recording.states / GRID),
         "actions": _packed(recording.actions / ACTION_GRID),
@@ -113,7 +108,7 @@ def to_bytes(recording: Recording, about: Mapping[str, Any] = {}) -> bytes:
 
 
 def read(path: str | Path, content: bytes | None = None) -> Recording:
-    """What `write` wrote. Sizes are checked before anything is unpacked, and nothing in the file is executed.
+    """What `to_bytes` gave, in a file. Sizes are checked before anything is unpacked, and nothing in the file is executed.
 
     Args: content: as `to_bytes` gives it, if it is read already.
 

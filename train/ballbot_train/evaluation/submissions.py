@@ -176,7 +176,7 @@ def submit(results: Path, name: str, link: str, out: Path, controller: str = "")
         if recording.about["controller"] == (controller or names[0]):
             about = recording.about | {"name": name, "link": link}
             path = out / recordings.file_of(about["task"], about["robot"], name)
-            written.append(recordings.write(path, about, recording))
+            written.append(files.write(path, recordings.to_bytes(replace(recording, about=about))))
     return written
 
 
