@@ -91,7 +91,7 @@ def test_a_shard_that_was_changed_is_named(tmp_path):
     url = str(tmp_path / "set")
     made(url, tmp_path / "out", 9)
     files.write_npz(Path(url) / "shard-000001.npz", {"i": np.arange(3)})
-    with pytest.raises(shards.ShardError, match=r"shard-000001\.npz is not the file that manifest\.json names"):
+    with pytest.raises(files.FileError, match=r"shard-000001\.npz is not the file that manifest\.json names"):
         list(shards.Shards(url))
 
 
@@ -100,7 +100,7 @@ def test_a_shard_that_was_changed_is_named(tmp_path):
 )
 def test_a_damaged_manifest_is_named(text, tmp_path):
     (tmp_path / shards.MANIFEST).write_text(text)
-    with pytest.raises(shards.ShardError, match=r"manifest\.json is damaged"):
+    with pytest.raises(files.FileError, match=r"manifest\.json is damaged"):
         shards.Shards(tmp_path)
 
 

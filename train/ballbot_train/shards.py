@@ -40,10 +40,6 @@ _VERSION = 1
 Arrays = Mapping[str, np.ndarray]
 
 
-class ShardError(ValueError):
-    """A set that is missing or damaged; the message names it."""
-
-
 class Shards:
     """A set of shards, to read or to add to."""
 
@@ -51,7 +47,7 @@ class Shards:
         """Reads the manifest, if there is one.
 
         Raises:
-            ShardError: the manifest is damaged, or nothing can be read there.
+            FileError: the manifest is damaged, or nothing can be read there.
         """
         self.url = str(url).rstrip("/")
         try:
@@ -60,7 +56,7 @@ class Shards:
         except FileNotFoundError:
             text = None
         except (ImportError, ValueError, OSError) as error:
-            raise ShardError(f"{self.url} cannot be read: {error}") from error
+            raise files.FileError(f"{self.url} cannot be read: {error}") from error
         self.about: dict[str, Any] | None = None
         """What the set was made from; None where there is none yet."""
         self._shards: dict[int, dict[str, Any]] = {}
@@ -79,7 +75,7 @@ class Shards:
                 if shard["file"] != _name(i) or not known or shard["episodes"] < 0:
                     raise ValueError(f"shard {i}")
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise ShardError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set anew") from error
+            raise files.FileError(f"{self.url}/{MANIFEST} is damaged ({error!r}); make the set anew") from error
 
     @property
     def numbers(self) -> list[int]:
@@ -99,16 +95,16 @@ class Shards:
         """The arrays of a shard.
 
         Raises:
-            ShardError: the shard is missing, or is not the one of the manifest.
+            FileError: the shard is missing, or is not the one of the manifest.
         """
         shard = self._shards[number]
         path = f"{self.url}/{shard['file']}"
         try:
             content = self._content(shard["file"], _LIMIT)
         except (OSError, files.FileError) as error:
-            raise ShardError(f"{path} cannot be read: {error}") from error
+            raise files.FileError(f"{path} cannot be read: {error}") from error
         if hashlib.sha256(content).hexdigest() != shard["sha256"]:
-            raise ShardError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
+            raise files.FileError(f"{path} is not the file that {MANIFEST} names; delete both, and make the set anew")
         return files.read_npz(path, _LIMIT, content)
 
     def _content(self, name: str, limit: int) -> bytes:

@@ -6,7 +6,7 @@ from ballbot_gym.robots import PAPER, file_name
 from ballbot_gym.tasks import TASKS
 from ballbot_train.commands.options import WorkersOption
 from ballbot_train.commands.train import Run, command_with
-from ballbot_train.console import RobotName, check_least, check_names, console, print_table, progress_bar
+from ballbot_train.console import RobotName, check_least, check_names, console, print_table
 from ballbot_train.executors import Workers
 from ballbot_train.learning.learners import LEARNERS
 
@@ -45,9 +45,7 @@ def tune(
     from ballbot_train.learning import tuning  # it imports torch and Optuna
 
     search = tuning.Search(learner, task, tuple(range(seeds)), env_steps, evaluations, robot)
-    with progress_bar() as progress:
-        bar = progress.add_task(f"{learner} {task}", total=trials)
-        best = tuning.run(search, trials, out, lambda count: progress.update(bar, completed=count), workers)
+    best = tuning.run(search, trials, out, workers)
     if not best:
         raise ValueError(f"none of {trials} trials came to its end; {out / 'study.db'} says why. Give more --trials")
     settings = tuning.settings_of(search, {name: best["settings"][name] for name in tuning.SPACES[learner]})

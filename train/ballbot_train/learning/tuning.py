@@ -26,7 +26,7 @@ prune, and say what theirs reached.
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from ballbot_gym.lazy import imports_of
 from ballbot_gym.robots import PAPER, named_robot, robot_setting
 from ballbot_gym.tasks import TASKS
 from ballbot_train import executors, jobs
+from ballbot_train.console import progress_bars
 from ballbot_train.executors import Workers
 from ballbot_train.learning import training
 from ballbot_train.learning.learners import LEARNERS, ppo, sac
@@ -109,7 +110,6 @@ def run(
     search: Search,
     trials: int,
     out: Path,
-    on_trial: Callable[[int], None] = lambda count: None,
     workers: int | Workers = 1,
 ) -> dict[str, Any]:
     """Searches until so many trials have ended, goes on with what is there, and writes all files.
@@ -118,7 +118,6 @@ def run(
         search: what is searched.
         trials: how many, pruned and failed ones included.
         out: folder of the search.
-        on_trial: called with the number of trials that have ended.
         workers: a number of processes, or `Workers`; each runs a trial at a time. One process is this one, and then the same
             search proposes the same trials. With more, proposals depend on which trials have ended before.
 
@@ -135,7 +134,9 @@ def run(
     jobs.claim(out, asdict(search), "config.json")
     try:
         study = open_study(search, out)
-        on_trial(begun := _ended(study))
+        ended = _State.COMPLETE, _State.PRUNED
+        begun = sum(trial.state in ended or "error" in trial.user_attrs for trial in study.trials)  # not those killed
+        named = f"{search.learner} {search.task}"
 
         def tasks() -> Iterator[Any]:
             for _ in range(begun, trials):
@@ -143,10 +144,12 @@ def run(
                 completed = study.get_trials(states=(_State.COMPLETE,))
                 yield trial, attempt, (search, settings_of(search, trial.params), completed)
 
-        for trial, reached in executors.completed(tasks(), workers, serial=True):
-            _end(study, trial, reached)
-            write_best(study, search, out)
-            on_trial(_ended(study))
+        with progress_bars({named: trials}) as advance:
+            advance(named, begun)
+            for trial, reached in executors.completed(tasks(), workers, serial=True):
+                _end(study, trial, reached)
+                write_best(study, search, out)
+                advance(named, 1)
         return write_best(study, search, out)
     except (sqlalchemy.exc.DBAPIError, optuna.exceptions.StorageInternalError) as error:
         cause = error.__cause__ or error
@@ -245,12 +248,6 @@ def _end(study: "optuna.Study", trial: "optuna.Trial", reached: dict[str, Any]) 
         study.tell(trial, float(np.mean(reached["costs"])))
     else:
         study.tell(trial, state=_State.FAIL if "error" in reached else _State.PRUNED)
-
-
-def _ended(study: "optuna.Study") -> int:
-    """How many trials ended by themselves."""
-    states = _State.COMPLETE, _State.PRUNED
-    return sum(trial.state in states or "error" in trial.user_attrs for trial in study.trials)
 
 
 def write_best(study: "optuna.Study", search: Search, out: Path) -> dict[str, Any]:
