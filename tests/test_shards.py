@@ -2,6 +2,7 @@
 
 import json
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from ballbot_gym import files
 from ballbot_gym.env import make_task
 from ballbot_gym.params import default_params
+from ballbot_gym.robots import ROBOTS, named_robot, robot_name
 from ballbot_train import shards
 from ballbot_train.commands.certify import certify
 from ballbot_train.learning.datasets import StreamedDemos, command_of, load_demos
@@ -130,6 +132,15 @@ def test_shards_of_a_robot_are_of_its_own_task(tmp_path):
         load_demos(tmp_path / "set", make_task("orbit"))
     with pytest.raises(ValueError, match="of the robot rolling, not of paper; make others with --robot"):
         load_demos(tmp_path / "set", make_task("orbit", "rolling"))
+
+
+def test_demonstrations_of_a_robot_on_a_smoother_floor_are_those_of_the_robot_that_learners_know(tmp_path, monkeypatch):
+    smoother = replace(named_robot("rolling"), friction=0.7)
+    monkeypatch.setitem(ROBOTS, "smoother", replace(ROBOTS["rolling"], urdf=smoother))
+    config = DemoConfig("orbit", "lqr", episodes=2, physics="rk4", robot="smoother")
+    write_shards(config, str(tmp_path / "set"), tmp_path / "out", 1)
+    for robot in ("smoother", robot_name(smoother)):
+        assert len(load_demos(tmp_path / "set", make_task("orbit", "smoother"), robot).actions) > 0
 
 
 def test_a_stream_gives_every_shard_once_per_epoch_in_an_order_of_its_own(demos):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ballbot_gym import files
 from ballbot_gym.checks import LARGEST
-from ballbot_gym.robots import PAPER
+from ballbot_gym.robots import PAPER, ROBOTS, named_robot, robot_name
 from ballbot_gym.tasks import Task
 from ballbot_train import shards
 from ballbot_train.console import option
@@ -141,7 +141,8 @@ def _check_made_for(path: str, metadata: Mapping[str, Any], task: Task, robot: s
     if metadata.get("task") != repr(task):
         raise ValueError(f"{path} holds demonstrations of {metadata.get('task')}, not of {task!r}")
     shown = str(metadata["demos"].get("robot", PAPER)).rpartition(":")[2]
-    if shown != robot:
+    # learners know their robot by `robot_name`, which is another where only the friction is
+    if robot not in (shown, robot_name(named_robot(shown)) if shown in ROBOTS else shown):
         raise ValueError(f"{path} holds demonstrations of the robot {shown}, not of {robot}; make others with --robot")
     if metadata.get("observation_version") != OBSERVATION_VERSION:
         raise ValueError(
