@@ -39,31 +39,26 @@ def _table(entries: Sequence[Entry]) -> str:
     """Rows with fewer failures first, then those with less regret."""
     ranked = sorted(entries, key=lambda entry: (-entry.success, entry.regret_mean or 0.0))
     lines = [
-        [
-            entry.name,
-            regret(entry),
-            f"{round(len(entry.costs) * (1 - entry.success))}",
-            str(group),
-            *map(str, extremes(entry)),
-        ]
+        [entry.name, regret(entry), f"{round(len(entry.costs) * (1 - entry.success))}", str(group)]
         for entry, group in zip(ranked, _groups(ranked), strict=True)
     ]
-    rows = markdown(_HEADER, lines).splitlines()  # links in what was handed in are escaped; ours come after that
-    for i, entry in enumerate(ranked, 2):
-        facts, best, worst = rows[i].removesuffix(" |").rsplit(" | ", 2)
-        rows[i] = f"{facts} | {_filmed(entry, best)} | {_filmed(entry, worst)} |"
+    # links in what was handed in are escaped; ours come after that
+    head, rule, *rows = markdown(_HEADER[:-2], lines).splitlines()
+    table = [f"{head} {' | '.join(_HEADER[-2:])} |", f"{rule} --- | --- |"]
+    for entry, row in zip(ranked, rows, strict=True):
         if entry.link:
-            rows[i] = rows[i].replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |", 1)
-    return "\n".join(rows) + "\n"
+            row = row.replace(f"| {entry.name} |", f"| [{entry.name}]({entry.link}) |", 1)
+        table.append(f"{row} {' | '.join(_filmed(entry, episode) for episode in extremes(entry))} |")
+    return "\n".join(table) + "\n"
 
 
-def _filmed(entry: Entry, episode: str) -> str:
+def _filmed(entry: Entry, episode: int) -> str:
     """An episode's number, linked to its film if there is one."""
     name = film(entry, episode)
-    return f"[{episode}](pictures/films/{name})" if (FILMS / name).exists() else episode
+    return f"[{episode}](pictures/films/{name})" if (FILMS / name).exists() else str(episode)
 
 
-def film(entry: Entry, episode: int | str) -> str:
+def film(entry: Entry, episode: int) -> str:
     """Name of a film."""
     return f"{Path(entry.file).stem}-{episode}.webp"
 
