@@ -15,7 +15,7 @@ class Rk4Simulator(Simulator):
         self._substeps = (
             dynamics.substeps_for(control_dt) if physics_dt is None else whole_substeps(control_dt, physics_dt)
         )
-        self._each = range(self._substeps)
+        self._each = range(self._substeps)  # made once: it is a hundredth of a step
         self._x: State = (0.0,) * params.state_size
         self._code: step_code.Work | None = None
 
