@@ -134,7 +134,7 @@ def score_and_validate(
     count = len(known)
     x, c, robots = fresh.draw(task, range(episodes), _VALIDATION_SEED, "validation", robot, randomization)
     own = known.drawn
-    if not own.shape[1]:  # the track moves no optimum
+    if own.shape[1] != robots.shape[1]:  # the track moves no optimum
         own = fresh.draw(task, range(count), _CERTIFIED_SEED, "validation", robot, randomization)[2]
     drawn, states, constants = map(np.concatenate, ((own, robots), (known.states, x), (known.constants, c)))
     history = fresh.history_of(policy, task, robot)
