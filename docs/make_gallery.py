@@ -46,9 +46,9 @@ _LAST_MS = 1500  # for which the last picture is shown
 
 
 def shown(task: str) -> list[Entry]:
-    """The rows of a task in the gallery: the experts, and the best shipped policy last."""
+    """The rows of a task in the gallery: LQR, NMPC, and the best shipped policy. Trajopt would hide its ghost."""
     rows = [row for row in read_entries() if (row.task, row.robot) == (task, PAPER)]
-    experts = [row for name in CONTROLLERS for row in rows if row.name == name]
+    experts = [row for name in ("lqr", "nmpc") for row in rows if row.name == name]
     policies = [row for row in rows if (SHIPPED / f"{task}-{row.name}.json").exists()]
     return [*experts, min(policies, key=lambda row: (-row.success, row.regret_mean or 0.0))]
 
@@ -70,14 +70,10 @@ def page(notes: dict[str, dict[str, str]]) -> str:
         parts.append(f"## {task.capitalize()}, episode {episode}\n")
         rows = shown(task)
         worst = make_leaderboard.extremes(rows[-1])[1]
-        for row, i, lead in [
-            *((row, episode, "") for row in rows),
-            (rows[-1], worst, f"Its worst of 200 episodes, {worst}: "),
-        ]:
+        for row, i, when in [*((row, episode, "") for row in rows), (rows[-1], worst, f", in episode {worst}")]:
             name = make_leaderboard.film(row, i)
             label = labels.label(row.name)
-            text = f"{label[0].upper()}{label[1:]} {notes[name]['note']}."
-            parts.append(f"![{row.name}, episode {i}](pictures/films/{name})\n{lead}{text}\n")
+            parts.append(f"![{row.name}](pictures/films/{name})\n{label}{when}: {notes[name]['note']}\n")
     text = "\n".join(parts)
     return _LISTS.sub(lambda match: f"{match[1]}\n{text}\n{match[2]}", PAGE.read_text(encoding="utf-8"))
 
@@ -140,14 +136,12 @@ def film(replay: Replay, optimum: Trajectory) -> bytes:
 
 
 def note(row: Entry, episode: int) -> str:
-    """How an episode ended, as the end of a sentence."""
+    """How an episode ended: its regret, or its failure."""
     result = row.results()[episode]
     if result.failure:
         end = row.ends[episode]
         return "falls" if end == "tilt" else "touches an obstacle" if end.startswith("obstacle") else f"fails: {end}"
-    regret = round(100 * (result.cost / result.optimum - 1), 1)
-    than = f"{abs(regret)} % {'more' if regret > 0 else 'less'} than" if regret else "as much as"
-    return f"costs {than} the optimum"
+    return f"{100 * (result.cost / result.optimum - 1):.1f} %"
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "clients.md").read_text()
 SECTIONS = dict(re.findall(r"^## (.+?)\n.*?```python\n(.*?)```", PAGE, re.MULTILINE | re.DOTALL))
 OURS = {"ballbot_gym", "ballbot_train"}
-NEEDS = {"RL Baselines3 Zoo": {"rl_zoo3"}, "RLlib": {"tree"}}  # besides what the code imports
+NEEDS = {"RL Baselines3 Zoo": {"rl_zoo3"}}  # besides what the code imports
 
 
 def libraries(title):
