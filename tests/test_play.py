@@ -195,9 +195,9 @@ def test_a_policy_file_is_offered_where_it_fits(play, tmp_path):
     assert playground.main.name == mine
     assert playground.notice == ""
     playground.set_world("orbit")
-    assert mine not in playground.controllers
+    assert mine not in playground.world.controllers
     playground.set_world("stabilize")
-    assert mine in playground.controllers
+    assert mine in playground.world.controllers
 
 
 WRONG = [

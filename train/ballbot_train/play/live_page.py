@@ -199,7 +199,7 @@ class PlayPage:
 
     def _refresh(self) -> None:
         """Shows what holds now, in every control and in words."""
-        playground, names = self.playground, tuple(self.playground.controllers)
+        playground, names = self.playground, tuple(self.playground.world.controllers)
         if tuple(self._ghosts) != names:
             self._controller.options = names
             for box in self._ghosts.values():

@@ -4,9 +4,10 @@ The robot that counts is the main one. Ghosts get the same start and the same pu
 """
 
 import contextlib
+import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -90,6 +91,11 @@ class Runner:
     name: str
     controller: Controller
     env: BallbotEnv
+    states: list[State] = field(default_factory=list)
+    forces: list[tuple[float, ...]] = field(default_factory=list)
+    cost: float = 0.0
+    violated: str = ""
+    arrived: bool = False
 
     @property
     def x(self) -> State:
@@ -109,14 +115,8 @@ class Runner:
     def begin(self, start: tuple[np.ndarray, np.ndarray], seed: int) -> None:
         """Begins an episode in a state (8,) with constants (nc,). The seed is of all that is drawn in it."""
         self.env.reset(seed=seed, options={"state": start[0], "constants": start[1]})
-        self._go_from(tuple(start[0].tolist()))
-
-    def join(self, other: "Runner") -> None:
-        """Takes the place of another robot in its episode, and all that is drawn for it."""
-        self.env.reset()
-        self.env.set_state(other.env.get_state())
-        self._go_from(other.x)
-        self.cost, self.violated, self.arrived = other.cost, other.violated, other.arrived
+        self.states, self.forces = [tuple(start[0].tolist())], []
+        self.cost, self.violated, self.arrived = 0.0, "", False
 
     def move_to(self, env: BallbotEnv) -> None:
         """Goes on in another environment, in the middle of an episode."""
@@ -161,11 +161,6 @@ class Runner:
             return np.zeros((0, 2))
         rest = plan.trajectory.x[plan.trajectory.t >= seconds]
         return rest[:: max(1, len(rest) // _PLAN_POINTS), :2]
-
-    def _go_from(self, x: State) -> None:
-        self.states: list[State] = [x]
-        self.forces: list[tuple[float, ...]] = []
-        self.cost, self.violated, self.arrived = 0.0, "", False
 
 
 class Score(NamedTuple):
@@ -253,11 +248,6 @@ class Playground:
     def ghosts(self) -> tuple[str, ...]:
         """The names of the ghosts' controllers."""
         return tuple(ghost.name for ghost in self.runners[1:])
-
-    @property
-    def controllers(self) -> list[str]:
-        """What can be chosen in this task, and what is in use; policy files that were not used yet come to it."""
-        return list(dict.fromkeys([*self.world.controllers, *(runner.name for runner in self.runners)]))
 
     @property
     def seconds(self) -> float:
@@ -382,8 +372,8 @@ class Playground:
                 runner.env.close()
                 self.runners.remove(runner)
         for name, controller in ready.items():
-            self.runners.append(Runner(name, controller, self._env(self.world)))
-            self.runners[-1].join(self.main)
+            told = {"name": name, "controller": controller, "env": copy.deepcopy(self.main.env)}
+            self.runners.append(replace(self.main, **told, states=[self.main.x], forces=[]))
 
     def set_plant(self, stress: str, value: float) -> None:
         """Changes what the controllers do not know, for every robot. The value is a severity within its bounds in `PLANT`."""
@@ -428,12 +418,12 @@ class Playground:
         self.begin(episode if known and episode is not None else "random")
 
     def _made(self, name: str, world: World) -> Controller:
-        """A controller by name, which is offered from then on if it is a policy file."""
+        """A controller by name, which is offered from then on."""
         self.announce(f"preparing {labels.label(name)} … the first time in a task, solvers are compiled")
         controller = make_controller(name, world.task, world.params)
-        if is_file(name) and name not in world.controllers:
+        if name not in world.controllers:
             world.controllers.append(name)
-            self._files.append(name)
+            self._files += [name] * is_file(name)
         return controller
 
     def _ready(self, name: str) -> Controller:
