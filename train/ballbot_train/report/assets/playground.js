@@ -19,8 +19,6 @@ class Playground {
       find(".trouble").textContent = `The robots cannot be drawn: ${error.message}. The numbers below are computed all the same.`;
     }
     this.playing = true;
-    [this.distance, this.zoom] = [NEAR, 1];
-    this.wake();
     for (const chip of find(".chips").children) {
       chip.onclick = () => this.open(DATA.scenarios.findIndex(({ title }) => title === chip.textContent));
     }
@@ -28,10 +26,6 @@ class Playground {
     find(".reset").onclick = () => this.open(this.index, this.driver !== null);
     find(".episode").onchange = (event) => this.open(Number(event.target.value), this.driver !== null);
     find(".drive").onclick = () => this.open(this.index, this.driver === null);
-    find(".theme").onclick = () => this.setTheme(!this.dark);
-    const night = matchMedia("(prefers-color-scheme: dark)");
-    night.onchange = () => this.setTheme(night.matches);
-    this.setTheme(night.matches);
     find(".impulse").oninput = () => (find(".strength output").textContent = `${this.impulse} N·s`);
     for (const button of document.querySelectorAll(".pushes button")) {
       button.onclick = () => this.pushOnScreen(Number(button.dataset.x), Number(button.dataset.y));
@@ -47,20 +41,6 @@ class Playground {
 
   say(text) {
     find(".said").textContent = text;
-  }
-
-  setTheme(dark) {
-    this.dark = dark;
-    document.documentElement.dataset.theme = dark ? "dark" : "light";
-    find(".theme").setAttribute("aria-pressed", dark);
-    if (this.scene) this.scene.theme = THEMES[dark ? "dark" : "light"];
-    this.wake();
-  }
-
-  /** A robot's colour, which is lighter in the dark. */
-  tint(color) {
-    if (!this.dark) return color;
-    return "#" + rgb(color).map((part) => Math.round(255 * (0.35 + 0.65 * part)).toString(16).padStart(2, "0")).join("");
   }
 
   get impulse() {
@@ -111,7 +91,10 @@ class Playground {
     this.restart(this.scenario.state);
     [...find(".readouts tbody").rows].forEach((row, i) => {
       row.hidden = i >= this.everyone.length;
-      row.cells[0].textContent = this.everyone[i]?.look.label ?? "";
+      if (row.hidden) return;
+      const { label, color } = this.everyone[i].look;
+      row.cells[0].textContent = label;
+      for (const shown of [row, find(".names").children[i]]) shown.style.setProperty("--robot", color);
     });
     if (this.scene) {
       const [x, y] = this.scenario.state;
@@ -122,7 +105,6 @@ class Playground {
 
   /** All robots in one state, at time 0. */
   restart(state) {
-    this.wake();
     for (const robot of this.everyone) robot.reset(state);
     this.disturbed = false; // a regret is that of an episode that nobody disturbs
     this.time = 0;
@@ -130,13 +112,7 @@ class Playground {
     this.shown = null; // the push whose arrow is shown: {impulse, until}
   }
 
-  /** Draws for a while even if time stands still: what is shown has changed, and the camera comes after it. */
-  wake() {
-    this.awake = performance.now() + 1500;
-  }
-
   setPlaying(playing) {
-    this.wake();
     this.playing = playing;
     find(".play").textContent = playing ? "Pause" : "Play";
   }
@@ -199,7 +175,7 @@ class Playground {
         this.advance();
       }
     }
-    if (this.playing || this.drag || performance.now() < this.awake) this.draw(elapsed);
+    this.draw(elapsed);
   }
 
   /** The state of a robot between two control steps. */
@@ -216,12 +192,12 @@ class Playground {
     const pull = this.drag?.pull ?? (this.shown && this.time < this.shown.until ? this.shown.impulse : null);
     const robots = this.everyone.map((robot, i) => ({
       x: states[i],
-      color: this.tint(robot.look.color),
+      color: robot.look.color,
       alpha: robot.look.alpha,
       u: robot.ended ? null : robot.force,
       push: pull && robot !== this.best && !robot.ended ? Vector.times(pull, DATA.push_scale) : null,
     }));
-    const paths = this.everyone.map(({ path, look }, i) => ({ points: path, color: this.tint(look.color), dashed: i > 0 }));
+    const paths = this.everyone.map(({ path, look }, i) => ({ points: path, color: look.color, dashed: i > 0 }));
     this.scene.draw({ robots: robots.reverse(), paths: paths.reverse(), markers: this.scenario.markers });
     this.showNames(states);
   }
@@ -235,8 +211,7 @@ class Playground {
     const wanted = [own[0] + share * (other[0] - own[0]), own[1] + share * (other[1] - own[1]), 0.5];
     const blend = 1 - Math.exp(-4 * elapsed);
     camera.target = camera.target.map((value, i) => value + blend * (wanted[i] - value));
-    this.distance += blend * (NEAR + (apart > 4 ? 0 : 0.9 * apart) - this.distance);
-    camera.distance = this.distance * this.zoom;
+    camera.distance += blend * (NEAR + (apart > 4 ? 0 : 0.9 * apart) - camera.distance);
   }
 
   showNames(states) {
@@ -250,7 +225,6 @@ class Playground {
       name.hidden = !places[i]; // of robots that there are not, too
       if (name.hidden) return;
       const robot = this.everyone[i];
-      name.style.borderColor = this.tint(robot.look.color);
       name.textContent = `${robot.look.label} ${verdict(robot) || `${(robot.tilt * DEGREES).toFixed(0)}°`}`;
       const half = name.offsetWidth / 2;
       const x = Math.min(Math.max(places[i][0], half), this.scene.canvas.clientWidth - half);
@@ -271,7 +245,6 @@ class Playground {
         robot === this.best ? `of ${this.scenario.optimum.toFixed(1)}` : robot.failed ? verdict(robot) : this.regret(robot),
       ];
       cells.forEach((text, k) => (rows[i].cells[k + 1].textContent = text));
-      rows[i].cells[0].style.borderLeftColor = this.tint(robot.look.color);
       rows[i].cells[5].className = robot.failed ? "bad" : this.isOver(robot) ? "good" : "";
     });
   }
@@ -294,7 +267,6 @@ class Playground {
   listen() {
     const view = find(".view");
     const place = (event) => [event.offsetX, event.offsetY];
-    window.addEventListener("resize", () => this.wake());
     view.onpointerdown = (event) => {
       if (!this.scene) return;
       const robot = this.driver ? null : this.robotAt(place(event));
@@ -327,16 +299,6 @@ class Playground {
       if (pull) this.hit(pull);
     };
     view.onpointercancel = () => this.letGo();
-    view.addEventListener(
-      "wheel",
-      (event) => {
-        if (!this.scene || !event.ctrlKey) return; // the wheel alone scrolls the page around the playground; pinches hold ctrl
-        event.preventDefault();
-        this.wake();
-        this.zoom = Math.min(Math.max(this.zoom * Math.exp(event.deltaY * 0.001), 0.4), 4);
-      },
-      { passive: false },
-    );
     view.onkeydown = (event) => {
       const along = event.ctrlKey || event.altKey || event.metaKey ? null : ARROWS[event.key];
       if (along && this.driver) {
@@ -356,7 +318,6 @@ class Playground {
   }
 
   letGo() {
-    this.wake();
     this.drag = null;
     find(".stick").hidden = true;
     if (this.driver) this.steer(0, 0);

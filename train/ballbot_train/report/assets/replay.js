@@ -28,8 +28,7 @@ class Replay {
       this.seek(Number(event.target.value));
     };
     window.addEventListener("resize", () => this.draw());
-    this.night = matchMedia("(prefers-color-scheme: dark)");
-    this.night.onchange = () => this.draw();
+    NIGHT.addEventListener("change", () => this.draw());
     this.choose(0);
   }
 
@@ -58,7 +57,7 @@ class Replay {
       const { stage, scene } = this.stages[n];
       const label = stage.querySelector("b");
       label.textContent = take.label;
-      label.style.borderColor = take.color;
+      label.style.setProperty("--robot", take.color);
       stage.querySelector(".note").textContent = take.note;
       scene?.canvas.setAttribute("aria-label", `${take.label} in 3D; drag to turn the camera of every picture`);
     });
@@ -96,7 +95,6 @@ class Replay {
       const now = sample(take, dt, this.time);
       stage.querySelector(".tilt").textContent = tiltOf(now.x[2], now.x[3]).toFixed(0) + "°";
       if (!scene) return;
-      scene.theme = THEMES[this.night.matches ? "dark" : "light"];
       scene.camera.target = [...now.x.slice(0, 2), 0.5];
       const driven = [...take.x.slice(0, now.n + 1), now.x];
       const paths = [{ points: take.x, color: take.color, dashed: true }, { points: driven, color: take.color, dashed: false }];

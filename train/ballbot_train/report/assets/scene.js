@@ -7,10 +7,9 @@ const [NEAREST, FARTHEST] = [0.1, 200]; // m, from the camera, of what is drawn
 const SHADOW = [0.1, 0.13, 0.2, 0.2];
 const LIGHT = [-0.36, -0.44, 0.82]; // towards it, of length 1
 /** Colours of sky, bright and dark squares. */
-const THEMES = {
-  light: { sky: [0.933, 0.949, 0.973], bright: [0.985, 0.985, 0.985], dim: [0.83, 0.86, 0.905] },
-  dark: { sky: [0.075, 0.09, 0.12], bright: [0.27, 0.3, 0.35], dim: [0.2, 0.225, 0.27] },
-};
+const DAY = { sky: [0.933, 0.949, 0.973], bright: [0.985, 0.985, 0.985], dim: [0.83, 0.86, 0.905] };
+const DARK = { sky: [0.075, 0.09, 0.12], bright: [0.27, 0.3, 0.35], dim: [0.2, 0.225, 0.27] };
+const NIGHT = matchMedia("(prefers-color-scheme: dark)");
 
 const VERTEX = `#version 300 es
 layout(location = 0) in vec3 position; layout(location = 1) in vec3 normal;
@@ -102,8 +101,10 @@ const Mesh = {
 };
 const UNBROKEN = 1e9; // m, of a dash
 
+/** A colour "#rrggbb", lighter in the dark, as in the pages' styles. */
 function rgb(color) {
-  return [1, 3, 5].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
+  const parts = [1, 3, 5].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
+  return NIGHT.matches ? parts.map((part) => 0.35 + 0.65 * part) : parts;
 }
 
 /** Calls `step` in every frame with the seconds since the last one, at most 0.1, until it returns false. */
@@ -124,7 +125,6 @@ class Scene {
   constructor(canvas, look) {
     this.canvas = canvas;
     this.look = look;
-    this.theme = THEMES.light;
     const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true }));
     if (!gl) throw new Error("no WebGL 2");
     this.at = this.program();
@@ -209,13 +209,14 @@ class Scene {
   draw({ robots, paths, markers }) {
     const { gl, at } = this;
     this.aim();
-    gl.clearColor(...this.theme.sky, 1);
+    const theme = NIGHT.matches ? DARK : DAY;
+    gl.clearColor(...theme.sky, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     gl.uniformMatrix4fv(at.camera, false, this.matrix.toFloat32Array());
-    for (const [name, value] of Object.entries({ eye: this.eye, light: LIGHT, ...this.theme })) gl.uniform3fv(at[name], value);
+    for (const [name, value] of Object.entries({ eye: this.eye, light: LIGHT, ...theme })) gl.uniform3fv(at[name], value);
     const posts = markers.filter((marker) => marker.height >= 0.1);
     this.put(this.cylinder, upright(60, 0, this.camera.target), [1, 1, 1, 1], FLOOR);
     gl.depthMask(false);
