@@ -6,7 +6,7 @@ const DEGREES = 180 / Math.PI;
 const PUSH_SHOWN = 0.5; // s of the episode, for which a push's arrow stays
 const STRONGEST = 250; // N·s
 const NEAR = 3.6; // m: the camera's distance from robots that are together
-const GRAB = 60; // px: how far from a robot's axis a drag still pushes it
+const GRAB = 60; // px: how far from a robot's parts a drag still pushes it
 const THUMB = 70; // px of a drag that holds the stick fully out
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], a: [-1, 0], d: [1, 0], w: [0, 1], s: [0, -1] };
 
@@ -146,9 +146,8 @@ class Playground {
 
   /** A push for everyone. Where somebody has fallen, all start again first. */
   hit(impulse) {
-    const size = Math.hypot(...impulse);
-    if (!(size > 0)) return;
-    const bounded = impulse.map((part) => (part * Math.min(size, STRONGEST)) / size);
+    if (!(Math.hypot(...impulse) > 0)) return;
+    const bounded = shortened(impulse, STRONGEST);
     if (this.robots.some((robot) => robot.ended)) this.restart(this.scenario.state);
     this.due = null;
     this.disturbed = true;
@@ -215,8 +214,7 @@ class Playground {
   }
 
   showNames(states) {
-    const height = DATA.robot.ball_radius + DATA.robot.com_height + DATA.robot.body_length / 2 + 0.1;
-    const places = states.map((x) => this.scene.project(Vector.plus([x[0], x[1], 0], bodyFrame(x)[2], height)));
+    const places = states.map((x) => this.scene.project(Vector.plus(pose(DATA.robot, x).top, [0, 0, 0.1])));
     places.forEach((place, i) => {
       const near = (other) => place && other && Math.abs(other[1] - place[1]) < 24 && Math.abs(other[0] - place[0]) < 110;
       for (let clash; (clash = places.slice(0, i).find(near)); ) place[1] = clash[1] - 24;
@@ -283,8 +281,7 @@ class Playground {
       }
       const [x, y] = place(event);
       if (this.driver) {
-        const out = Vector.times(Vector.minus([x, y], this.drag.at), 1 / THUMB);
-        const held = Vector.times(out, 1 / Math.max(Math.hypot(...out), 1));
+        const held = shortened(Vector.times(Vector.minus([x, y], this.drag.at), 1 / THUMB), 1);
         this.showStick(this.drag.at, held);
         this.steer(held[0], -held[1]);
       } else if (this.drag.robot) this.drag.pull = this.pullTo([x, y]);
@@ -342,37 +339,31 @@ class Playground {
   }
 
   /** The robot near a pixel of the canvas, or null. */
-  robotAt([px, py]) {
-    for (const robot of this.robots) {
-      if (robot.ended) continue;
-      const x = this.between(robot);
-      const axis = bodyFrame(x)[2];
-      const ball = [x[0], x[1], DATA.robot.ball_radius];
-      const [low, high] = [ball, Vector.plus(ball, axis, DATA.robot.com_height + DATA.robot.body_length / 2)].map((p) => this.scene.project(p));
-      if (!low || !high) continue;
-      const along = Vector.minus(high, low);
-      const share = Math.min(Math.max(Vector.dot(Vector.minus([px, py], low), along) / Vector.dot(along, along), 0), 1);
-      const nearest = Vector.plus(low, along, share);
-      if (Math.hypot(px - nearest[0], py - nearest[1]) < GRAB) return robot;
-    }
-    return null;
+  robotAt(pixel) {
+    const isNear = (place) => place && Math.hypot(...Vector.minus(pixel, place)) < GRAB;
+    const isHere = (robot) => {
+      const { ball, low, body, top } = pose(DATA.robot, this.between(robot));
+      return [ball, low, body, top].some((part) => isNear(this.scene.project(part)));
+    };
+    return this.robots.find((robot) => !robot.ended && isHere(robot)) ?? null;
   }
 
   /** The impulse of a drag from the robot's centre of mass to a pixel, N·s; null where it is too short. */
   pullTo(pixel) {
-    const x = this.between(this.drag.robot);
-    const centre = Vector.plus([x[0], x[1], DATA.robot.ball_radius], bodyFrame(x)[2], DATA.robot.com_height);
-    const from = this.drag.from ?? (this.drag.from = this.scene.unproject(this.drag.at, centre[2]));
-    const to = this.scene.unproject(pixel, centre[2]);
+    const [, , height] = pose(DATA.robot, this.between(this.drag.robot)).body;
+    const from = (this.drag.from ??= this.scene.unproject(this.drag.at, height));
+    const to = this.scene.unproject(pixel, height);
     if (!from || !to) return this.drag.pull;
-    const impulse = [0, 1].map((i) => (to[i] - from[i]) / DATA.push_scale);
+    const impulse = shortened(Vector.times(Vector.minus(to, from).slice(0, 2), 1 / DATA.push_scale), STRONGEST);
     const size = Math.hypot(...impulse);
     if (size < 3) return null;
-    const bounded = Math.min(size, STRONGEST);
-    find(".strength output").textContent = `${bounded.toFixed(0)} N·s`;
-    return impulse.map((part) => (part * bounded) / size);
+    find(".strength output").textContent = `${size.toFixed(0)} N·s`;
+    return impulse;
   }
 }
+
+/** A vector that is at most so long. */
+const shortened = (vector, longest) => Vector.times(vector, Math.min(1, longest / Math.hypot(...vector)));
 
 /** How a robot's episode ended, in a word; "" while it goes on. */
 function verdict(robot) {

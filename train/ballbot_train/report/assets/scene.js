@@ -20,7 +20,7 @@ void main() {
   at = world.xyz; up = mat3(place) * normal;
   gl_Position = camera * world;
 }`;
-const [PLAIN, LIT, FLOOR] = [0, 1, 2]; // looks: of one colour, of one colour in the light, and the floor's squares
+const [PLAIN, LIT, FLOOR, DASHED] = [0, 1, 2, 3]; // looks: of one colour, of one colour in the light, the floor's squares, and with gaps
 const FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 at, up;
@@ -39,7 +39,10 @@ void main() {
     float diffuse = max(dot(n, light), 0.0);
     float shine = pow(max(dot(n, normalize(light + e)), 0.0), 40.0);
     pixel = vec4(color.rgb * (0.52 + 0.16 * n.z + 0.5 * diffuse) + 0.22 * shine, color.a);
-  } else pixel = color;
+  } else {
+    if (look == ${DASHED} && fract(up.x) > 0.5) discard;
+    pixel = color;
+  }
 }`;
 
 /** Places of bodies: matrices in columns, from axes and origin, and of what is upright, from radius, height and (x, y), m. */
@@ -77,29 +80,25 @@ const Mesh = {
   /** Radius 1, from z = 0 to 1. */
   cylinder: () => Mesh.turned([[0, 0, 0, -1], [1, 0, 0, -1], [1, 0, 1, 0], [1, 1, 1, 0], [1, 1, 0, 1], [0, 1, 0, 1]]),
   cone: () => Mesh.turned([[0, 0, 0, -1], [1, 0, 0, -1], [1, 0, 0.7, 0.7], [0, 1, 0.7, 0.7]]),
-  /** A band along points (x, y), in dashes of this length, m. */
+  /** A band along points (x, y); its normals' x counts the pairs of a dash and a gap of this length each, m. */
   band(points, width, dash) {
     const out = [];
-    let along = 0; // m, how far the line has come
+    let along = 0; // pairs
     for (let i = 0; i + 1 < points.length; i++) {
       const [a, b] = [points[i], points[i + 1]].map(([x, y]) => [x, y]);
       const way = Vector.minus(b, a);
       const length = Math.hypot(...way);
       if (length < 1e-9) continue;
       const side = [-way[1], way[0]].map((part) => (0.5 * width * part) / length);
-      const at = (share, sign) => [...Vector.plus(Vector.plus(a, way, share), side, sign), 0, 0, 0, 1];
-      for (let n = Math.floor(along / dash); n * dash < along + length; n++) {
-        if (n % 2) continue;
-        const [from, to] = [Math.max((n * dash - along) / length, 0), Math.min(((n + 1) * dash - along) / length, 1)];
-        const [p, q, r, s] = [at(from, -1), at(from, 1), at(to, 1), at(to, -1)];
-        out.push(...p, ...s, ...r, ...p, ...r, ...q);
-      }
-      along += length;
+      const corner = (end, sign) => [...Vector.plus(end, side, sign), 0, along, 0, 1];
+      const [p, q] = [corner(a, -1), corner(a, 1)];
+      along += length / (2 * dash);
+      const [r, s] = [corner(b, 1), corner(b, -1)];
+      out.push(...p, ...s, ...r, ...p, ...r, ...q);
     }
     return out;
   },
 };
-const UNBROKEN = 1e9; // m, of a dash
 
 /** A colour "#rrggbb", lighter in the dark, as in the pages' styles. */
 function rgb(color) {
@@ -114,10 +113,13 @@ function everyFrame(step, last = performance.now()) {
   });
 }
 
-/** The body's axis in state x, upwards, and the axes across it. γ turns about y, then θ about the turned −x. */
-function bodyFrame(x) {
+/** Points of a robot of these measures in state x, m, and its body's axes, the last one upwards. γ turns about y, then θ about the turned −x. */
+function pose({ ball_radius, com_height, body_length }, x) {
   const [sg, cg, st, ct] = [Math.sin(x[2]), Math.cos(x[2]), Math.sin(x[3]), Math.cos(x[3])];
-  return [[cg, 0, -sg], [-sg * st, ct, -cg * st], [sg * ct, st, cg * ct]];
+  const axes = [[cg, 0, -sg], [-sg * st, ct, -cg * st], [sg * ct, st, cg * ct]];
+  const ball = [x[0], x[1], ball_radius];
+  const [low, body, top] = [-0.5, 0, 0.5].map((share) => Vector.plus(ball, axes[2], com_height + share * body_length));
+  return { ball, low, body, top, axes };
 }
 
 class Scene {
@@ -221,7 +223,7 @@ class Scene {
     this.put(this.cylinder, upright(60, 0, this.camera.target), [1, 1, 1, 1], FLOOR);
     gl.depthMask(false);
     for (const marker of markers) if (!posts.includes(marker)) this.drawFlat(marker);
-    for (const path of paths) this.drawBand(path.points, rgb(path.color), path.dashed ? 0.09 : UNBROKEN);
+    for (const path of paths) this.drawBand(path.points, rgb(path.color), path.dashed ? 0.09 : Infinity);
     this.drawShadows(robots, posts);
     gl.depthMask(true);
     for (const post of posts) this.drawPost(post);
@@ -252,16 +254,14 @@ class Scene {
   }
 
   drawRobot({ x, color, u, alpha, push }) {
-    const { ball_radius, body_radius, body_length, com_height } = this.look.robot;
-    const ball = [x[0], x[1], ball_radius];
+    const { ball_radius, body_radius, body_length } = this.look.robot;
+    const { ball, low, body, axes } = pose(this.look.robot, x);
     this.put(this.sphere, upright(ball_radius, ball_radius, x, ball_radius), [...rgb(this.look.colors.ball), alpha]);
-    const [a, b, axis] = bodyFrame(x);
-    const low = Vector.plus(ball, axis, com_height - body_length / 2);
-    const place = framed(Vector.times(a, body_radius), Vector.times(b, body_radius), Vector.times(axis, body_length), low);
-    this.put(this.cylinder, place, [...rgb(color), alpha]);
+    const sides = [body_radius, body_radius, body_length].map((size, i) => Vector.times(axes[i], size));
+    this.put(this.cylinder, framed(...sides, low), [...rgb(color), alpha]);
     if (this.isShadow) return;
     if (u && Math.hypot(...u) > this.look.least_force) this.drawArrow(ball, Vector.times([...u, 0], this.look.force_scale), this.look.colors.force, alpha);
-    if (push) this.drawArrow(Vector.plus(ball, axis, com_height), [...push, 0], this.look.colors.push, alpha);
+    if (push) this.drawArrow(body, [...push, 0], this.look.colors.push, alpha);
   }
 
   /** An arrow from a point along a level vector, m. */
@@ -291,7 +291,7 @@ class Scene {
     const corners = new Float32Array(Mesh.band(points, 0.035, dash));
     gl.bindBuffer(gl.ARRAY_BUFFER, this.strip.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, corners, gl.DYNAMIC_DRAW);
-    this.put({ ...this.strip, count: corners.length / 6 }, upright(1, 1, [0, 0], 0.006), [...color, 1], PLAIN);
+    this.put({ ...this.strip, count: corners.length / 6 }, upright(1, 1, [0, 0], 0.006), [...color, 1], DASHED);
   }
 
   /** What is solid, flattened on the floor along the light; each pixel is darkened once. */
