@@ -28,7 +28,7 @@ PUSH_SCALE = 1 / 130
 """Length of a push's arrow, m/(N·s)."""
 LEAST_FORCE = 2.0
 """N: smaller forces get no arrow."""
-_NEAR, _FAR = 3.0, 6.0  # m from the last robot: from where on another counts less, and from where on not at all
+_FARTHEST = 3.0  # m from the last robot: who is farther may leave the picture
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,12 @@ class Robot:
 
 @dataclass(frozen=True)
 class GroundPath:
-    """A line on the floor through points (n, 2), m: where a robot was, dashed where it plans to go."""
+    """A line on the floor through points (n, 2), m: where a robot was, dashed where it plans to go. Its colour is as of a
+    robot or as of a marker.
+    """
 
     points: np.ndarray
-    color: str
+    color: str | tuple[float, ...]
     dashed: bool = False
 
 
@@ -67,23 +69,25 @@ class Drawing:
 
     @property
     def centre(self) -> np.ndarray:
-        """(2,) the middle of the robots near the last one, m; the origin if there is no robot."""
-        if not self.robots:
-            return np.zeros(2)
-        return np.average([robot.x[:2] for robot in self.robots], axis=0, weights=self._nearness())
+        """(2,) where the last robot is, m; the origin if there is no robot."""
+        return self.robots[-1].x[:2] if self.robots else np.zeros(2)
 
     @property
     def spread(self) -> float:
-        """The largest distance of a robot near the last one from it, m."""
-        return float(max(self._nearness() * self._distances(), default=0.0))
+        """How far others are from the last robot, m, at most `_FARTHEST`."""
+        distances = (math.hypot(*(robot.x[:2] - self.centre)) for robot in self.robots)
+        return min(max(distances, default=0.0), _FARTHEST)
 
-    def _distances(self) -> np.ndarray:
-        """(n,) distances from the last robot, m."""
-        return np.array([np.hypot(*(robot.x - self.robots[-1].x)[:2]) for robot in self.robots])
+    @property
+    def lines(self) -> tuple[GroundPath, ...]:
+        """The rings of markers, then the paths."""
+        rings = (GroundPath(_ring(marker), marker.color, True) for marker in self.markers if marker.ring)
+        return *rings, *self.paths
 
-    def _nearness(self) -> np.ndarray:
-        """(n,) 1 for robots near the last one, 0 for those far away, so that a camera leaves smoothly who falls behind."""
-        return np.clip((_FAR - self._distances()) / (_FAR - _NEAR), 0.0, 1.0)
+    @property
+    def posts(self) -> tuple[Marker, ...]:
+        """The other markers."""
+        return tuple(marker for marker in self.markers if not marker.ring)
 
 
 class Pose(NamedTuple):
@@ -122,7 +126,7 @@ def arrows(place: Pose, robot: Robot) -> list[tuple[str, tuple[np.ndarray, np.nd
     ]
 
 
-def ring(marker: Marker) -> np.ndarray:
+def _ring(marker: Marker) -> np.ndarray:
     """(n, 2) points, m, of a marker's circle."""
     angles = np.linspace(0, 2 * math.pi, 97)
     return marker.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) + np.array(marker.position)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw
 
-from ballbot_gym.drawing import BALL, Drawing, Robot, arrows, pose, ring
+from ballbot_gym.drawing import BALL, Drawing, GroundPath, Robot, arrows, pose
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.tasks.marker import Marker
 
@@ -63,7 +63,7 @@ def _placed(mesh: np.ndarray, low: np.ndarray, high: np.ndarray, radius: float) 
 def picture(drawing: Drawing, width: int = 640, height: int = 480) -> np.ndarray:
     """(height, width, 3) uint8 of a moment.
 
-    The camera looks at the robots' centre, from the farther away the more they spread.
+    The camera looks at the last robot, from the farther away the more others spread.
     """
     return _Painter(drawing, width, height).paint()
 
@@ -81,17 +81,15 @@ class _Painter:
         self._pen = ImageDraw.Draw(self._image)
 
     def paint(self) -> np.ndarray:
-        markers, robots = self._drawing.markers, self._drawing.robots
+        posts, robots = self._drawing.posts, self._drawing.robots
         self._paint_floor()
-        for marker in markers:
-            if marker.ring:
-                self._paint_line(ring(marker), rgb(marker.color), dashed=True)
-            elif marker.height < _FLAT:
-                self._paint_solids([_post(marker)], marker.color[3])
-        for path in self._drawing.paths:
-            self._paint_line(path.points, rgb(path.color), path.dashed)
+        for post in posts:
+            if post.height < _FLAT:
+                self._paint_solids([_post(post)], post.color[3])
+        for path in self._drawing.lines:
+            self._paint_line(path)
         bodies = [(_robot(self._drawing.params, robot), robot.alpha) for robot in robots]
-        bodies += [([_post(each)], each.color[3]) for each in markers if not each.ring and each.height >= _FLAT]
+        bodies += [([_post(post)], post.color[3]) for post in posts if post.height >= _FLAT]
         self._paint_shadows(bodies)
         for robot, (solids, alpha) in zip(robots, bodies, strict=False):
             if alpha == 1:
@@ -122,15 +120,15 @@ class _Painter:
         fade = np.clip(1 - depth[seen].mean(axis=1) / (_FLOOR_REACH + 2), 0, 1)
         self._paint_polygons(places[seen], _FLOOR + fade[:, None] * (_TILE - _FLOOR))
 
-    def _paint_line(self, points: np.ndarray, color: Rgb, dashed: bool) -> None:
-        """Paints a line on the floor through points (n, 2), m, where it is in front of the camera."""
-        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    def _paint_line(self, path: GroundPath) -> None:
+        """Paints a line on the floor, where it is in front of the camera."""
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path.points, axis=0).T))])
         stops = np.append(np.arange(0.0, way[-1], _DASH), way[-1])
-        x, y = (np.interp(stops, way, column) for column in points.T)
+        x, y = (np.interp(stops, way, column) for column in path.points.T)
         places, depth = self._pixels(np.column_stack([x, y, np.full(len(stops), _LINE_HEIGHT)]))
-        for i in range(0, len(stops) - 1, 2 if dashed else 1):
+        for i in range(0, len(stops) - 1, 2 if path.dashed else 1):
             if (depth[i : i + 2] > _NEAR).all():
-                self._pen.line(places[i : i + 2].ravel().tolist(), color, round(_LINE * self._image.height))
+                self._pen.line(places[i : i + 2].ravel().tolist(), rgb(path.color), round(_LINE * self._image.height))
 
     def _paint_shadows(self, bodies: Sequence[tuple[list[_Solid], float]]) -> None:
         """Paints the shadows of solids and their opacities on the floor; where two meet, the darker one."""

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrows, pose, ring
+from ballbot_gym.drawing import BALL, FORCE, PUSH, Drawing, GroundPath, Robot, arrows, pose
 from ballbot_gym.lazy import imports_of
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.picture import rgb
@@ -107,15 +107,14 @@ class Viewer:
     def draw(self, drawing: Drawing) -> None:
         """Shows a moment. What is the same as before is not sent again."""
         with self.server.atomic():
-            self._follow(drawing.robots[-1].x[:2] if drawing.robots else np.zeros(2))
+            self._follow(drawing.centre)
             self._before, self._shown = self._shown, {}
             for i, robot in enumerate(reversed(drawing.robots)):
                 self._draw_robot(i, drawing.params, robot)
-            for i, path in enumerate(drawing.paths):
-                segments, width = _segments(path), 0.02 if path.dashed else 0.015
-                self._draw_lines(f"path{i}", (path.color, path.dashed), segments, rgb(path.color), width)
-            for i, marker in enumerate(drawing.markers):
-                self._draw_marker(f"marker{i}", marker)
+            for i, path in enumerate(drawing.lines):
+                self._draw_line(f"line{i}", path)
+            for i, marker in enumerate(drawing.posts):
+                self._draw_post(f"post{i}", marker)
             for _, nodes in self._before.values():
                 nodes[0].remove()
 
@@ -181,17 +180,15 @@ class Viewer:
         label = scene.add_label(f"{name}/label", "", anchor="bottom-center", visible=False)
         return [root, ball, body, force, push, label]
 
-    def _draw_lines(self, key: str, look: Hashable, segments: np.ndarray, color: tuple, width: float) -> None:
-        add = self.server.scene.add_line_segments
-        (node,) = self._nodes(key, look, lambda name: [add(name, segments, color, thickness=width)])
+    def _draw_line(self, key: str, path: GroundPath) -> None:
+        add, segments, width = self.server.scene.add_line_segments, _segments(path), 0.02 if path.dashed else 0.015
+        look = path.color, path.dashed
+        (node,) = self._nodes(key, look, lambda name: [add(name, segments, rgb(path.color), thickness=width)])
         node.points = segments
 
-    def _draw_marker(self, key: str, marker: Marker) -> None:
+    def _draw_post(self, key: str, marker: Marker) -> None:
         """Draws a marker, which does not move."""
-        (x, y), color, opacity = marker.position, rgb(marker.color[:3]), marker.color[3]
-        if marker.ring:
-            self._draw_lines(key, marker, _segments(GroundPath(ring(marker), "")), color, 0.03)
-            return
+        (x, y), color, opacity = marker.position, rgb(marker.color), marker.color[3]
         add, look = self.server.scene.add_cylinder, {"opacity": None if opacity == 1 else opacity}
         place = (x, y, marker.height / 2)
         self._nodes(key, marker, lambda name: [add(name, marker.radius, marker.height, color, position=place, **look)])

@@ -39,15 +39,15 @@ def test_the_page_shows_robots_arrows_paths_and_markers_where_they_are(viewer, p
     shown, place = nodes(viewer), pose(params, STATE)
     assert shown["/world/robot0/ball"].position == pytest.approx(place.ball)
     assert shown["/world/robot0/body"].wxyz == pytest.approx(place.turn)
-    assert shown["/world/path0"].points.shape == (2, 2, 3)
+    assert shown["/world/line1"].points.shape == (2, 2, 3)
     start, end = shown["/world/robot0/force"].points[0]
     assert end - start == pytest.approx([0.5, 0, 0])
     assert shown["/world/robot1/label"].text == "LQR fell"
     assert [shown[f"/world/robot{i}/push"].visible for i in (0, 1)] == [True, False]
-    assert {"/world/marker0", "/world/marker1"} <= set(shown)
+    assert {"/world/line0", "/world/post0"} <= set(shown)
     viewer.draw(Drawing(params, (Robot(STATE),), (GroundPath(np.zeros((300, 2)), "#e08a00"),)))
     assert "/world/robot1/ball" not in nodes(viewer)
-    assert len(nodes(viewer)["/world/path0"].points) == 120
+    assert len(nodes(viewer)["/world/line0"].points) == 120
     viewer.draw(Drawing(params, ()))
     assert set(nodes(viewer)) == empty
 
