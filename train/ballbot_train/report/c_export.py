@@ -6,7 +6,8 @@ from the lines that Python runs; see `printed`.
 
 import textwrap
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import casadi
 import numpy as np
@@ -18,7 +19,7 @@ from ballbot_gym import dynamics, files, sensors
 from ballbot_gym.env import BallbotEnv
 from ballbot_gym.params import BallbotParams
 from ballbot_gym.robots import PAPER, named_robot
-from ballbot_gym.rollout import rollout
+from ballbot_gym.rollout import Controller, rollout
 from ballbot_gym.tasks import Task
 from ballbot_train.console import printable
 from ballbot_train.onnx_export import metadata
@@ -93,7 +94,7 @@ def _source(network: PolicyNetwork, about: dict[str, str], task: Task, robot: st
         ),
         acted=c_function("acted", policy_function(network), {"o": spec.seen}),
         filter=_filter(task, params) if filtered else None,
-        test=_filtered_test(network, task, robot) if filtered else _test(network, task, robot),
+        test=_test(network, task, robot, filtered),
         largest_error=c_number(LARGEST_ERROR),
         number=c_number,
         numbers=_numbers,
@@ -125,44 +126,36 @@ def _filter(task: Task, params: BallbotParams) -> dict[str, Any]:
     }
 
 
-def _filtered_test(network: PolicyNetwork, task: Task, robot: str) -> dict[str, np.ndarray]:
-    """What sensors show in an episode's first steps, as float32, and the actions that the policy behind the filter takes."""
-    params = named_robot(robot)
-    controller = kalman.FilteredController(task, params, PolicyController(task, params, network))
-    env = BallbotEnv(task, physics="rk4", robot=robot, observation="sensors")
-    seen, info = env.reset(seed=0)
-    shown, actions = [], []
-    for k in range(_TEST_STEPS):
-        shown.append((seen[:9] * sensors.SCALE).astype(np.float32))
-        seen = np.append(shown[-1] / np.array(sensors.SCALE), seen[9:])
-        if not k:
-            place = seen[9:11]
-            controller.reset(0.0, seen, info["constants"])
-        actions.append(np.clip(controller.act(k * task.control_dt, seen) / params.force_limit, -1, 1))
-        seen, _, _, _, info = env.step(actions[-1])
-    times = task.control_dt * np.arange(_TEST_STEPS, dtype=np.float32)
-    arrays = {"sensors": np.array(shown), "place": place, "constants": np.zeros(1), "times": times}
-    return arrays | {"actions": _finite(np.array(actions))}
+def _test(network: PolicyNetwork, task: Task, robot: str, filtered: bool) -> dict[str, np.ndarray]:
+    """Of an episode under the policy: states in some steps, or what sensors show in the first ones, as float32, and the
+    actions that it takes on them one after the other.
+    """
+    params, seen = named_robot(robot), []
+    controller: Controller = PolicyController(task, params, network)
+    if filtered:
+        controller = kalman.FilteredController(task, params, controller)
 
+    def act(t: float, x: np.ndarray) -> np.ndarray:
+        seen.append(x)
+        return controller.act(t, x)
 
-def _test(network: PolicyNetwork, task: Task, robot: str) -> dict[str, np.ndarray]:
-    """States of an episode under the policy, as float32, and the actions that it takes there one after the other."""
-    params = named_robot(robot)
-    controller = PolicyController(task, params, network)
-    episode = rollout(BallbotEnv(task, physics="rk4", robot=robot), controller, seed=0)
-    trajectory = episode.trajectory
-    k = np.linspace(0, len(trajectory.u) - 1, _TEST_STEPS).astype(int)
-    states, times = trajectory.x[k].astype(np.float32), (k * task.control_dt).astype(np.float32)
-    c = episode.constants.astype(np.float32)
-    controller.reset(0.0, states[0], c)
-    actions = np.array([controller.act(float(t), x) for t, x in zip(times, states, strict=True)]) / params.force_limit
-    return {"constants": c if c.size else np.zeros(1), "states": states, "times": times, "actions": _finite(actions)}
-
-
-def _finite(actions: np.ndarray) -> np.ndarray:
+    env = BallbotEnv(task, physics="rk4", robot=robot, observation="sensors" if filtered else "state")
+    watched = cast(Controller, SimpleNamespace(reset=controller.reset, act=act, senses=filtered))
+    c = rollout(env, watched, seed=0).constants.astype(np.float32)
+    k = np.arange(_TEST_STEPS) if filtered else np.linspace(0, len(seen) - 1, _TEST_STEPS).astype(int)
+    shown, times = np.array(seen)[k], (k * task.control_dt).astype(np.float32)
+    if filtered:
+        readings = (shown[:, :9] * sensors.SCALE).astype(np.float32)
+        arrays = {"sensors": readings, "place": shown[0, 9:11]}
+        shown = np.hstack([readings / np.array(sensors.SCALE), shown[:, 9:]])
+    else:
+        shown = shown.astype(np.float32)
+        arrays = {"states": shown}
+    controller.reset(0.0, shown[0], c)
+    actions = np.array([controller.act(float(t), x) for t, x in zip(times, shown, strict=True)]) / params.force_limit
     if not np.isfinite(actions).all():
         raise PolicyError("the policy's actions are not finite, so it cannot be exported; train it anew")
-    return actions
+    return arrays | {"constants": c if c.size else np.zeros(1), "times": times, "actions": actions.clip(-1, 1)}
 
 
 def _numbers(values: np.ndarray) -> str:
