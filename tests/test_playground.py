@@ -182,8 +182,8 @@ def test_the_page_is_small_and_loads_nothing(page):
     assert text.count("<script>") == text.count("</script>") == 3
 
 
-def test_the_page_is_the_same_every_time(page):
-    assert playground.playground_page() == page.read_text()
+def test_the_page_is_the_same_every_time(page, tmp_path):
+    assert write_playground(tmp_path / "again.html").read_text() == page.read_text()
 
 
 @pytest.fixture(scope="module")

@@ -88,14 +88,10 @@ SCENARIOS = (
 
 
 def write_playground(path: Path, policies: Sequence[str] = ()) -> Path:
-    """Writes the page; arguments and errors as `playground_page`."""
-    return files.write(path, playground_page(policies))
-
-
-def playground_page(policies: Sequence[str] = ()) -> str:
-    """The page as HTML.
+    """Writes the page.
 
     Args:
+        path: of the HTML file.
         policies: files of policies, each shown in place of the shipped one of its task.
 
     Raises:
@@ -112,7 +108,7 @@ def playground_page(policies: Sequence[str] = ()) -> str:
     size = len(page.encode())
     if size > LARGEST:
         raise ValueError(f"the page would have {size / 1e6:.2f} MB, and at most {LARGEST / 1e6:g} MB load at once")
-    return str(page)
+    return files.write(path, page)
 
 
 def engine_script(policies: Sequence[str] = ()) -> str:
