@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ from ballbot_gym.robots import PAPER, checked_robot, own_fields
 from ballbot_gym.step_code import Judge
 from ballbot_gym.tasks import TASKS, Task
 from ballbot_gym.tasks.transition import limit_names, outcome
-from ballbot_gym.viewer import PageScene, has_viser, import_viser
+from ballbot_gym.viewer import Viewer, has_viser, import_viser
 
 _KEY_FORCE = 0.2  # of the force limit, while a key is held
 _NO_GRIP = (0.0, 0.0, 0.0, 0.0)
@@ -144,7 +145,7 @@ class BallbotEnv(gymnasium.Env):
                 viser.
         """
         self._spec: EnvSpec | None = None
-        self._page: PageScene | None = None
+        self._page: Viewer | None = None
         self._state: State = ()  # until the first reset
         self.params = checked_robot(robot, params)
         physics = default_physics() if physics is None else physics
@@ -319,8 +320,9 @@ class BallbotEnv(gymnasium.Env):
         if self.render_mode == "rgb_array":
             return picture(drawing)
         if self._page is None:
-            self._page = PageScene(self.task.control_dt)
-        self._page.draw(drawing)
+            self._page = Viewer()
+            sys.stderr.write(f"the robot is shown at {self._page.address}\n")
+        self._page.show(drawing, self.task.control_dt)
         return None
 
     def get_keys_to_action(self) -> dict[tuple[str, ...], np.ndarray]:

@@ -9,7 +9,6 @@ import io
 import logging
 import math
 import re
-import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
@@ -79,6 +78,9 @@ class Viewer:
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.on_grab: Callable[[np.ndarray], object] | None = None
         """Gets how far (2,) on the floor somebody has dragged the robot, m, when the drag ends."""
+        self.trace: list[np.ndarray] = []
+        """Points (2,) at which `show` has shown the robot since they were emptied, m."""
+        self._next = 0.0
         self._shown: dict[str, tuple[Hashable, list[Any]]] = {}
         self._before: dict[str, tuple[Hashable, list[Any]]] = {}
         self._shift = np.zeros(2)
@@ -118,6 +120,15 @@ class Viewer:
             for _, nodes in self._before.values():
                 nodes[0].remove()
 
+    def show(self, drawing: Drawing, seconds: float) -> None:
+        """Shows a drawing of one robot, and its `trace`, when so much time has passed since the last one, s."""
+        now = time.perf_counter()
+        self._next = max(self._next + seconds, now)
+        time.sleep(self._next - now)
+        self.trace.append(drawing.robots[0].x[:2])
+        path = GroundPath(np.array(self.trace), drawing.robots[0].color)
+        self.draw(replace(drawing, paths=(path,) if len(self.trace) > 1 else ()))
+
     def close(self) -> None:
         """Stops the server; may be called again."""
         self.server.stop()
@@ -155,14 +166,11 @@ class Viewer:
     def _add_robot(self, name: str, params: BallbotParams, robot: Robot, grab: bool) -> list[Any]:
         scene, radius, length = self.server.scene, params.body_radius, params.body_length
         look = {"opacity": None if robot.alpha == 1 else robot.alpha, "cast_shadow": False, "receive_shadow": False}
-        root, ball, body = (scene.add_frame(f"{name}{part}", show_axes=False) for part in ("", "/ball", "/body"))
-        parts = [
-            scene.add_icosphere(f"{name}/ball/shape", params.ball_radius, rgb(BALL), **look),
-            scene.add_cylinder(f"{name}/body/shape", radius, length, rgb(robot.color), **look),
-            scene.add_cylinder(
-                f"{name}/body/cap", 1.02 * radius, 0.06 * length, rgb(BALL), position=(0.0, 0.0, 0.44 * length), **look
-            ),
-        ]
+        root = scene.add_frame(name, show_axes=False)
+        ball = scene.add_icosphere(f"{name}/ball", params.ball_radius, rgb(BALL), **look)
+        body = scene.add_cylinder(f"{name}/body", radius, length, rgb(robot.color), **look)
+        place = (0.0, 0.0, 0.44 * length)
+        cap = scene.add_cylinder(f"{name}/body/cap", 1.02 * radius, 0.06 * length, rgb(BALL), position=place, **look)
         scene.add_cylinder(
             f"{name}/ball/shadow",
             1.3 * params.ball_radius,
@@ -171,7 +179,7 @@ class Viewer:
             position=(0.0, 0.0, _SHADOW_HEIGHT - params.ball_radius),
             **look | {"opacity": _SHADOW * robot.alpha},
         )
-        for part in parts if grab else ():
+        for part in (ball, body, cap) if grab else ():
             part.on_drag("left")(self._grabbed)
         force, push = (
             scene.add_arrows(f"{name}/{what}", np.zeros((1, 2, 3)), rgb(color), visible=False)
@@ -197,37 +205,6 @@ class Viewer:
         """A coroutine, so that viser keeps the order of the events."""
         if self.on_grab is not None and event.phase == "end":
             self.on_grab(_dragged(event))
-
-
-class PageScene:
-    """Shows an environment in a page, in real time."""
-
-    def __init__(self, frame_seconds: float):
-        """Starts the page and says its address on stderr.
-
-        Args:
-            frame_seconds: s, between two drawings.
-
-        Raises:
-            ImportError: viser is missing.
-        """
-        self._viewer, self._frame_seconds, self._next = Viewer(), frame_seconds, 0.0
-        self.trace: list[np.ndarray] = []
-        """Points (2,) at which the robot was in this episode, m."""
-        sys.stderr.write(f"the robot is shown at {self._viewer.address}\n")
-
-    def draw(self, drawing: Drawing) -> None:
-        """Shows a drawing of one robot, and where it was, when its time has come."""
-        now = time.perf_counter()
-        self._next = max(self._next + self._frame_seconds, now)
-        time.sleep(self._next - now)
-        self.trace.append(drawing.robots[0].x[:2])
-        path = GroundPath(np.array(self.trace), drawing.robots[0].color)
-        self._viewer.draw(replace(drawing, paths=(path,) if len(self.trace) > 1 else ()))
-
-    def close(self) -> None:
-        """Stops the page; may be called again."""
-        self._viewer.close()
 
 
 @contextlib.contextmanager
