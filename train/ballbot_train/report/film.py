@@ -11,12 +11,10 @@ from typing import Any, Literal
 import imageio.v2 as imageio
 import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from ballbot_gym import dynamics, files
 from ballbot_gym.picture import picture
-from ballbot_train.report import figures
 from ballbot_train.report.replay import LEAST_SLIP, Replay
 
 Format = Literal["png", "mp4", "webp"]
@@ -24,24 +22,16 @@ Format = Literal["png", "mp4", "webp"]
 _FAILED = "#c01818"
 _FONT = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
 _COLUMNS = 4
-_STRIP_SIZE = (520, 390)  # pixels of a strip's picture
+_STRIP_SIZE = (520, 390)  # pixels of a moment of a take in a strip
 _PAUSE = 1.5  # s, for which a film that loops shows its last picture
 
 
 def write_strip(replay: Replay, path: Path, frames: int, seconds: float) -> Path:
     """Writes a PNG with a row for each take: its pictures at `frames` equal times until `seconds`."""
-    rows = len(replay.takes)
-    figure = Figure(figsize=(2.6 * frames, 2.25 * rows), layout="constrained")
-    axes = figure.subplots(rows, frames, squeeze=False)
-    for row, take in zip(axes, replay.takes, strict=True):
-        for axis, t in zip(row, np.linspace(0, seconds, frames), strict=True):
-            axis.imshow(picture(replay.drawing(take, t), *_STRIP_SIZE), interpolation="antialiased")
-            axis.set(xticks=[], yticks=[])
-            held = min(t, take.trajectory.duration)
-            axis.set_title(f"{held:.2f} s, {_tilt(take.trajectory.state(held)):.0f}°", fontsize=9)
-        if rows > 1:
-            row[0].set_ylabel(f"{take.label}\n{take.note}".strip().replace("; ", "\n"), fontsize=8, color=take.color)
-    return figures.save(figure, path)
+    width, height = _STRIP_SIZE
+    times = np.linspace(0, seconds, frames).tolist()
+    strip = np.hstack([_frame(replay, t, width, len(replay.takes) * height, height // 20, 1) for t in times])
+    return files.write(path, imageio.imwrite("<bytes>", strip, "png"))
 
 
 def write_film(frames: Iterable[np.ndarray], path: Path, fps: int = 25) -> Path:
@@ -90,31 +80,32 @@ def film_times(seconds: float, fps: int, speed: float) -> np.ndarray:
 def film_frames(replay: Replay, times: Sequence[float] | np.ndarray, width: int = 1280) -> Iterator[np.ndarray]:
     """Yields frames (h, width, 3), uint8, at times of the episode, s: the takes side by side, at most four in a row."""
     width, height = width // 2 * 2, width * 9 // 32 * 2  # H.264 wants even sizes
-    line = max(height // 32, 9)  # px, the height of the words
+    for t in map(float, times):
+        yield _frame(replay, t, width, height, max(height // 32, 9), min(len(replay.takes), _COLUMNS))
+
+
+def _frame(replay: Replay, t: float, width: int, height: int, line: int, columns: int) -> np.ndarray:
+    """(height, width, 3) the takes at time t, s, in so many columns, with words of the height `line`, px."""
     font, large = (ImageFont.truetype(_FONT, size) for size in (line, 3 * line // 2))
-    columns = min(len(replay.takes), _COLUMNS)
     wide, high = width // columns, (height - 2 * line) // math.ceil(len(replay.takes) / columns)
     letters = max(5, round(1.5 * wide / line))  # that fit into a line
-    for t in map(float, times):
-        frame = Image.new("RGB", (width, height), "white")
-        pen = ImageDraw.Draw(frame)
-        pen.text((line // 2, line // 2), replay.title, "black", font)
-        pen.text((width - line // 2, line // 2), f"{t:.2f} s", "black", font, "ra")
-        for i, take in enumerate(replay.takes):
-            left, top = i % columns * wide + 2, i // columns * high + 2 * line
-            right, bottom = left + wide - 4, top + high - 4
-            shown = picture(replay.drawing(take, t), max(right - left, 1), max(bottom - top, 1))
-            frame.paste(Image.fromarray(shown), (left, top))
-            label, slip = textwrap.fill(take.label, letters), take.slip_at(t)
-            tilt = f"{_tilt(take.trajectory.state(t)):.0f}°" + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
-            pen.text((left + 3, top + 2), label, take.color, font)
-            pen.text((left + 3, top + 3 * line // 2 * (1 + label.count("\n"))), tilt, take.color, large)
-            if t >= take.trajectory.duration or not take.failed:
-                note = "\n".join(textwrap.fill(part, letters) for part in take.note.split("; "))
-                pen.text(
-                    (right - 4, bottom - 4), note, _FAILED if take.failed else "#333333", font, "rd", align="right"
-                )
-        yield np.asarray(frame)
+    frame = Image.new("RGB", (width, height), "white")
+    pen = ImageDraw.Draw(frame)
+    pen.text((line // 2, line // 2), replay.title, "black", font)
+    pen.text((width - line // 2, line // 2), f"{t:.2f} s", "black", font, "ra")
+    for i, take in enumerate(replay.takes):
+        left, top = i % columns * wide + 2, i // columns * high + 2 * line
+        right, bottom = left + wide - 4, top + high - 4
+        shown = picture(replay.drawing(take, t), max(right - left, 1), max(bottom - top, 1))
+        frame.paste(Image.fromarray(shown), (left, top))
+        label, slip = textwrap.fill(take.label, letters), take.slip_at(t)
+        tilt = f"{_tilt(take.trajectory.state(t)):.0f}°" + f"\nslips, {slip:.1f} m/s" * (slip > LEAST_SLIP)
+        pen.text((left + 3, top + 2), label, take.color, font)
+        pen.text((left + 3, top + 3 * line // 2 * (1 + label.count("\n"))), tilt, take.color, large)
+        if t >= take.trajectory.duration or not take.failed:
+            note = "\n".join(textwrap.fill(part, letters) for part in take.note.split("; "))
+            pen.text((right - 4, bottom - 4), note, _FAILED if take.failed else "#333333", font, "rd", align="right")
+    return np.asarray(frame)
 
 
 def _tilt(x: np.ndarray) -> float:
