@@ -48,7 +48,7 @@ class Visitor:
         )
         threading.Thread(target=self._listen, daemon=True).start()
         self.send(**CAMERA)
-        wait_for(lambda: "Start" in self.controls)
+        wait_for(lambda: "Episode" in self.controls)
 
     def __enter__(self):
         return self

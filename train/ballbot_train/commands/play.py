@@ -9,7 +9,7 @@ from ballbot_gym.viewer import PORT, Viewer, import_viser
 from ballbot_train.console import RobotName, console
 from ballbot_train.evaluation.controllers import task_name
 from ballbot_train.play.live_page import PlayPage
-from ballbot_train.play.simulation import Playground
+from ballbot_train.play.simulation import Episode, Playground
 
 
 def play(
@@ -17,7 +17,7 @@ def play(
     /,
     controller: str | None = None,
     ghosts: tuple[str, ...] = ("lqr",),
-    episode: int | Literal["rest", "random"] | None = None,
+    episode: Episode | None = None,
     physics: Literal["bullet", "mujoco", "rk4"] | None = None,
     robot: RobotName = PAPER,
     seed: int = 0,
@@ -43,9 +43,8 @@ def play(
     import_viser()
     if episode is None:
         episode = 0 if make_task(task, robot).constant_names else "rest"
-    start = None if episode == "random" else episode
     console.print("preparing the controllers …")
-    playground = Playground(task, controller, ghosts, physics, start, seed, robot, randomization)
+    playground = Playground(task, controller, ghosts, physics, episode, seed, robot, randomization)
     viewer = Viewer(port, "ballbot play")
     page = PlayPage(playground, viewer)
     signal.signal(signal.SIGTERM, lambda *_: page.stop())

@@ -7,18 +7,18 @@ between two steps. So the playground needs no locks.
 import math
 import queue
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from ballbot_gym import dynamics, files
+from ballbot_gym import certified, dynamics, files
 from ballbot_gym.drawing import PUSH_SCALE
 from ballbot_gym.robots import without_wheels
 from ballbot_gym.tasks import TASKS
 from ballbot_gym.viewer import Viewer
 from ballbot_train.console import markdown_text
 from ballbot_train.evaluation.robustness import STRESSES
-from ballbot_train.play.simulation import LARGEST_PUSH, PLANT, Playground
+from ballbot_train.play.simulation import LARGEST_PUSH, PLANT, Episode, Playground
 from ballbot_train.report import labels
 
 PATIENCE = 0.1
@@ -139,20 +139,14 @@ class PlayPage:
         gui, playground = self._gui, self.playground
         with gui.add_folder("Time"):
             actions = {"Play / pause": self._toggle, "Step": self._step, "Restart": playground.restart}
-            self._button_group(" ", actions, hint="keys: space, and R for restart")
+            actions["Random"] = partial(playground.begin, "random")
+            group = gui.add_button_group(" ", tuple(actions), hint="keys: space, R and N")
+            group.on_click(self._asking(lambda _, button: actions[button]()))
             self.speed = gui.add_slider("Speed", _SLOWEST, _FASTEST, step=0.1, initial_value=1.0)
-            episode = gui.add_number("Certified episode", 0, min=0, step=1)
-            self._bind(
-                episode,
-                playground.begin,
-                lambda: episode.value if playground.episode is None else playground.episode,
-            )
-            starts = {
-                "Certified": lambda: playground.begin(episode.value),
-                "Random": partial(playground.begin, "random"),
-                "At rest": partial(playground.begin, "rest"),
-            }
-            self._button_group("Start", starts, hint="key: N for a random one")
+            episodes: dict[str, Episode] = {"rest": "rest", "random": "random"}
+            episodes |= {str(i): i for i in range(certified.EPISODES)}
+            shown = gui.add_dropdown("Episode", tuple(episodes))
+            self._bind(shown, lambda name: playground.begin(episodes[name]), lambda: str(playground.episode))
         self._key("pause or play", "space", self._toggle)
         self._key("restart", "R", playground.restart)
         self._key("random start", "N", partial(playground.begin, "random"))
@@ -176,10 +170,6 @@ class PlayPage:
 
     def _button(self, label: str, action: Callable[[], object], hint: str | None = None) -> None:
         self._gui.add_button(label, hint=hint).on_click(self._asking(lambda *_: action()))
-
-    def _button_group(self, label: str, actions: Mapping[str, Callable[[], object]], hint: str) -> None:
-        group = self._gui.add_button_group(label, tuple(actions), hint=hint)
-        group.on_click(self._asking(lambda _, button: actions[button]()))
 
     def _key(self, label: str, key: Any, action: Callable[[], object]) -> None:
         self._gui.add_command(label, hotkey=key).on_trigger(self._asking(lambda *_: action()))

@@ -42,6 +42,9 @@ _TRACE_STEPS = 400  # control steps that the trace on the floor goes back
 _PLAN_POINTS = 60  # of a drawn plan
 
 
+Episode = int | Literal["rest", "random"]
+"""The index of a certified episode, one that stands at the origin until it is pushed, or one with another start."""
+
 PLANT: dict[str, tuple[str, float, float, float]] = {
     "mass": ("Masses, %", -50.0, 100.0, 5.0),
     "com": ("Centre of mass, %", -30.0, 50.0, 5.0),
@@ -199,7 +202,7 @@ class Playground:
         controller: str | None = None,
         ghosts: Sequence[str] = (),
         physics: str | None = None,
-        episode: int | Literal["rest"] | None = 0,
+        episode: Episode = 0,
         seed: int = 0,
         robot: str = PAPER,
         randomization: str | None = None,
@@ -212,7 +215,7 @@ class Playground:
                 of a model that Stable-Baselines3 saved; default, `World.best`.
             ghosts: controllers of the ghosts.
             physics: "bullet", "mujoco" or "rk4"; default, as for environments.
-            episode: index of a certified episode; "rest" for standing at the origin; None for a random start.
+            episode: as of `begin`.
             seed: of random starts, sensor noise and random pushes.
             robot: name in `robots.ROBOTS`.
             randomization: name of a track: every episode has a robot of it, which the controllers are not told.
@@ -230,6 +233,7 @@ class Playground:
         """The main robot, then the ghosts."""
         self.notice = ""
         """What went wrong last, in words."""
+        self.episode: Episode = episode
         self._files: list[str] = []
         self._rng = np.random.default_rng(seed)
         self._track = checked_randomization(randomization)
@@ -262,16 +266,16 @@ class Playground:
     @property
     def optimum_cost(self) -> float:
         """The best cost of the certified episode without pushes; NaN of other starts."""
-        known = self.world.certified
-        return math.nan if known is None or self.episode is None else float(known.costs[self.episode])
+        known, i = self.world.certified, self.episode
+        return math.nan if known is None or isinstance(i, str) else float(known.costs[i])
 
     @property
     def optimum_cost_so_far(self) -> float:
         """What the optimum has cost until now; NaN where its trajectory is not kept."""
-        known = self.world.certified
-        if known is None or self.episode is None or self.episode >= len(known.trajectories):
+        known, i = self.world.certified, self.episode
+        if known is None or isinstance(i, str) or i >= len(known.trajectories):
             return math.nan
-        task, best = self.world.task, known.trajectories[self.episode]
+        task, best = self.world.task, known.trajectories[i]
         n = min(self.elapsed, len(best.u))
         c = task.at(tuple(self.start[1].tolist()), best.t[:n])
         return task.control_dt * float(np.sum(task.cost(tuple(best.x[:n].T), tuple(best.u[:n].T), c)))
@@ -319,7 +323,7 @@ class Playground:
                 self.restart()
             return
         dt = self.world.task.control_dt
-        if self._at_rest and self.elapsed == round(_FIRST_PUSH_AFTER / dt):
+        if self.episode == "rest" and self.elapsed == round(_FIRST_PUSH_AFTER / dt):
             self.push(*(part * self.world.params.total_mass / default_params().total_mass for part in FIRST_PUSH))
         push, self._pending_push = self._pending_push, np.zeros(2)
         if push.any():
@@ -387,17 +391,16 @@ class Playground:
 
     def restart(self) -> None:
         """Begins the same episode again."""
-        self._begin(self.start, self.episode, self._at_rest)
+        self._begin(self.start, self.episode)
 
-    def begin(self, episode: int | Literal["rest", "random"]) -> None:
+    def begin(self, episode: Episode) -> None:
         """Begins a certified episode, by its index, a random one, or one that stands at the origin until it is pushed, which
         happens by itself.
         """
         task, known = self.world.task, self.world.certified
-        if episode == "random":
-            self._begin(task.sample(self._rng, self.world.params), None)
-        elif episode == "rest":
-            self._begin((np.zeros(8), task.sample(self._rng, self.world.params)[1]), None, True)
+        if isinstance(episode, str):
+            x, c = task.sample(self._rng, self.world.params)
+            self._begin((np.zeros(8) if episode == "rest" else x, c), episode)
         elif known is None:
             raise ValueError(
                 f"{self.world.task_name} has no certified episodes for {self.world.robot}; begin a random one"
@@ -409,13 +412,12 @@ class Playground:
 
     # --- inside ---
 
-    def _open(self, world: World, controllers: Iterable[str], episode: int | Literal["rest"] | None) -> None:
+    def _open(self, world: World, controllers: Iterable[str], episode: Episode) -> None:
         made = {name: self._made(name, world) for name in dict.fromkeys(controllers)}
         self.close()
         self.world = world
         self.runners = [Runner(*each, self._env(world)) for each in made.items()]
-        known = episode == "rest" or world.certified is not None
-        self.begin(episode if known and episode is not None else "random")
+        self.begin("random" if world.certified is None and episode != "rest" else episode)
 
     def _made(self, name: str, world: World) -> Controller:
         """A controller by name, which is offered from then on."""
@@ -433,9 +435,9 @@ class Playground:
             controller.reset(self.seconds, np.array(self.main.x), self.start[1])
         return controller
 
-    def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: int | None, at_rest: bool = False) -> None:
+    def _begin(self, start: tuple[np.ndarray, np.ndarray], episode: Episode) -> None:
         """Begins an episode. A controller that finds no plan is replaced by LQR."""
-        self.start, self.episode, self._at_rest = start, episode, at_rest
+        self.start, self.episode = start, episode
         self.elapsed = self._pause_left = self._push_until = 0
         self._pending_push = self._push = np.zeros(2)
         seed = int(self._rng.integers(2**32))  # the same for all, so that they meet the same robot, noise and pushes
@@ -471,7 +473,7 @@ class Playground:
         if task.first_exit or main.stands_still:
             self._pause_left = round(_PAUSE / task.control_dt)
         else:
-            self._begin((np.array(main.x), self.start[1]), None)
+            self._begin((np.array(main.x), self.start[1]), "random")
 
 
 def _failure_word(limit: str) -> str:
