@@ -115,7 +115,11 @@ class Episode(Moving):
 
 
 def rollout(
-    env: gymnasium.Env, controller: Controller, seed: int | None = None, options: dict[str, Any] | None = None
+    env: gymnasium.Env,
+    controller: Controller,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+    watch: Callable[[np.ndarray], object] = lambda seen: None,
 ) -> Episode:
     """Runs one episode.
 
@@ -125,6 +129,7 @@ def rollout(
             with observation="sensors" it gets what they show, and must have an attribute `senses` that is true.
         seed: as for `env.reset`.
         options: as for `env.reset`.
+        watch: is told what the controller sees before each control step, while the env is where the step begins.
 
     Raises:
         ValueError: the env shows sensors, and the controller wants states.
@@ -144,6 +149,7 @@ def rollout(
     states, forces, act_seconds, settled = [x], [], [], [task.is_goal(tuple(x), task.at(tuple(c), 0.0))]
     cost, done = 0.0, False
     while not done:
+        watch(seen)
         start = time.perf_counter()
         u = controller.act(len(forces) * dt, seen)
         act_seconds.append(time.perf_counter() - start)

@@ -6,8 +6,7 @@ from the lines that Python runs; see `printed`.
 
 import textwrap
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import casadi
 import numpy as np
@@ -130,18 +129,12 @@ def _test(network: PolicyNetwork, task: Task, robot: str, filtered: bool) -> dic
     """Of an episode under the policy: states in some steps, or what sensors show in the first ones, as float32, and the
     actions that it takes on them one after the other.
     """
-    params, seen = named_robot(robot), []
+    params, seen = named_robot(robot), list[np.ndarray]()
     controller: Controller = PolicyController(task, params, network)
     if filtered:
         controller = kalman.FilteredController(task, params, controller)
-
-    def act(t: float, x: np.ndarray) -> np.ndarray:
-        seen.append(x)
-        return controller.act(t, x)
-
     env = BallbotEnv(task, physics="rk4", robot=robot, observation="sensors" if filtered else "state")
-    watched = cast(Controller, SimpleNamespace(reset=controller.reset, act=act, senses=filtered))
-    c = rollout(env, watched, seed=0).constants.astype(np.float32)
+    c = rollout(env, controller, seed=0, watch=seen.append).constants.astype(np.float32)
     k = np.arange(_TEST_STEPS) if filtered else np.linspace(0, len(seen) - 1, _TEST_STEPS).astype(int)
     shown, times = np.array(seen)[k], (k * task.control_dt).astype(np.float32)
     if filtered:

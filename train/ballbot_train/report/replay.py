@@ -4,8 +4,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 
@@ -143,13 +141,7 @@ def _take(
     episode: int,
 ) -> Take:
     slips: list[float] = []
-
-    def act(t: float, x: np.ndarray) -> np.ndarray:
-        slips.append(env.slip)
-        return controller.act(t, x)
-
-    watched = cast(Controller, SimpleNamespace(reset=controller.reset, act=act))
-    run = rollout(env, watched, options=episode_set.options(episode))
+    run = rollout(env, controller, options=episode_set.options(episode), watch=lambda _: slips.append(env.slip))
     if run.failure:
         note = f"fails at {run.trajectory.duration:.2f} s"
     else:
