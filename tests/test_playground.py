@@ -315,7 +315,7 @@ def drive(browser):
     """Drives the open episode to its end, as somebody who looks where the goal is."""
     browser.execute_script(
         "const [mine] = playground.robots;"
-        "while (!playground.isOver(mine)) {"
+        "while (!mine.over) {"
         "  playground.driver.hold(...[0, 1].map(i => -0.1 * mine.x[i] - 0.25 * mine.x[4 + i]));"
         "  playground.advance();"
         "} playground.draw(0.1)"

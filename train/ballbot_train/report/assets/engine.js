@@ -111,6 +111,12 @@ class Robot {
     return !["", "goal", "over"].includes(this.ended);
   }
 
+  /** Whether its episode is over: it failed or arrived, or the time is up. */
+  get over() {
+    const { optimum, duration } = this.scenario;
+    return this.ended !== "" || (optimum !== null && this.steps * DATA.dt >= duration - 1e-9);
+  }
+
   /** Holds a force for one control step. */
   advance() {
     this.before = this.x;
@@ -129,10 +135,8 @@ class Robot {
 
   /** Counts a control step under a force, to the next state. Tells the violated limit, or −1, and whether it is the goal. */
   move(force, next) {
-    const { optimum, duration, constants } = this.scenario;
-    const counts = optimum === null || this.steps * DATA.dt < duration - 1e-9; // an episode's cost ends with it
-    const [cost, ...end] = this.model.outcome(this.x, force, next, constants);
-    if (counts) this.cost += cost;
+    const [cost, ...end] = this.model.outcome(this.x, force, next, this.scenario.constants);
+    if (!this.over) this.cost += cost; // an episode's cost ends with it
     [this.x, this.force] = [next, force];
     this.steps += 1;
     this.peak = Math.max(this.peak, this.tilt);

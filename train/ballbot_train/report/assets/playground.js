@@ -126,12 +126,7 @@ class Playground {
     }
     for (const robot of this.everyone) robot.advance();
     this.time += DATA.dt;
-    if (this.driver && this.isOver(this.robots[0])) this.finish();
-  }
-
-  /** Whether a robot's episode is over: it failed or arrived, or the time is up. */
-  isOver(robot) {
-    return robot.ended !== "" || (this.scenario.optimum !== null && robot.steps * DATA.dt >= this.scenario.duration - 1e-9);
+    if (this.driver && this.robots[0].over) this.finish();
   }
 
   /** The end of an episode that the reader has driven. */
@@ -243,7 +238,7 @@ class Playground {
         robot === this.best ? `of ${this.scenario.optimum.toFixed(1)}` : robot.failed ? verdict(robot) : this.regret(robot),
       ];
       cells.forEach((text, k) => (rows[i].cells[k + 1].textContent = text));
-      rows[i].cells[5].className = robot.failed ? "bad" : this.isOver(robot) ? "good" : "";
+      rows[i].cells[5].className = robot.failed ? "bad" : robot.over ? "good" : "";
     });
   }
 
@@ -251,12 +246,12 @@ class Playground {
   regret(robot) {
     if (!this.best || this.disturbed || robot.failed || !(this.best.cost > 0)) return "";
     const share = this.share100(robot);
-    return this.isOver(robot) ? `regret ${share.toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
+    return robot.over ? `regret ${share.toFixed(1)} %` : `${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(0)} % so far`;
   }
 
   /** The same as a number, %; nothing costs less than the optimum over a whole episode. */
   share100(robot) {
-    const over = this.isOver(robot);
+    const over = robot.over;
     const share = 100 * (robot.cost / (over ? this.scenario.optimum : this.best.cost) - 1);
     return over ? Math.max(0, share) : share;
   }
@@ -330,7 +325,7 @@ class Playground {
   steer(x, y) {
     if (!this.driver) return;
     this.driver.hold(...this.onFloor(x, y));
-    if (!this.playing && (x || y) && !this.isOver(this.robots[0])) this.setPlaying(true);
+    if (!this.playing && (x || y) && !this.robots[0].over) this.setPlaying(true);
   }
 
   steerByKeys() {
